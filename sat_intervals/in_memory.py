@@ -1,0 +1,117 @@
+"""A pair of arrays in memory, matched as one tile: no files, no store, no scheduler."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sat_intervals.config import Config, load_config
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.finish import Rows, Scale, confidence_scale, finish_rows
+from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.kernels.cost import padded_to_lanes
+from sat_intervals.patch import Reader, match_patch
+from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
+from sat_intervals.tiling import Window
+
+Array = np.ndarray | xr.DataArray
+
+
+def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) -> xr.Dataset:
+    """Match two epipolar images in memory.
+
+    Parameters
+    ----------
+    left, right
+        ``(rows, columns)`` real numbers; the rows correspond, the numbers of columns may differ. NaN and infinity are
+        no data, and so are the masked pixels of a masked array.
+    config
+        Settings, or a mapping of them as `load_config` takes it; ``tiles`` does not matter.
+
+    Returns
+    -------
+    Dataset
+        ``disparity``, ``lower``, ``upper`` (pixels), ``confidence`` (0 to 1), float32, and ``validity``, uint16
+        flags; dimensions and coordinates of a left DataArray are kept.
+
+    Raises
+    ------
+    SatIntervalsError
+        For arrays that do not fit each other or the search range, and for a volume larger than the memory.
+    """
+    config = load_config(config)
+    left_image, right_image = _image(left, "left"), _image(right, "right")
+    _check_fit(left_image, right_image, config)
+    whole = Window(0, 0, *left_image.shape)
+    patch = match_patch(_reader(left_image), _reader(right_image), whole, whole, whole, config)
+    raw = patch.raw
+    rows = Rows(
+        raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner
+    )
+    scale = Scale(np.nan, np.nan)
+    if config.ambiguity:
+        histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
+        scale = confidence_scale(config.ambiguity, histogram)
+    final = finish_rows(rows, 0, whole.height, scale, config)
+    labels = left if isinstance(left, xr.DataArray) else xr.DataArray(left_image, dims=("row", "column"))
+    dataset = xr.Dataset(coords=labels.coords)
+    for band, layer in zip(BANDS, final.intervals, strict=True):
+        attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
+        dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
+    dataset["validity"] = xr.DataArray(final.validity, dims=labels.dims, attrs=flag_attributes())
+    return dataset
+
+
+def flag_attributes() -> dict[str, object]:
+    """The validity flags as CF conventions write them."""
+    return {
+        "long_name": "validity flags",
+        "flag_masks": [flag.value for flag in FLAGS],
+        "flag_meanings": " ".join(flag.name for flag in FLAGS),
+    }
+
+
+def _image(array: Array, side: str) -> np.ma.MaskedArray:
+    """The pixels as float, masked where they are no data."""
+    values = np.ma.asanyarray(array.data if isinstance(array, xr.DataArray) else array)
+    if values.ndim != 2 or values.dtype.kind not in "uif":
+        raise SatIntervalsError(
+            f"{side} array: {values.ndim} dimensions of {values.dtype}, needed: 2 dimensions of real numbers"
+        )
+    dtype = np.float32 if np.can_cast(values.dtype, np.float32) else np.float64
+    return np.ma.masked_invalid(values.astype(dtype))
+
+
+def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
+    if left.shape[0] != right.shape[0]:
+        raise SatIntervalsError(
+            f"the left array has {left.shape[0]} rows, the right {right.shape[0]}: rows must correspond"
+        )
+    if 0 in left.shape or 0 in right.shape:
+        raise SatIntervalsError(f"nothing to match: shapes {left.shape} and {right.shape}")
+    volume = 2 * left.size * padded_to_lanes(config.disparity.count)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if volume > memory:
+        raise SatIntervalsError(
+            f"{left.shape[0]} x {left.shape[1]} pixels x {config.disparity.count} disparities need {volume / 1e9:.1f} GB, "
+            f"the machine has {memory / 1e9:.1f} GB: write the arrays to files and use match_pair, which works in tiles"
+        )
+
+
+def _reader(image: np.ma.MaskedArray) -> Reader:
+    """Read any window of an array as `match_patch` wants it."""
+    whole = Window(0, 0, *image.shape)
+    values, masked = image.filled(0), np.ma.getmaskarray(image)
+
+    def read(window: Window) -> tuple[np.ndarray, np.ndarray]:
+        pixels = np.zeros((window.height, window.width), values.dtype)
+        state = np.full(pixels.shape, NO_DATA, np.uint8)
+        inside = window.clipped(whole)
+        here = inside.relative_to(window).slices
+        pixels[here] = values[inside.slices]
+        state[here] = np.where(masked[inside.slices], NO_DATA, 0)
+        return pixels, state
+
+    return read

@@ -1,0 +1,117 @@
+"""Census matching cost (Zabih and Woodfill 1994; method: section 1).
+
+Letters: r row, c column, k disparity index (disparity = minimum + k), w word of a code.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sat_intervals.kernels.vector import LANES, add, hamming, larger, load
+
+
+class Codes(NamedTuple):
+    """Census codes of a patch.
+
+    Attributes
+    ----------
+    words
+        ``(words, rows, columns)``, uint32 (windows 3 and 5) or uint64 (one word up to window 7, two above).
+    state
+        ``(rows, columns)`` uint8: the union of the states of the window's pixels, 0 = usable.
+    """
+
+    words: np.ndarray
+    state: np.ndarray
+
+
+@njit(nogil=True, cache=True)
+def _census_words(pixels, radius, words):
+    """Shift one bit a neighbour into each word, row by row, so that columns vectorise."""
+    bits = words.itemsize * 8
+    rows, columns = words.shape[1:]
+    for r in range(rows):
+        neighbour = 0
+        for dr in range(2 * radius + 1):
+            for dc in range(2 * radius + 1):
+                if dr == radius and dc == radius:
+                    continue
+                row = words[neighbour // bits, r]
+                for c in range(columns):
+                    greater = pixels[r + dr, c + dc] > pixels[r + radius, c + radius]
+                    row[c] = (row[c] << 1) | greater
+                neighbour += 1
+
+
+@njit(nogil=True, cache=True)
+def _window_union(state, radius, union):
+    """Union of the states under each window, one axis after the other."""
+    rows, columns = union.shape
+    across = np.zeros((state.shape[0], columns), np.uint8)
+    for r in range(state.shape[0]):
+        for dc in range(2 * radius + 1):
+            for c in range(columns):
+                across[r, c] |= state[r, c + dc]
+    for r in range(rows):
+        for dr in range(2 * radius + 1):
+            for c in range(columns):
+                union[r, c] |= across[r + dr, c]
+
+
+def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
+    """Census codes: one bit a neighbour, set where the neighbour is greater than the centre.
+
+    Parameters
+    ----------
+    pixels
+        ``(rows + 2 R, columns + 2 R)`` float32 or float64 with ``R = window // 2``, finite everywhere.
+    state
+        uint8 of the same shape; 0 = usable.
+    window
+        Side of the square window in pixels, odd, 3 to 11.
+
+    Returns
+    -------
+    Codes
+        of ``(rows, columns)`` pixels.
+    """
+    radius = window // 2
+    shape = pixels.shape[0] - 2 * radius, pixels.shape[1] - 2 * radius
+    neighbours = window**2 - 1
+    dtype = np.uint32 if neighbours <= 32 else np.uint64
+    count = -(-neighbours // (8 * np.dtype(dtype).itemsize))
+    codes = Codes(np.zeros((count, *shape), dtype), np.zeros(shape, np.uint8))
+    _census_words(pixels, radius, codes.words)
+    _window_union(state, radius, codes.state)
+    return codes
+
+
+@njit(nogil=True, forceinline=True)
+def hamming_costs(left, right, r, c, k):
+    """Hamming distances of the left pixel ``(r, c)`` to its candidates ``k .. k + 31``.
+
+    ``right`` is ``(words, rows, width)`` with ``width >= c + k + 32``: 32 columns lie behind the last candidate.
+    """
+    width = right.shape[2]
+    rows = right.shape[1]
+    costs = hamming(right, r * width + c + k, left[0, r, c])
+    for w in range(1, left.shape[0]):
+        costs = add(costs, hamming(right, (w * rows + r) * width + c + k, left[w, r, c]))
+    return costs
+
+
+@njit(nogil=True, forceinline=True)
+def candidate_costs(left, right, barrier, beyond, r, c, k):
+    """Costs of the candidates ``k .. k + 31``: Hamming distance, or a constant where the candidate is impossible.
+
+    ``barrier[c + k]`` is the cost of an impossible candidate, or 0, for the row; ``beyond[k]`` keeps lanes behind
+    the search range above every cost.
+    """
+    costs = larger(hamming_costs(left, right, r, c, k), load(barrier, c + k))
+    return larger(costs, load(beyond, k))
+
+
+def padded_to_lanes(count: int) -> int:
+    """The smallest multiple of the lane count that holds ``count`` disparities."""
+    return -(-count // LANES) * LANES

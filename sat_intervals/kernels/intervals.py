@@ -1,0 +1,202 @@
+"""Intervals from cost curves, and their regularisation in low-confidence areas (method: sections 5 and 8).
+
+Letters: r row, c column, k disparity index, s segment: a run of low-confidence pixels in a row.
+"""
+
+import numpy as np
+from numba import njit
+
+from sat_intervals.kernels.vector import LANES, first_lane, lanes_above_last, lanes_at_most, load
+
+
+@njit(nogil=True, forceinline=True)
+def alpha_cut(curve, limit):
+    """First and last index whose cost is at most ``limit = lowest + floor((1 - alpha) * span)`` (paper eq. 5 to 7).
+
+    ``curve`` is padded to whole vectors with costs above every limit, and some cost is at most ``limit``.
+    """
+    first = 0
+    cut = lanes_at_most(load(curve, first), limit)
+    while cut == 0:
+        first += LANES
+        cut = lanes_at_most(load(curve, first), limit)
+    first += first_lane(cut)
+    last = curve.size - LANES
+    cut = lanes_at_most(load(curve, last), limit)
+    while cut == 0:
+        last -= LANES
+        cut = lanes_at_most(load(curve, last), limit)
+    last += LANES - 1 - lanes_above_last(cut)
+    return first, last
+
+
+@njit(nogil=True)
+def _segments(low):
+    """The runs of low-confidence pixels: their first and last columns, and the first segment of each row."""
+    rows, columns = low.shape
+    count = 0
+    for r in range(rows):
+        for c in range(columns):
+            if low[r, c] and (c == 0 or not low[r, c - 1]):
+                count += 1
+    start, stop = np.empty(count, np.int32), np.empty(count, np.int32)
+    row_start = np.empty(rows + 1, np.int64)
+    s = 0
+    for r in range(rows):
+        row_start[r] = s
+        for c in range(columns):
+            if low[r, c]:
+                if c == 0 or not low[r, c - 1]:
+                    start[s] = c
+                if c == columns - 1 or not low[r, c + 1]:
+                    stop[s] = c + 1
+                    s += 1
+    row_start[rows] = s
+    return start, stop, row_start
+
+
+@njit(nogil=True)
+def _touching(start, stop, row_start, neighbours, step):
+    """Fill ``neighbours[s] = first, after last`` of the segments in row ``r + step`` that share a column with s."""
+    rows = row_start.size - 1
+    for r in range(rows):
+        if not 0 <= r + step < rows:
+            continue
+        begin, end = row_start[r + step], row_start[r + step + 1]
+        first = begin
+        for s in range(row_start[r], row_start[r + 1]):
+            while first < end and stop[first] <= start[s]:
+                first += 1
+            last = first
+            while last < end and start[last] < stop[s]:
+                last += 1
+            neighbours[s, 0], neighbours[s, 1] = first, last
+
+
+@njit(nogil=True)
+def _area(s, depth, above, below, visited, area):
+    """Collect the segments reached from s in at most ``depth`` steps; returns how many. ``visited`` is stamped s."""
+    area[0] = s
+    visited[s] = s
+    count = 1
+    reached = 0
+    for _ in range(depth):
+        frontier = count
+        for i in range(reached, frontier):
+            for neighbours in (above[area[i]], below[area[i]]):
+                for t in range(neighbours[0], neighbours[1]):
+                    if visited[t] != s:
+                        visited[t] = s
+                        area[count] = t
+                        count += 1
+        reached = frontier
+    return count
+
+
+@njit(nogil=True)
+def _select(values, count, rank):
+    """The value of a rank among the first ``count``; afterwards none behind the rank is smaller (Hoare 1961)."""
+    left, right = 0, count - 1
+    while left < right:
+        pivot = values[(left + right) // 2]
+        i, j = left, right
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if rank <= j:
+            right = j
+        elif rank >= i:
+            left = i
+        else:
+            break
+    return values[rank]
+
+
+@njit(nogil=True)
+def _quantile(values, count, quantile):
+    """Quantile of the first ``count`` values, interpolated linearly; reorders them."""
+    rank = quantile * (count - 1)
+    below = int(rank)
+    first = np.float64(_select(values, count, below))
+    part = rank - below
+    if below + 1 == count or part == 0.0:
+        return first
+    second = np.float64(values[below + 1 : count].min())
+    if part < 0.5:
+        return first + (second - first) * part
+    return second - (second - first) * (1.0 - part)  # as numpy rounds it
+
+
+@njit(nogil=True)
+def _gather(values, segment_row, start, stop, area, count, into):
+    """Copy the values of all pixels of some segments; returns how many."""
+    size = 0
+    for i in range(count):
+        s = area[i]
+        length = stop[s] - start[s]
+        into[size : size + length] = values[segment_row[s], start[s] : stop[s]]
+        size += length
+    return size
+
+
+@njit(nogil=True, cache=True)
+def regularize(lower, upper, low, depth, quantile, first, last):
+    """Widen the intervals of low-confidence areas to quantiles of the area's bounds (paper section 3.5).
+
+    A segment's area is made of the segments reached in at most ``depth`` steps between segments of adjacent rows
+    that share a column.
+
+    Parameters
+    ----------
+    lower, upper
+        ``(rows, columns)`` float32 bounds, a number wherever ``low``.
+    low
+        bool of the same shape: low-confidence pixels.
+    depth
+        Steps, and so the rows above and below a row that its areas reach.
+    quantile
+        Of the upper bounds; the lower bounds take ``1 - quantile``.
+    first, last
+        The rows ``[first, last)`` are returned; the others are there to be reached.
+
+    Returns
+    -------
+    ``(lower, upper)``, float32 of shape ``(last - first, columns)``; pixels that are not low keep their bounds.
+    """
+    start, stop, row_start = _segments(low)
+    segments = start.size
+    above, below = np.zeros((segments, 2), np.int64), np.zeros((segments, 2), np.int64)
+    _touching(start, stop, row_start, above, -1)
+    _touching(start, stop, row_start, below, 1)
+    segment_row = np.empty(segments, np.int64)
+    for r in range(row_start.size - 1):
+        segment_row[row_start[r] : row_start[r + 1]] = r
+    visited, area = np.full(segments, -1, np.int64), np.empty(segments, np.int64)
+    values = np.empty((stop - start).sum(), np.float32)
+    new_lower, new_upper = lower[first:last].copy(), upper[first:last].copy()
+    low_bound = high_bound = 0.0
+    for s in range(row_start[first], row_start[last]):
+        # Segments of a row that touch the same segments have, from two steps on, the same area: without this, a row
+        # of short segments beside one long segment would cost their number squared.
+        if not (depth > 1 and s > row_start[segment_row[s]] and _same_neighbours(s - 1, s, above, below)):
+            count = _area(s, depth, above, below, visited, area)
+            size = _gather(lower, segment_row, start, stop, area, count, values)
+            low_bound = _quantile(values, size, 1.0 - quantile)
+            size = _gather(upper, segment_row, start, stop, area, count, values)
+            high_bound = _quantile(values, size, quantile)
+        new_lower[segment_row[s] - first, start[s] : stop[s]] = low_bound
+        new_upper[segment_row[s] - first, start[s] : stop[s]] = high_bound
+    return new_lower, new_upper
+
+
+@njit(nogil=True)
+def _same_neighbours(s, t, above, below):
+    """Whether two segments of a row touch the same segments, at least one."""
+    same = (above[s] == above[t]).all() and (below[s] == below[t]).all()
+    return same and (above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1])

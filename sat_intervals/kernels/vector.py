@@ -1,0 +1,220 @@
+"""Explicit vectors of 32 unsigned 16-bit lanes for numba kernels.
+
+LLVM vectorises a plain loop over disparities only behind run-time checks that no two arrays overlap, which costs
+more than the loop itself when a curve is two or four vectors long. These few primitives say what is meant. LLVM
+lowers them to whatever the processor has: one AVX-512 register, two of AVX2, four of SSE2 or NEON.
+
+Sums and differences wrap around; comparisons are unsigned; a mask of lanes is a 32-bit number, lane 0 lowest.
+"""
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, register_model
+
+LANES = 32
+
+_HALF = ir.IntType(16)
+_WORD = ir.IntType(32)
+_VECTOR = ir.VectorType(_HALF, LANES)
+_LANE_INDEX = ir.VectorType(_WORD, LANES)
+
+
+class _VectorType(types.Type):
+    """The numba type of 32 x uint16."""
+
+    def __init__(self) -> None:
+        super().__init__(name="vector_32_uint16")
+
+
+vector_type = _VectorType()
+
+
+@register_model(_VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, _VECTOR)
+
+
+def _address(context, builder, array_type, array, index, pointee):
+    """Pointer to element ``index`` of a C-contiguous array, flat, as a pointer to a vector."""
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), pointee.as_pointer())
+
+
+def _splat(builder, value, kind):
+    single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_WORD, 0))
+    zeros = ir.Constant(ir.VectorType(_WORD, kind.count), [0] * kind.count)
+    return builder.shuffle_vector(single, ir.Constant(kind, ir.Undefined), zeros)
+
+
+def _call(builder, name, result, arguments):
+    kind = ir.FunctionType(result, [argument.type for argument in arguments])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
+
+
+def _lane_mask(builder, lanes):
+    return builder.bitcast(lanes, _WORD)
+
+
+@intrinsic
+def load(typing_context, array, index):
+    """Return ``array.ravel()[index : index + 32]`` of a contiguous uint16 array."""
+
+    def generate(context, builder, signature, arguments):
+        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _VECTOR)
+        return builder.load(pointer, align=2)
+
+    return vector_type(array, types.intp), generate
+
+
+@intrinsic
+def store(typing_context, array, index, vector):
+    """Write a vector to ``array.ravel()[index : index + 32]``."""
+
+    def generate(context, builder, signature, arguments):
+        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _VECTOR)
+        builder.store(arguments[2], pointer, align=2)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector), generate
+
+
+@intrinsic
+def splat(typing_context, value):
+    """Return a vector with ``value`` in every lane."""
+
+    def generate(context, builder, signature, arguments):
+        return _splat(builder, arguments[0], _VECTOR)
+
+    return vector_type(types.uint16), generate
+
+
+def _binary(name, operation, doc):
+    @intrinsic
+    def function(typing_context, first, second):
+        def generate(context, builder, signature, arguments):
+            return operation(builder, *arguments)
+
+        return vector_type(vector_type, vector_type), generate
+
+    function.__doc__ = doc
+    return function
+
+
+def _smaller(builder, first, second):
+    return _call(builder, f"llvm.umin.v{LANES}i16", _VECTOR, (first, second))
+
+
+def _larger(builder, first, second):
+    return _call(builder, f"llvm.umax.v{LANES}i16", _VECTOR, (first, second))
+
+
+def _slide_up(builder, before, vector):
+    lanes = ir.Constant(_LANE_INDEX, list(range(LANES - 1, 2 * LANES - 1)))
+    return builder.shuffle_vector(before, vector, lanes)
+
+
+def _slide_down(builder, vector, after):
+    lanes = ir.Constant(_LANE_INDEX, list(range(1, LANES + 1)))
+    return builder.shuffle_vector(vector, after, lanes)
+
+
+add = _binary("add", lambda builder, a, b: builder.add(a, b), "Lane by lane ``a + b``.")
+subtract = _binary("subtract", lambda builder, a, b: builder.sub(a, b), "Lane by lane ``a - b``.")
+smaller = _binary("smaller", _smaller, "Lane by lane ``min(a, b)``.")
+larger = _binary("larger", _larger, "Lane by lane ``max(a, b)``.")
+slide_up = _binary("slide_up", _slide_up, "Return ``(before, vector)`` shifted: lane i holds element i - 1.")
+slide_down = _binary("slide_down", _slide_down, "Return ``(vector, after)`` shifted: lane i holds element i + 1.")
+
+
+@intrinsic
+def smallest(typing_context, vector):
+    """Return the smallest lane."""
+
+    def generate(context, builder, signature, arguments):
+        value = arguments[0]
+        width = LANES
+        while width > 8:  # halve to 8 lanes: x86 has one instruction for the minimum of 8
+            width //= 2
+            halves = [
+                builder.shuffle_vector(
+                    value,
+                    ir.Constant(value.type, ir.Undefined),
+                    ir.Constant(ir.VectorType(_WORD, width), list(range(start, start + width))),
+                )
+                for start in (0, width)
+            ]
+            value = _call(builder, f"llvm.umin.v{width}i16", halves[0].type, halves)
+        return _call(builder, "llvm.vector.reduce.umin.v8i16", _HALF, (value,))
+
+    return types.uint16(vector), generate
+
+
+@intrinsic
+def lanes_at_most(typing_context, vector, limit):
+    """Return the mask of the lanes that are ``<= limit``."""
+
+    def generate(context, builder, signature, arguments):
+        limits = _splat(builder, arguments[1], _VECTOR)
+        return _lane_mask(builder, builder.icmp_unsigned("<=", arguments[0], limits))
+
+    return types.uint32(vector, types.uint16), generate
+
+
+@intrinsic
+def fill_where_nonzero(typing_context, vector):
+    """Return 65535 in the lanes that are not zero, 0 in the others."""
+
+    def generate(context, builder, signature, arguments):
+        zeros = ir.Constant(_VECTOR, [0] * LANES)
+        return builder.sext(builder.icmp_unsigned("!=", arguments[0], zeros), _VECTOR)
+
+    return vector_type(vector), generate
+
+
+@intrinsic
+def choose_smaller(typing_context, candidate, best, index, best_index):
+    """Return ``best_index`` with ``index`` in the lanes where ``candidate <= best``."""
+
+    def generate(context, builder, signature, arguments):
+        candidate, best, index, best_index = arguments
+        return builder.select(builder.icmp_unsigned("<=", candidate, best), index, best_index)
+
+    return vector_type(candidate, best, index, best_index), generate
+
+
+def _bit_count(name, doc):
+    @intrinsic
+    def function(typing_context, mask):
+        def generate(context, builder, signature, arguments):
+            zero_is_undefined = ir.Constant(ir.IntType(1), 1)
+            count = _call(builder, f"llvm.{name}.i32", _WORD, (arguments[0], zero_is_undefined))
+            return builder.zext(count, ir.IntType(64))
+
+        return types.intp(types.uint32), generate
+
+    function.__doc__ = doc
+    return function
+
+
+first_lane = _bit_count("cttz", "Return the number of the lowest lane of a mask that is not empty.")
+lanes_above_last = _bit_count("ctlz", "Return how many lanes lie above the highest lane of a mask that is not empty.")
+
+
+@intrinsic
+def hamming(typing_context, words, index, word):
+    """Return the Hamming distances of 32 consecutive words of a contiguous array to one word.
+
+    ``words`` holds uint32 or uint64; distances are added up over several words of a code by the caller.
+    """
+
+    def generate(context, builder, signature, arguments):
+        bits = signature.args[0].dtype.bitwidth
+        kind = ir.VectorType(ir.IntType(bits), LANES)
+        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], kind)
+        differing = builder.xor(builder.load(pointer, align=bits // 8), _splat(builder, arguments[2], kind))
+        counts = _call(builder, f"llvm.ctpop.v{LANES}i{bits}", kind, (differing,))
+        return builder.trunc(counts, _VECTOR)
+
+    return vector_type(words, types.intp, words.dtype), generate

@@ -1,0 +1,72 @@
+"""What a run writes: the bands, the validity bits, the states of an input pixel. One table for every reader."""
+
+from dataclasses import dataclass
+
+# State of an input pixel, and of a census window (the union of its pixels' states). 0 = usable.
+NO_DATA = 1  # outside the image, declared no data, or not finite
+MASKED = 2  # excluded by the user's mask
+
+# Raw products of a tile hold integer disparities; this stands where there is none.
+NO_DISPARITY = -32768
+# The aggregated cost of an impossible candidate, above every declared span.
+IMPOSSIBLE_COST = 65535
+
+# Validity bits (method: section 9), with the numbers of Pandora so that its readers read ours.
+LEFT_WINDOW = 1 << 0
+NO_CANDIDATE = 1 << 1
+RANGE_INCOMPLETE = 1 << 2
+NOT_REFINED = 1 << 3
+LEFT_MASKED = 1 << 6
+RIGHT_MASKED = 1 << 7
+OCCLUSION = 1 << 8
+MISMATCH = 1 << 9
+REGULARIZED = 1 << 11
+
+REJECTED = OCCLUSION | MISMATCH
+UNMATCHED = LEFT_WINDOW | NO_CANDIDATE | LEFT_MASKED | RIGHT_MASKED
+INVALID = UNMATCHED | REJECTED
+
+
+@dataclass(frozen=True)
+class Flag:
+    """One bit of the validity band: its value, a short name, its meaning, and whether it makes a pixel invalid."""
+
+    bit: int
+    name: str
+    meaning: str
+    invalid: bool
+
+    @property
+    def value(self) -> int:
+        """The flag as a number, ``1 << bit``."""
+        return 1 << self.bit
+
+
+FLAGS = (
+    Flag(0, "left_window", "the left window meets the image's border, no data or a mask", True),
+    Flag(1, "no_candidate", "all candidates impossible: outside the right image or on its no data", True),
+    Flag(2, "range_incomplete", "part of the search range could not be searched", False),
+    Flag(3, "not_refined", "sub-pixel refinement not done", False),
+    Flag(6, "left_masked", "the left pixel is masked", True),
+    Flag(7, "right_masked", "all candidates impossible, at least one through the right mask", True),
+    Flag(8, "occlusion", "rejected by cross-checking: occlusion", True),
+    Flag(9, "mismatch", "rejected by cross-checking: mismatch", True),
+    Flag(11, "regularized", "interval regularised in a low-confidence area", False),
+)
+
+
+@dataclass(frozen=True)
+class Band:
+    """One band of ``intervals.tif``: its name (the GeoTIFF description), unit ("" = none) and meaning."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+BANDS = (
+    Band("disparity", "px", "disparity of the left image, x_right = x_left + disparity"),
+    Band("lower", "px", "lower bound of the disparity interval"),
+    Band("upper", "px", "upper bound of the disparity interval"),
+    Band("confidence", "", "confidence from ambiguity, 0 to 1, high = easy to tell"),
+)
