@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sat_intervals.kernels.vector import LANES, add, hamming, larger, load
+from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, store
 
 
 class Codes(NamedTuple):
@@ -110,6 +110,13 @@ def candidate_costs(left, right, barrier, beyond, r, c, k):
     """
     costs = larger(hamming_costs(left, right, r, c, k), load(barrier, c + k))
     return larger(costs, load(beyond, k))
+
+
+@njit(nogil=True, forceinline=True)
+def cost_curve(left, right, barrier, beyond, r, c, curve):
+    """Write the costs of all candidates of a pixel to ``curve``."""
+    for k in range(0, curve.size, LANES):
+        store(curve, k, candidate_costs(left, right, barrier, beyond, r, c, k))
 
 
 def padded_to_lanes(count: int) -> int:

@@ -13,13 +13,12 @@ import numpy as np
 from numba import njit
 
 from sat_intervals.kernels.confidence import ambiguity
-from sat_intervals.kernels.cost import Codes, candidate_costs, padded_to_lanes
+from sat_intervals.kernels.cost import Codes, cost_curve, padded_to_lanes
 from sat_intervals.kernels.disparity import vfit
 from sat_intervals.kernels.intervals import alpha_cut
-from sat_intervals.kernels.sgm import WALL, advance_pixel, enter_row, path_slots, restart
+from sat_intervals.kernels.sgm import WALL, add_curve, advance_pixel, enter_row, path_slots, restart_all
 from sat_intervals.kernels.vector import (
     LANES,
-    add,
     choose_smaller,
     fill_where_nonzero,
     first_lane,
@@ -64,7 +63,7 @@ class Settings(NamedTuple):
     """
 
     minimum: int
-    count: int
+    count: int  # type: ignore[assignment]
     window: int
     p1: int
     p2: int
@@ -117,7 +116,7 @@ class RightView(NamedTuple):
 
 @njit(nogil=True)
 def _candidates(left_state, right_state, r, count, impossible, barrier, possible):
-    """Fill a row's barrier (cost of impossible candidates) and the number of possible candidates of each pixel."""
+    """Fill a row's barrier, the cost of impossible candidates or 0, and each pixel's number of possible candidates."""
     columns = left_state.shape[1]
     for x in range(right_state.shape[1]):
         barrier[x] = impossible if right_state[r, x] else 0
@@ -126,7 +125,7 @@ def _candidates(left_state, right_state, r, count, impossible, barrier, possible
         usable += right_state[r, x] == 0
     for c in range(columns):
         usable += right_state[r, c + count - 1] == 0
-        possible[c] = usable
+        possible[c] = usable if left_state[r, c] == 0 else 0
         usable -= right_state[r, c] == 0
 
 
@@ -154,28 +153,15 @@ def _winner(curve, lowest):
 
 
 @njit(nogil=True, forceinline=True)
-def _read_curve(curve, lowest, settings, raw, r, c):
-    """Winner, refinement, interval and ambiguity of one pixel."""
-    k = _winner(curve, lowest)
-    raw.winner[r, c] = settings.minimum + k
-    raw.cost[r, c] = lowest
-    shift, refined = 0.0, False
-    if settings.refine:
-        shift, refined = vfit(curve, k, settings.count)
-    raw.disparity[r, c] = np.float32(settings.minimum + k + shift)
-    if not refined:
-        raw.validity[r, c] |= NOT_REFINED
-    if settings.cut_level >= 0:
-        first, last = alpha_cut(curve, np.uint16(min(lowest + settings.cut_level, IMPOSSIBLE_COST - 1)))
-        if settings.refine:  # refinement moves a winner at a bound out of the cut
-            if curve[first] == lowest and first > 0:
-                first -= 1
-            if curve[last] == lowest and last < settings.count - 1:
-                last += 1
-        raw.lower[r, c] = settings.minimum + first
-        raw.upper[r, c] = settings.minimum + last
-    if settings.weights.size:
-        raw.ambiguity[r, c] = ambiguity(curve, settings.count, lowest, settings.weights)
+def _interval(curve, lowest, count, cut_level, refine):
+    """First and last index of the alpha-cut; refinement moves a winner at a bound by up to half a pixel out of it."""
+    first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
+    if refine:
+        if curve[first] == lowest and first > 0:
+            first -= 1
+        if curve[last] == lowest and last < count - 1:
+            last += 1
+    return first, last
 
 
 @njit(nogil=True, forceinline=True)
@@ -192,10 +178,12 @@ def _see_from_right(curve, index, cost, best, start):
 
 
 class _Patch(NamedTuple):
-    """What both sweeps read and write."""
+    """What both sweeps read and write. They unpack it once: counting references would cost more than a pixel."""
 
-    left: Codes
-    right: Codes  # words padded by whole vectors behind the last column
+    left_words: np.ndarray
+    left_state: np.ndarray
+    right_words: np.ndarray  # padded by whole vectors behind the last column
+    right_state: np.ndarray
     barrier: np.ndarray
     possible: np.ndarray
     beyond: np.ndarray
@@ -207,14 +195,16 @@ class _Patch(NamedTuple):
 def _prepare(left: Codes, right: Codes, settings: Settings) -> _Patch:
     rows, columns = left.state.shape
     size = padded_to_lanes(settings.count)
-    words = np.zeros((right.words.shape[0], rows, columns + size), right.words.dtype)
-    words[:, :, : right.words.shape[2]] = right.words
+    right_words = np.zeros((right.words.shape[0], rows, columns + size), right.words.dtype)
+    right_words[:, :, : right.words.shape[2]] = right.words
     beyond = np.zeros(size, np.uint16)
     beyond[settings.count :] = WALL
     slots = 1 + 3 * columns
     return _Patch(
-        left=left,
-        right=Codes(words, right.state),
+        left_words=left.words,
+        left_state=left.state,
+        right_words=right_words,
+        right_state=right.state,
         barrier=np.zeros(columns + size, np.uint16),
         possible=np.zeros(columns, np.int64),
         beyond=beyond,
@@ -224,71 +214,42 @@ def _prepare(left: Codes, right: Codes, settings: Settings) -> _Patch:
     )
 
 
-@njit(nogil=True, forceinline=True)
-def _enter(patch, settings, r, down):
-    """Make the row's candidates known and restart the paths that enter the patch in it; returns its diagonals."""
-    columns = patch.possible.size
-    impossible = settings.window**2 + settings.p2 + 1
-    _candidates(patch.left.state, patch.right.state, r, settings.count, impossible, patch.barrier, patch.possible)
-    falling, rising = -r % columns, r % columns
-    enter_row(patch.paths, patch.lowest, columns, falling, rising, down)
-    return falling, rising
-
-
-@njit(nogil=True, forceinline=True)
-def _advance_or_restart(patch, settings, r, c, falling, rising, target, offset):
-    """Advance the four paths through a pixel; behind one that has no candidate they restart."""
-    slots = path_slots(c, patch.possible.size, falling, rising)
-    if patch.left.state[r, c] != 0 or patch.possible[c] == 0:
-        for slot in slots:
-            restart(patch.paths, patch.lowest, slot)
-        return False
-    advance_pixel(
-        patch.left.words, patch.right.words, patch.barrier, patch.beyond, r, c,
-        settings.p1, settings.p2, patch.paths, patch.lowest, slots, target, offset,
-    )  # fmt: skip
-    return True
-
-
 @njit(nogil=True, cache=True)
 def _sweep_down(patch, settings, row, column, volume):
     """Store the sums of the downward paths of the wanted pixels, which begin at ``row, column``."""
+    left, left_state, right, right_state, barrier, possible, beyond, paths, lowest, curve = patch
+    count, p1, p2 = settings.count, settings.p1, settings.p2
+    impossible = settings.window**2 + p2 + 1
     height, width, size = volume.shape
+    columns = possible.size
     for r in range(row + height):
-        falling, rising = _enter(patch, settings, r, True)
-        for c in range(patch.possible.size):
-            if r >= row and column <= c < column + width:
+        _candidates(left_state, right_state, r, count, impossible, barrier, possible)
+        falling, rising = -r % columns, r % columns
+        enter_row(paths, lowest, columns, falling, rising, True)
+        for c in range(columns):
+            slots = path_slots(c, columns, falling, rising)
+            if possible[c] == 0:
+                restart_all(paths, lowest, slots)
+            elif r >= row and column <= c < column + width:
                 offset = ((r - row) * width + c - column) * size
-                _advance_or_restart(patch, settings, r, c, falling, rising, volume, offset)
+                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slots, volume, offset)
             else:
-                _advance_or_restart(patch, settings, r, c, falling, rising, patch.curve, 0)
-
-
-@njit(nogil=True, forceinline=True)
-def _finish_curve(patch, settings, r, c, volume, offset):
-    """The aggregated curve of a pixel, its paths or its costs summed up; returns its lowest cost."""
-    for k in range(0, patch.curve.size, LANES):
-        if settings.regularized:
-            costs = add(load(patch.curve, k), load(volume, offset + k))
-        else:
-            costs = candidate_costs(patch.left.words, patch.right.words, patch.barrier, patch.beyond, r, c, k)
-        store(patch.curve, k, costs)
-    return _wall_off(patch.curve, patch.barrier, patch.beyond, c)
+                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slots, curve, 0)
 
 
 @njit(nogil=True)
-def _explain(patch, settings, r, c):
-    """Validity flags of what could be searched at a pixel."""
+def _explain(left_state, right_state, r, c, count, possible):
+    """Validity flags of what could be searched at a pixel; the left and the right image are blamed separately."""
     flags = 0
-    left_closed = patch.left.state[r, c] != 0
-    if left_closed:
+    if left_state[r, c] != 0:
         flags |= LEFT_WINDOW
-    if patch.possible[c] == 0:
-        masked = False
-        for x in range(c, c + settings.count):
-            masked |= patch.right.state[r, x] & MASKED != 0
+    usable, masked = 0, False
+    for x in range(c, c + count):
+        usable += right_state[r, x] == 0
+        masked |= right_state[r, x] & MASKED != 0
+    if usable == 0:
         flags |= RIGHT_MASKED if masked else NO_CANDIDATE
-    elif patch.possible[c] < settings.count and not left_closed:
+    elif 0 < possible < count:
         flags |= RANGE_INCOMPLETE
     return flags
 
@@ -296,29 +257,54 @@ def _explain(patch, settings, r, c):
 @njit(nogil=True, cache=True)
 def _sweep_up(patch, settings, row, column, volume, keep, raw, core, index, right_cost, right_best):
     """Finish the curves of the wanted pixels and read them; ``core`` is what the right view is made of."""
+    left, left_state, right, right_state, barrier, possible, beyond, paths, lowest, curve = patch
+    winner, lower, upper, disparity, cost, doubt, validity = raw
+    minimum, count, window, p1, p2, regularized, cut_level, weights, refine = settings
+    impossible = window**2 + p2 + 1
     height, width, size = volume.shape
-    core_row, core_column, core_height, core_width = core
-    for r in range(patch.left.state.shape[0] - 1, row - 1, -1):
-        falling, rising = _enter(patch, settings, r, False)
+    columns = possible.size
+    for r in range(left_state.shape[0] - 1, row - 1, -1):
+        _candidates(left_state, right_state, r, count, impossible, barrier, possible)
+        falling, rising = -r % columns, r % columns
+        enter_row(paths, lowest, columns, falling, rising, False)
         wanted_row = r < row + height
-        shared_row = core_row <= r < core_row + core_height
-        for c in range(patch.possible.size - 1, -1, -1):
-            candidates = _advance_or_restart(patch, settings, r, c, falling, rising, patch.curve, 0)
+        seen_row = core[0] <= r < core[0] + core[2]
+        for c in range(columns - 1, -1, -1):
+            slots = path_slots(c, columns, falling, rising)
+            if possible[c] == 0:
+                restart_all(paths, lowest, slots)
+            elif regularized:
+                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slots, curve, 0)
             if not (wanted_row and column <= c < column + width):
                 continue
-            raw.validity[r - row, c - column] = _explain(patch, settings, r, c)
-            offset = ((r - row) * width + c - column) * size
-            if not candidates:
+            i, j = r - row, c - column
+            if possible[c] < count:
+                validity[i, j] = _explain(left_state, right_state, r, c, count, possible[c])
+            if possible[c] == 0:
                 if keep:
-                    volume[r - row, c - column] = IMPOSSIBLE_COST
+                    volume[i, j] = IMPOSSIBLE_COST
                 continue
-            lowest = _finish_curve(patch, settings, r, c, volume, offset)
-            _read_curve(patch.curve, lowest, settings, raw, r - row, c - column)
-            if shared_row and core_column <= c < core_column + core_width:
-                start = (r - core_row) * right_cost.shape[1] + c - core_column
-                _see_from_right(patch.curve, index, right_cost, right_best, start)
+            if regularized:
+                add_curve(curve, volume, (i * width + j) * size)
+            else:
+                cost_curve(left, right, barrier, beyond, r, c, curve)
+            least = _wall_off(curve, barrier, beyond, c)
+            k = _winner(curve, least)
+            shift, refined = vfit(curve, k, count) if refine else (0.0, False)
+            winner[i, j], cost[i, j] = minimum + k, least
+            disparity[i, j] = minimum + k + shift
+            if not refined:
+                validity[i, j] |= NOT_REFINED
+            if cut_level >= 0:
+                first, last = _interval(curve, least, count, cut_level, refine)
+                lower[i, j], upper[i, j] = minimum + first, minimum + last
+            if weights.size:
+                doubt[i, j] = ambiguity(curve, count, least, weights)
+            if seen_row and core[1] <= c < core[1] + core[3]:
+                start = (r - core[0]) * right_cost.shape[1] + c - core[1]
+                _see_from_right(curve, index, right_cost, right_best, start)
             if keep:
-                volume[r - row, c - column] = patch.curve
+                volume[i, j] = curve
 
 
 def _volume(output: Window, size: int, buffer: np.ndarray | None) -> np.ndarray:

@@ -119,6 +119,20 @@ def restart(paths, lowest, slot):
     lowest[slot] = 0
 
 
+@njit(nogil=True, forceinline=True)
+def restart_all(paths, lowest, slots):
+    """Let the four paths of a pixel start at their next pixels: behind one without candidates nothing is known."""
+    for slot in slots:
+        restart(paths, lowest, slot)
+
+
+@njit(nogil=True, forceinline=True)
+def add_curve(curve, volume, offset):
+    """Add ``volume.ravel()[offset : offset + curve.size]`` to a curve."""
+    for k in range(0, curve.size, LANES):
+        store(curve, k, add(load(curve, k), load(volume, offset + k)))
+
+
 @njit(nogil=True)
 def enter_row(paths, lowest, columns, falling, rising, down):
     """Restart the paths that enter the patch in this row: along it, and the diagonals at its two ends.

@@ -1,0 +1,116 @@
+"""``sat-intervals match``: two epipolar GeoTIFFs and a search range in, georeferenced bands out."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+_FILE = click.Path(path_type=Path)
+
+
+def _debug(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    context.meta["sat_intervals.debug"] = value
+
+
+def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of every command that matches a pair."""
+    options = [
+        click.option("--config", "config_file", type=_FILE, help="Settings (YAML); the command line wins."),
+        click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
+        click.option("--overlap", type=int, help="Pixels read around a core."),
+        click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
+        click.option("--processes", is_flag=True, help="Workers are processes, not threads."),
+        click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles in OUT/tiles."),
+        click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
+        click.option("--quiet", is_flag=True, help="Print errors only."),
+        click.option(
+            "--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."
+        ),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def overrides(disparity: tuple[int, int] | None, tile_size: int | None, overlap: int | None) -> dict[str, Any]:
+    """The settings that the command line gives, as sections."""
+    sections: dict[str, dict[str, Any]] = {"disparity": {}, "tiles": {}}
+    if disparity is not None:
+        sections["disparity"] = {"minimum": disparity[0], "maximum": disparity[1]}
+    given = {"size": tile_size, "overlap": overlap}
+    sections["tiles"] = {name: value for name, value in given.items() if value is not None}
+    return {name: section for name, section in sections.items() if section}
+
+
+@click.command(short_help="Match a pair: disparity, interval, confidence, validity.")
+@click.argument("left", type=str)
+@click.argument("right", type=str)
+@click.argument("out", type=_FILE)
+@click.option("--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched.")
+@click.option("--left-mask", type=str, metavar="FILE", help="Left pixels to leave out: non-zero = masked.")
+@click.option("--right-mask", type=str, metavar="FILE", help="Right pixels to leave out.")
+@click.option("--nodata", type=float, metavar="V", help="No-data value of both images, in place of their own.")
+@click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image.")
+@click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image.")
+@click.option("--band", type=int, metavar="N", help="Band to match, where an image has several.")
+@click.option(
+    "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
+)
+@run_options
+def match(
+    left: str,
+    right: str,
+    out: Path,
+    disparity: tuple[int, int] | None,
+    left_mask: str | None,
+    right_mask: str | None,
+    nodata: float | None,
+    left_nodata: float | None,
+    right_nodata: float | None,
+    band: int | None,
+    window: tuple[int, int, int, int] | None,
+    config_file: Path | None,
+    tile_size: int | None,
+    overlap: int | None,
+    workers: int | None,
+    processes: bool,
+    keep_tiles: bool,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
+    r"""Match the epipolar images LEFT and RIGHT over a search range and write to the folder OUT.
+
+    \b
+    OUT/intervals.tif   disparity, lower, upper (pixels), confidence
+    OUT/validity.tif    flags: why a pixel is invalid, what was done to it
+    OUT/run.json        settings, inputs, figures
+
+    Disparity is x_right - x_left. An interrupted run goes on where it was with the same command.
+    """
+    from sat_intervals.cli.console import Console
+    from sat_intervals.config import load_config
+    from sat_intervals.tiling import Window
+
+    config = load_config(config_file, overrides(disparity, tile_size, overlap))
+    with Console(quiet) as console:
+        from sat_intervals.raster import open_image
+        from sat_intervals.run import match_pair
+
+        report = match_pair(
+            open_image(left, band=band, nodata=_either(left_nodata, nodata), mask=left_mask),
+            open_image(right, band=band, nodata=_either(right_nodata, nodata), mask=right_mask),
+            out,
+            config,
+            window=Window(*window) if window else None,
+            workers=workers,
+            processes=processes,
+            keep_tiles=keep_tiles,
+            overwrite=overwrite,
+            progress=console.progress,
+        )
+    console.summary(report, out)
+
+
+def _either(first: float | None, second: float | None) -> float | None:
+    return second if first is None else first

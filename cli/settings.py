@@ -1,0 +1,14 @@
+"""``sat-intervals config``: a complete, commented file of settings."""
+
+import click
+
+PRESETS = ("default", "homogeneous", "mountain", "urban")
+
+
+@click.command(short_help="Print a complete, commented file of settings.")
+@click.option("--preset", type=click.Choice(PRESETS), default="default", show_default=True, help="Which settings.")
+def config(preset: str) -> None:
+    """Print a complete YAML file of settings, every one commented, to change and give to `match --config`."""
+    from sat_intervals.config import preset_text
+
+    click.echo(preset_text(preset), nl=False)

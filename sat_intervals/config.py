@@ -1,0 +1,424 @@
+"""What a user may set: its default, its range, its one-line meaning, and the thresholds that follow."""
+
+import difflib
+import json
+import reprlib
+from collections.abc import Iterable, Mapping
+from decimal import Decimal
+from fractions import Fraction
+from importlib import resources
+from math import ceil, floor
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Literal, Self, get_args
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import IMPOSSIBLE_COST
+
+SGM_PATHS = 8
+
+
+class ConfigError(SatIntervalsError):
+    """Settings that cannot be used: the message names the file, the key, its value and what is allowed."""
+
+
+def _check_odd(value: int) -> int:
+    if value % 2 == 0:
+        raise PydanticCustomError("odd", "must be odd")
+    return value
+
+
+def _as_written(value: Any) -> Any:
+    # The shortest decimal of a float is what was typed: 0.9, where the float is 0.90000000000000002.
+    return Decimal(repr(value)) if type(value) in (int, float) else value
+
+
+Odd = Annotated[int, AfterValidator(_check_odd)]
+# A number whose thresholds must be exact; a plain number in JSON, so that a run's settings can be read back.
+Exact = Annotated[Decimal, BeforeValidator(_as_written), PlainSerializer(float, when_used="json")]
+# Disparities are stored as int16; within this limit the difference of any two of them fits as well.
+Pixels = Annotated[int, Field(ge=-16000, le=16000)]
+
+
+class Section(BaseModel):
+    """Settings that belong together: immutable; unknown keys, other types and NaN are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _accept_numpy_scalars(cls, value: Any) -> Any:
+        return value.item() if isinstance(value, np.generic) else value
+
+
+class Disparity(Section):
+    """Search range; both ends are searched."""
+
+    minimum: Pixels = Field(description="smallest disparity searched, in pixels")
+    maximum: Pixels = Field(description="largest disparity searched, in pixels")
+
+    @property
+    def count(self) -> int:
+        """Number of candidates of a pixel."""
+        return self.maximum - self.minimum + 1
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.minimum > self.maximum:
+            raise ValueError(f"minimum {self.minimum} is above maximum {self.maximum}, swap them")
+        return self
+
+
+class Census(Section):
+    """Matching cost: Hamming distance of Census codes."""
+
+    method: Literal["census"] = Field("census", description="matching cost")
+    window: Odd = Field(5, ge=3, le=11, description="side of the square window, in pixels")
+
+
+class Sgm(Section):
+    """Semi-global matching over 8 paths (Hirschmuller 2008)."""
+
+    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
+    p2: int = Field(32, ge=1, description="penalty of a larger step, at least p1")
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.p1 > self.p2:
+            raise ValueError(f"p1 {self.p1} is above p2 {self.p2}, the penalty of a larger step")
+        return self
+
+
+class Ambiguity(Section):
+    """Confidence from the ambiguity of a pixel's costs (Sarrazin et al. 2021)."""
+
+    eta_max: Exact = Field(Decimal("0.7"), gt=0, le=1, description="eta, a share of the cost span, stays below this")
+    # At most 1000 levels, so that the ambiguity histograms of tiles stay small.
+    eta_step: Exact = Field(
+        Decimal("0.01"), ge=Decimal("0.001"), le=1, description="step of eta from 0, at most eta_max"
+    )
+    normalization: Literal["percentile", "range"] = Field(
+        "percentile", description="by the image's percentiles, or by the largest possible"
+    )
+    p1: float | None = Field(None, ge=0, description="ambiguity to use as the 1st percentile, with p99")
+    p99: float | None = Field(None, ge=0, description="ambiguity to use as the 99th percentile, with p1")
+
+    @model_validator(mode="after")
+    def _check_together(self) -> Self:
+        if self.eta_step > self.eta_max:
+            raise ValueError(f"eta_step {self.eta_step} is above eta_max {self.eta_max}")
+        if self.p1 is None and self.p99 is None:
+            return self
+        if self.p1 is None or self.p99 is None:
+            raise ValueError(f"p1 is {_shown(self.p1)}, p99 is {_shown(self.p99)}: give both or none")
+        if self.p1 > self.p99:
+            raise ValueError(f"p1 {self.p1} is above p99 {self.p99}, swap them")
+        if self.normalization == "range":
+            raise ValueError("p1 and p99 stand for percentiles: leave them out with normalization range")
+        return self
+
+
+class Interval(Section):
+    """Disparity interval: alpha-cut of a possibility distribution (paper, eq. 5 to 8)."""
+
+    alpha: Exact = Field(Decimal("0.9"), gt=0, le=1, description="level of possibility, not a calibrated probability")
+
+
+class Refinement(Section):
+    """Sub-pixel refinement of the disparity."""
+
+    method: Literal["vfit"] = Field("vfit", description="symmetric V through the costs at and beside the winner")
+
+
+class CrossCheck(Section):
+    """Rejection of pixels on which the left and the right view disagree."""
+
+    method: Literal["fast", "accurate"] = Field(
+        "fast", description="right view read off the left costs, or matched itself at twice the work"
+    )
+    tolerance: int = Field(1, ge=0, description="largest difference of the two views, in pixels")
+
+
+class Median(Section):
+    """Median filter on disparity and bounds, over kept pixels (paper, eq. 10 and 11)."""
+
+    size: Odd = Field(3, ge=3, description="side of the square window, in pixels")
+
+
+class Regularization(Section):
+    """Intervals of low-confidence pixels from quantiles of the bounds around them."""
+
+    threshold: float = Field(0.6, ge=0, le=1, description="confidence up to this is low")
+    kernel: Odd = Field(5, ge=1, description="pixels along the row whose least confidence counts")
+    depth: int = Field(2, ge=0, description="rows reached up and down through touching segments")
+    quantile: float = Field(0.9, ge=0.5, le=1, description="quantile of upper bounds, 1 - quantile of lower ones")
+
+
+class Tiles(Section):
+    """How the image is cut for the workers."""
+
+    # Multiples of 64 keep cores aligned with the blocks of the images read and written.
+    size: int = Field(
+        1024, ge=64, multiple_of=64, description="side of what a tile keeps, in pixels; memory follows it"
+    )
+    overlap: int = Field(100, ge=1, description="pixels read around it and dropped; more leave fewer seams")
+
+
+class Products(Section):
+    """What the written bands hold."""
+
+    keep_rejected: bool = Field(False, description="write values of pixels rejected by cross-checking")
+
+
+class Config(Section):
+    """All settings of a run; a section that is None switches its step off."""
+
+    disparity: Disparity
+    cost: Census = Census()
+    sgm: Sgm | None = Sgm()
+    ambiguity: Ambiguity | None = Ambiguity()
+    interval: Interval | None = Interval()
+    refinement: Refinement | None = Refinement()
+    cross_check: CrossCheck | None = CrossCheck()
+    median: Median | None = Median()
+    regularization: Regularization | None = Regularization()
+    tiles: Tiles = Tiles()
+    products: Products = Products()
+
+    @model_validator(mode="after")
+    def _check_sections(self) -> Self:
+        # The largest uint16 is kept free: it marks the summed cost of an impossible candidate.
+        largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self._largest_cost
+        if self.sgm is not None and self.sgm.p2 > largest:
+            raise ValueError(
+                f"sgm.p2 is {self.sgm.p2}, allowed: <= {largest} with cost.window {self.cost.window}, "
+                f"so that costs summed over {SGM_PATHS} paths fit in 16 bits"
+            )
+        off = [name for name in ("ambiguity", "interval") if getattr(self, name) is None]
+        if self.regularization is not None and off:
+            raise ValueError(
+                f"regularization needs {' and '.join(off)}, which null switches off: "
+                f"give {' and '.join(off)} or set regularization to null"
+            )
+        # Neighbouring tiles are compared on a ring of one pixel around the core: Census must be whole there.
+        smallest = self.cost.window // 2 + 1
+        if self.tiles.overlap < smallest:
+            raise ValueError(
+                f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with cost.window {self.cost.window}"
+            )
+        return self
+
+    @property
+    def _largest_cost(self) -> int:
+        return self.cost.window**2 - 1
+
+    @property
+    def cost_span(self) -> int:
+        """Largest minus smallest possible cost, after SGM where it is on.
+
+        The paper's ``max C_V - min C_V``, declared and not measured: real scenes attain both bounds, and a
+        span measured on a tile would make the result depend on the tiling.
+        """
+        return self._largest_cost if self.sgm is None else SGM_PATHS * (self._largest_cost + self.sgm.p2)
+
+    @property
+    def cut_level(self) -> int | None:
+        """Largest ``S(d) - min S`` of the alpha-cut: ``floor((1 - alpha) * cost_span)``; None if off."""
+        if self.interval is None:
+            return None
+        return floor((1 - Fraction(self.interval.alpha)) * self.cost_span)
+
+    @property
+    def ambiguity_levels(self) -> tuple[int, ...] | None:
+        """Largest ambiguous ``S(d) - min S`` at each eta: ``floor(eta * cost_span)``; None if off."""
+        if self.ambiguity is None:
+            return None
+        step = Fraction(self.ambiguity.eta_step)
+        count = ceil(Fraction(self.ambiguity.eta_max) / step)
+        return tuple(floor(i * step * self.cost_span) for i in range(count))
+
+    @property
+    def largest_ambiguity(self) -> int:
+        """Ambiguity of a pixel all of whose disparities are ambiguous at every eta; 0 without ambiguity."""
+        return len(self.ambiguity_levels or ()) * self.disparity.count
+
+    @property
+    def ambiguity_weights(self) -> npt.NDArray[np.uint16] | None:
+        """Table ``(cost_span + 1,)`` of what a candidate adds to the ambiguity, by its ``S(d) - min S``.
+
+        The number of levels at or above it; ``weights[0]``, all of them, is also what an impossible candidate
+        adds. None if off.
+        """
+        levels = self.ambiguity_levels
+        if levels is None:
+            return None
+        below = np.searchsorted(levels, np.arange(self.cost_span + 1), side="left")
+        return (len(levels) - below).astype(np.uint16)
+
+
+def load_config(
+    source: str | Path | Mapping[str, Any] | Config | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Config:
+    """Check settings and complete them with the defaults.
+
+    Parameters
+    ----------
+    source
+        A YAML file, a mapping of sections, or settings checked before; None for the defaults.
+    overrides
+        Sections and keys that win over ``source``, as those of the command line do.
+
+    Raises
+    ------
+    ConfigError
+        All that is wrong, in one line.
+    """
+    overrides = overrides or {}
+    values: Mapping[str, Any] = {}
+    file = ""
+    match source:
+        case None:
+            pass
+        case str() | Path():
+            values, file = _read_yaml(Path(source)), f"{source}: "
+        case Config():
+            values = source.model_dump()
+        case Mapping():
+            values = source
+        case _:
+            raise ConfigError(f"settings are {_shown(source)}, allowed: a YAML file, a mapping or a Config")
+    try:
+        return Config.model_validate(_merged(values, overrides))
+    except ValidationError as error:
+        problems = error.errors(include_url=False)
+        if all(_given(overrides, problem["loc"]) for problem in problems):
+            file = ""  # not to blame for what the overrides brought
+        raise ConfigError(file + "; ".join(map(_explained, problems))) from error
+
+
+def preset_names() -> tuple[str, ...]:
+    """Return the names of the settings files that come with the package."""
+    files = resources.files("sat_intervals.configs").iterdir()
+    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
+
+
+def preset_text(name: str = "default") -> str:
+    """Return the text of a settings file that comes with the package: complete, commented YAML."""
+    if name not in preset_names():
+        raise ConfigError(f"unknown preset {name!r}{_known(name, preset_names())}")
+    return (resources.files("sat_intervals.configs") / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def allowed(field: FieldInfo) -> str:
+    """Return in words which values a setting takes, from its own type and bounds: ``integer >= 1, odd``."""
+    nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false"}
+    signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
+    kinds = get_args(field.annotation) or (field.annotation,)
+    section = _section(field)
+    kind = f"section of {', '.join(section.model_fields)}" if section else nouns.get(kinds[0]) or " or ".join(kinds)
+    bounds = [
+        f"{sign} {getattr(constraint, name)}"
+        for constraint in field.metadata
+        for name, sign in signs.items()
+        if hasattr(constraint, name)
+    ]
+    if any(constraint == AfterValidator(_check_odd) for constraint in field.metadata):
+        bounds.append("odd")
+    return " ".join(filter(None, [kind, ", ".join(bounds), "or null" if NoneType in kinds else ""]))
+
+
+def _section(field: FieldInfo) -> type[Section] | None:
+    kinds = get_args(field.annotation) or (field.annotation,)
+    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)), None)
+
+
+def _explained(problem: ErrorDetails) -> str:
+    path = [str(key) for key in problem["loc"]]
+    where = ".".join(path)
+    if problem["type"] == "value_error":
+        return ": ".join(filter(None, [where, str(problem["ctx"]["error"])]))
+    owner = (len(path) > 1 and _section(Config.model_fields[path[0]])) or Config
+    if problem["type"] in ("extra_forbidden", "invalid_key"):
+        return f"unknown key {where!r}{_known(path[-1], owner.model_fields)}"
+    state = "missing" if problem["type"] == "missing" else _shown(problem["input"])
+    return f"{where} is {state}, allowed: {allowed(owner.model_fields[path[-1]])}"
+
+
+def _known(name: str, names: Iterable[str]) -> str:
+    names = list(names)
+    guess = "".join(f", did you mean {close}?" for close in difflib.get_close_matches(name, names, n=1))
+    return f"{guess} (known: {', '.join(names)})"
+
+
+def _shown(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
+    return str(value) if isinstance(value, Decimal) else reprlib.repr(value)
+
+
+def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(values)
+    for key, value in overrides.items():
+        below = merged.get(key)
+        if isinstance(below, Mapping) and isinstance(value, Mapping):
+            value = _merged(below, value)
+        merged[key] = value
+    return merged
+
+
+def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
+    for key in path:
+        if not isinstance(overrides, Mapping) or key not in overrides:
+            return False
+        overrides = overrides[key]
+    return bool(path)  # an error without a path is between sections
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML's safe subset, where a key given twice is an error: plain YAML keeps the last without a word."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                raise yaml.MarkedYAMLError(problem=f"key {key.value!r} appears twice", problem_mark=key.start_mark)
+            seen.add(key.value)
+        return node
+
+
+def _read_yaml(file: Path) -> Mapping[str, Any]:
+    try:
+        values = yaml.load(file.read_bytes(), _UniqueKeyLoader)  # a SafeLoader
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror}") from error
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        raise ConfigError(f"{file}: {line}{error.problem}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"{file}: {' '.join(str(error).split())}") from error
+    if values is None:
+        return {}
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{file}: holds {_shown(values)}, allowed: sections {', '.join(Config.model_fields)}")
+    return values

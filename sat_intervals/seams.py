@@ -1,0 +1,104 @@
+"""What the overlap left: neighbours compute the pixel lines beside their border twice, and these are compared.
+
+SGM's paths have no bounded support, so a tile's products depend, a little, on how far the tile was read. The two
+lines along every inner border tell how much.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sat_intervals.kernels.matching import Raw
+from sat_intervals.products import NO_DISPARITY
+from sat_intervals.tiling import Grid, Window
+
+OWN, RING = 0, 1
+TOP, BOTTOM, LEFT, RIGHT = range(4)
+
+
+def seam_lines(raw: Raw, output: Window, core: Window, size: int) -> np.ndarray:
+    """The core's outermost lines and the ring's, which the neighbours own.
+
+    Parameters
+    ----------
+    raw
+        Products of the pixels of ``output``, which holds ``core`` and, on inner borders, one pixel around it.
+    size
+        Length of the longest line.
+
+    Returns
+    -------
+    int16 ``(side, own or ring, winner or lower or upper, size)``; NO_DISPARITY where there is no pixel.
+    """
+    lines = np.full((4, 2, 3, size), NO_DISPARITY, np.int16)
+    inner = core.relative_to(output)
+    rows, columns = inner.slices
+    for i, product in enumerate((raw.winner, raw.lower, raw.upper)):
+        for side, own, ring in ((TOP, inner.row, -1), (BOTTOM, inner.row_stop - 1, 1)):
+            lines[side, OWN, i, : core.width] = product[own, columns]
+            if 0 <= own + ring < output.height:
+                lines[side, RING, i, : core.width] = product[own + ring, columns]
+        for side, own, ring in ((LEFT, inner.column, -1), (RIGHT, inner.column_stop - 1, 1)):
+            lines[side, OWN, i, : core.height] = product[rows, own]
+            if 0 <= own + ring < output.width:
+                lines[side, RING, i, : core.height] = product[rows, own + ring]
+    return lines
+
+
+class _Difference(NamedTuple):
+    """How many pixels of a border were matched, and how many of them differ."""
+
+    pixels: int
+    winner: int
+    bounds: int
+
+    def shares(self) -> dict[str, Any]:
+        pixels = max(self.pixels, 1)
+        return {
+            "pixels": self.pixels,
+            "winner_share": self.winner / pixels,
+            "bounds_share": self.bounds / pixels,
+        }
+
+
+def seam_report(lines: np.ndarray, grid: Grid) -> dict[str, Any]:
+    """Shares of the pixels along inner borders whose raw winner or raw bounds the two neighbours saw differently.
+
+    Parameters
+    ----------
+    lines
+        ``(grid rows, grid columns, side, own or ring, product, size)``, see `seam_lines`.
+    grid
+        The tiles.
+
+    Returns
+    -------
+    ``borders``, ``pixels`` (with a winner for either neighbour), ``winner_share`` and ``bounds_share`` over all borders; ``worst``: the
+    same of the border with the largest ``bounds_share``, None without inner borders.
+    """
+    borders = dict(_borders(lines, grid))
+    total = _Difference(*(sum(counts) for counts in zip((0, 0, 0), *borders.values(), strict=True)))
+    report = {"borders": len(borders), **total.shares(), "worst": None}
+    if borders:
+        name = max(borders, key=lambda key: (borders[key].shares()["bounds_share"], borders[key].winner))
+        report["worst"] = {"between": list(name), **borders[name].shares()}
+    return report
+
+
+def _borders(lines: np.ndarray, grid: Grid) -> Iterator[tuple[tuple[str, str], _Difference]]:
+    for tile in grid:
+        for row, column, side, other in ((0, 1, RIGHT, LEFT), (1, 0, BOTTOM, TOP)):
+            if tile.grid_row + row < grid.rows and tile.grid_column + column < grid.columns:
+                neighbour = grid.tile(tile.grid_row + row, tile.grid_column + column)
+                here = lines[tile.grid_row, tile.grid_column, side]
+                there = lines[neighbour.grid_row, neighbour.grid_column, other]
+                own = np.concatenate([here[OWN], there[OWN]], axis=-1)
+                seen_by_other = np.concatenate([there[RING], here[RING]], axis=-1)
+                yield (tile.name, neighbour.name), _compare(own, seen_by_other)
+
+
+def _compare(first: np.ndarray, second: np.ndarray) -> _Difference:
+    differs = first != second
+    pixels = (first[0] != NO_DISPARITY) | (second[0] != NO_DISPARITY)
+    return _Difference(int(pixels.sum()), int(differs[0].sum()), int((differs[1] | differs[2]).sum()))

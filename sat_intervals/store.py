@@ -1,0 +1,235 @@
+"""What tiles leave behind until the run is finished: arrays, records, a manifest. The only home of zarr.
+
+A tile's arrays lie in one shard each, written by whoever computed the tile, and its record comes last: a tile is done
+when its record is there. Writing a tile again writes the same bytes. The manifest holds everything that decides the
+bytes; a store with another manifest is never mixed in.
+"""
+
+import json
+import math
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import zarr
+from zarr.codecs import BloscCodec
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
+from sat_intervals.tiling import Grid, Tile
+
+# Raw products of the pixels of a core.
+PIXEL_ARRAYS = {
+    "winner": np.int16,
+    "lower": np.int16,
+    "upper": np.int16,
+    "disparity": np.float32,
+    "ambiguity": np.uint32,
+    "validity": np.uint16,
+}
+SIDES = ("top", "bottom", "left", "right")
+# The raw products that neighbours compare along a seam.
+SEAM_PRODUCTS = ("winner", "lower", "upper")
+
+# Rows of a shard that are compressed together, so that strips read no more than they need.
+_ROWS_TOGETHER = 256
+_COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle")
+
+
+class StoreError(SatIntervalsError):
+    """A store that belongs to another run, or cannot be written."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """The tiles of one run under a folder; picklable, so that every worker writes for itself.
+
+    Attributes
+    ----------
+    path
+        The folder.
+    grid
+        The tiles.
+    count
+        Number of disparities of the search range.
+    ambiguities
+        Largest ambiguity a pixel can have.
+    """
+
+    path: Path
+    grid: Grid
+    count: int
+    ambiguities: int
+
+    @property
+    def _reach(self) -> int:
+        """Columns of the right view that a core sees."""
+        return self.grid.size + self.count - 1
+
+    def open(self, manifest: Mapping[str, Any]) -> None:
+        """Create the store, or go on with the one that is there.
+
+        Raises
+        ------
+        StoreError
+            When the store that is there was begun with other settings, inputs or versions.
+        """
+        file = self.path / "manifest.json"
+        wanted = json.loads(json.dumps(manifest))
+        if file.exists():
+            changed = list(_differences(json.loads(file.read_text()), wanted))
+            if changed:
+                raise StoreError(
+                    f"{self.path} holds the tiles of another run: {'; '.join(changed)} "
+                    "(use the same settings and inputs to go on, --overwrite to start afresh)"
+                )
+            return
+        shutil.rmtree(self.path, ignore_errors=True)
+        self._create_arrays()
+        (self.path / "records").mkdir(parents=True)
+        _write_whole(file, json.dumps(manifest, indent=1))
+
+    def _create_arrays(self) -> None:
+        size, height = self.grid.size, self.grid.rows * self.grid.size
+        width = self.grid.columns * size
+        together = math.gcd(size, _ROWS_TOGETHER)
+        group = zarr.create_group(self._arrays)
+        for name, dtype in PIXEL_ARRAYS.items():
+            _create(group, name, (height, width), (size, size), (together, size), dtype)
+        right = height, self.grid.columns * self._reach
+        shard = size, self._reach
+        _create(group, "right_cost", right, shard, (together, self._reach), np.uint16)
+        _create(group, "right_winner", right, shard, (together, self._reach), np.int16)
+        lines = len(SIDES), 2, len(SEAM_PRODUCTS), size
+        _create(group, "seams", (self.grid.rows, self.grid.columns, *lines), None, (1, 1, *lines), np.int16)
+        counts = self.ambiguities + 1
+        _create(
+            group, "histogram", (self.grid.rows, self.grid.columns, counts), None, (1, 1, counts), np.uint32
+        )
+
+    @property
+    def _arrays(self) -> Path:
+        return self.path / "arrays.zarr"
+
+    def _array(self, name: str, mode: Literal["r", "r+"] = "r") -> zarr.Array[Any]:
+        return zarr.open_array(self._arrays / name, mode=mode)
+
+    def _record_file(self, tile: Tile) -> Path:
+        return self.path / "records" / f"{tile.name}.json"
+
+    def is_done(self, tile: Tile) -> bool:
+        """Whether the tile is complete."""
+        return self._record_file(tile).exists()
+
+    def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write what a tile leaves behind.
+
+        Parameters
+        ----------
+        tile
+            Which tile.
+        arrays
+            Those of PIXEL_ARRAYS, of the core's shape; ``right_cost`` and ``right_winner``, which may be missing;
+            ``seams`` (SIDES, own line or ring, SEAM_PRODUCTS, size); ``histogram``.
+        """
+        row = tile.grid_row * self.grid.size
+        for name, array in arrays.items():
+            target = self._array(name, "r+")
+            if name in ("seams", "histogram"):
+                target[tile.grid_row, tile.grid_column] = array
+            else:
+                column = tile.grid_column * (self.grid.size if name in PIXEL_ARRAYS else self._reach)
+                target[row : row + array.shape[0], column : column + array.shape[1]] = array
+
+    def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
+        """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
+        _write_whole(self._record_file(tile), json.dumps(record))
+
+    def records(self) -> dict[str, dict[str, Any]]:
+        """The records of the tiles that are done, by name."""
+        files = ((tile.name, self._record_file(tile)) for tile in self.grid)
+        return {name: json.loads(file.read_text()) for name, file in files if file.exists()}
+
+    def histogram(self) -> np.ndarray:
+        """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``."""
+        stored = self._array("histogram")
+        rows = (np.asarray(stored[row]).sum(axis=0, dtype=np.int64) for row in range(self.grid.rows))
+        return sum(rows, np.zeros(self.ambiguities + 1, np.int64))
+
+    def seams(self) -> np.ndarray:
+        """The lines along the tiles' borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size)."""
+        return np.asarray(self._array("seams")[:])
+
+    def strips(self, rows: int) -> Iterator[dict[str, np.ndarray]]:
+        """Raw products of the region in full-width strips of about ``rows`` rows, from the top.
+
+        The shares of the right view are merged: smallest cost, the largest disparity at ties.
+        """
+        arrays = {name: self._array(name) for name in (*PIXEL_ARRAYS, "right_cost", "right_winner")}
+        width = self.grid.region.width
+        step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
+        for first in range(0, self.grid.region.height, step):
+            last = min(first + step, self.grid.region.height)
+            strip = {name: np.asarray(arrays[name][first:last, :width]) for name in PIXEL_ARRAYS}
+            cost, winner = (np.asarray(arrays[name][first:last]) for name in ("right_cost", "right_winner"))
+            yield strip | {"right_winner": self._merged(cost, winner)}
+
+    def _merged(self, cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
+        """One right view ``(rows, width + count - 1)`` from the shares of all cores of the rows."""
+        columns = self.grid.region.width + self.count - 1
+        best = np.full((cost.shape[0], columns), IMPOSSIBLE_COST, np.uint16)
+        merged = np.full(best.shape, NO_DISPARITY, np.int16)
+        for grid_column in range(self.grid.columns):
+            start, share = grid_column * self.grid.size, grid_column * self._reach
+            width = min(self._reach, columns - start)
+            here, there = np.s_[:, start : start + width], np.s_[:, share : share + width]
+            wins = (cost[there] < best[here]) | (
+                (cost[there] == best[here]) & (winner[there] > merged[here])
+            )
+            best[here] = np.where(wins, cost[there], best[here])
+            merged[here] = np.where(wins, winner[there], merged[here])
+        return merged
+
+    def remove(self) -> None:
+        """Delete the store."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def _create(
+    group: zarr.Group,
+    name: str,
+    shape: tuple[int, ...],
+    shard: tuple[int, ...] | None,
+    chunk: tuple[int, ...],
+    dtype: npt.DTypeLike,
+) -> None:
+    fill = {"right_cost": IMPOSSIBLE_COST, "disparity": np.nan, "validity": 0, "ambiguity": 0, "histogram": 0}
+    group.create_array(
+        name, shape=shape, shards=shard, chunks=chunk, dtype=dtype,
+        compressors=_COMPRESSOR, fill_value=fill.get(name, NO_DISPARITY),
+    )  # fmt: skip
+
+
+def _write_whole(file: Path, text: str) -> None:
+    """Write a file that is either there as a whole or not at all."""
+    temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
+    try:
+        temporary.write_text(text)
+        os.replace(temporary, file)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
+    """The values in which two manifests differ, each with its path."""
+    if isinstance(there, dict) and isinstance(wanted, dict):
+        for key in sorted(there.keys() | wanted.keys()):
+            yield from _differences(there.get(key), wanted.get(key), f"{path}.{key}".lstrip("."))
+    elif there != wanted:
+        yield f"{path} was {json.dumps(there)}, now {json.dumps(wanted)}"

@@ -1,0 +1,567 @@
+"""Every kernel again, slow and obvious: the method's text in loops, exact integers and fractions.
+
+Nothing here is shared with the kernels but the table of constants. Letters: r row, c column, k disparity
+index, d = minimum + k disparity, R = window // 2. Left pixel (r, c) at index k faces ``right[r, c + k]``:
+right arrays have ``columns + count - 1`` columns. Section numbers are those of the method.
+
+Costs are int64 ``(rows, columns, count)`` with IMPOSSIBLE_COST at impossible candidates; indices of
+disparities are int64 with -1 where there is none.
+"""
+
+import math
+from decimal import Decimal
+from fractions import Fraction
+from types import SimpleNamespace
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sat_intervals.products import (
+    IMPOSSIBLE_COST,
+    INVALID,
+    LEFT_MASKED,
+    LEFT_WINDOW,
+    MASKED,
+    MISMATCH,
+    NO_CANDIDATE,
+    NO_DATA,
+    NO_DISPARITY,
+    NOT_REFINED,
+    OCCLUSION,
+    RANGE_INCOMPLETE,
+    REGULARIZED,
+    REJECTED,
+    RIGHT_MASKED,
+)
+
+NONE = -1  # the index of a disparity that does not exist
+PATHS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+# ---- 1. Matching cost --------------------------------------------------------------------------------------
+def census(pixels, window):
+    """Section 1: ``(rows - 2R, columns - 2R, window^2)`` bits, 1 where the neighbour is above the centre."""
+    radius = window // 2
+    rows, columns = (size - 2 * radius for size in pixels.shape)
+    bits = np.zeros((rows, columns, window * window), bool)
+    for r in range(rows):
+        for c in range(columns):
+            bits[r, c] = (pixels[r : r + window, c : c + window] > pixels[r + radius, c + radius]).ravel()
+    return bits
+
+
+def window_state(state, window):
+    """Section 1: the union of the states of a window's pixels, 0 where the whole window is usable."""
+    radius = window // 2
+    rows, columns = (size - 2 * radius for size in state.shape)
+    union = np.zeros((rows, columns), np.uint8)
+    for r in range(rows):
+        for c in range(columns):
+            union[r, c] = np.bitwise_or.reduce(state[r : r + window, c : c + window], axis=None)
+    return union
+
+
+def possible(left_state, right_state):
+    """Section 1: a candidate is impossible when either window's state is not 0."""
+    rows, columns = left_state.shape
+    count = right_state.shape[1] - columns + 1
+    result = np.zeros((rows, columns, count), bool)
+    for k in range(count):
+        result[:, :, k] = (left_state == 0) & (right_state[:, k : k + columns] == 0)
+    return result
+
+
+def census_cost(left, right, left_state, right_state, window):
+    """Section 1: Hamming distances of the windows of two padded patches."""
+    left_bits, right_bits = census(left, window), census(right, window)
+    searched = possible(window_state(left_state, window), window_state(right_state, window))
+    columns = left_bits.shape[1]
+    cost = np.full(searched.shape, IMPOSSIBLE_COST, np.int64)
+    for k in range(cost.shape[2]):
+        distance = (left_bits != right_bits[:, k : k + columns]).sum(axis=2)
+        cost[:, :, k] = np.where(searched[:, :, k], distance, IMPOSSIBLE_COST)
+    return cost
+
+
+# ---- 2, 3. Semi-global matching and the cost span ----------------------------------------------------------
+def aggregate(cost, window, p1, p2):
+    """Section 2: the sum of the eight path costs; an empty pixel carries nothing, paths restart behind it."""
+    impossible = cost == IMPOSSIBLE_COST
+    empty = impossible.all(axis=2)
+    priced = np.where(impossible, window * window + p2 + 1, cost)
+    total = sum(path_cost(priced, empty, step, p1, p2) for step in PATHS)
+    return np.where(impossible, IMPOSSIBLE_COST, total)
+
+
+def path_cost(cost, empty, step, p1, p2):
+    """Section 2: L along one path; ``step`` leads from the previous pixel q to the pixel p."""
+    rows, columns, count = cost.shape
+    path = np.zeros_like(cost)
+    for r in range(rows)[:: step[0] or 1]:
+        for c in range(columns)[:: step[1] or 1]:
+            if empty[r, c]:
+                continue
+            q = r - step[0], c - step[1]
+            path[r, c] = cost[r, c]
+            if 0 <= q[0] < rows and 0 <= q[1] < columns and not empty[q]:
+                least = path[q].min()
+                smaller, larger = np.full(count, least + p2), np.full(count, least + p2)
+                smaller[1:] = path[q][:-1] + p1
+                larger[:-1] = path[q][1:] + p1
+                path[r, c] += (
+                    np.minimum.reduce([path[q], smaller, larger, np.full(count, least + p2)]) - least
+                )
+    return path
+
+
+def span(window, p2):
+    """Section 3: the declared span of the cost; ``p2=None`` without SGM."""
+    return window * window - 1 if p2 is None else 8 * (window * window - 1 + p2)
+
+
+# ---- 4. Ambiguity and confidence ---------------------------------------------------------------------------
+def etas(eta_max, eta_step):
+    """Section 4: 0, step, 2 step, .. below eta_max, as fractions of the decimals a person wrote."""
+    stop, step = Fraction(Decimal(str(eta_max))), Fraction(Decimal(str(eta_step)))
+    return [i * step for i in range(math.ceil(stop / step))]
+
+
+def ambiguity(volume, eta_max, eta_step, cost_span):
+    """Section 4: candidates within eta * span of the minimum or impossible, over all etas; 0 where empty."""
+    result = np.zeros(volume.shape[:2], np.int64)
+    for r, c in np.ndindex(result.shape):
+        searched = volume[r, c] != IMPOSSIBLE_COST
+        if searched.any():
+            above = volume[r, c] - volume[r, c].min()
+            for eta in etas(eta_max, eta_step):
+                # above <= eta * span, multiplied by eta's denominator: integers on both sides
+                near = above * eta.denominator <= eta.numerator * cost_span
+                result[r, c] += np.count_nonzero(near | ~searched)
+    return result
+
+
+def percentile(histogram, percent):
+    """Section 4: of the values ``histogram`` counts, linear between order statistics; a Fraction."""
+    values = np.repeat(np.arange(len(histogram)), histogram)
+    position = Fraction(percent, 100) * (len(values) - 1)
+    below = math.floor(position)
+    above = min(below + 1, len(values) - 1)
+    return int(values[below]) + (position - below) * (int(values[above]) - int(values[below]))
+
+
+def normalize(amounts, searched, p1, p99):
+    """Section 4: confidence float32, NaN where no candidate was searched."""
+    result = np.full(amounts.shape, np.nan, np.float32)
+    for r, c in np.argwhere(searched):
+        amount = float(amounts[r, c])
+        if p99 <= p1:
+            result[r, c] = 1 if amount <= p1 else 0
+        else:
+            result[r, c] = 1 - min(max((amount - p1) / (p99 - p1), 0.0), 1.0)
+    return result
+
+
+def low_confidence(confidence, threshold, kernel):
+    """Section 8: the least confidence over 1 x kernel is at most the threshold; never where there is none."""
+    rows, columns = confidence.shape
+    low = np.zeros(confidence.shape, bool)
+    for r in range(rows):
+        for c in range(columns):
+            near = confidence[r, max(0, c - kernel // 2) : c + kernel // 2 + 1]
+            least = min([np.float32(1), *near[~np.isnan(near)]])
+            low[r, c] = not np.isnan(confidence[r, c]) and least <= np.float32(threshold)
+    return low
+
+
+# ---- 5. Possibility and alpha-cut --------------------------------------------------------------------------
+def alpha_cut(volume, alpha, cost_span, extend):
+    """Section 5: the first and the last index with possibility >= alpha, pushed out at S = min S."""
+    lower, upper = (np.full(volume.shape[:2], NONE) for _ in range(2))
+    count = volume.shape[2]
+    for r, c in np.ndindex(lower.shape):
+        costs = {k: int(s) for k, s in enumerate(volume[r, c]) if s != IMPOSSIBLE_COST}
+        if not costs:
+            continue
+        least = min(costs.values())
+        cut = [
+            k for k, s in costs.items() if 1 - Fraction(s - least, cost_span) >= Fraction(Decimal(str(alpha)))
+        ]
+        first, last = min(cut), max(cut)
+        lower[r, c] = max(first - 1, 0) if extend and costs[first] == least else first
+        upper[r, c] = min(last + 1, count - 1) if extend and costs[last] == least else last
+    return lower, upper
+
+
+def cut_level(alpha, cost_span):
+    """Section 5: the largest ``S - min S`` that belongs to the cut."""
+    return int((1 - Decimal(str(alpha))) * cost_span)
+
+
+# ---- 6. Disparity ------------------------------------------------------------------------------------------
+def winner_takes_all(volume):
+    """Section 6: the index of the least cost, the smallest at ties."""
+    return np.where(volume.min(axis=2) == IMPOSSIBLE_COST, NONE, volume.argmin(axis=2))
+
+
+def vfit(volume, winner, minimum):
+    """Section 6: float32 disparities and where the refinement was done."""
+    disparity = np.full(winner.shape, np.nan, np.float32)
+    refined = np.zeros(winner.shape, bool)
+    for r, c in np.argwhere(winner != NONE):
+        k = int(winner[r, c])
+        shift = Fraction(0)
+        if 0 < k < volume.shape[2] - 1:
+            before, here, after = (int(s) for s in volume[r, c, k - 1 : k + 2])
+            if before != IMPOSSIBLE_COST and after != IMPOSSIBLE_COST and max(before, after) > here:
+                shift = Fraction(before - after, 2 * (max(before, after) - here))
+                refined[r, c] = True
+        disparity[r, c] = float(minimum + k + shift)
+    return disparity, refined
+
+
+def right_winners(volume):
+    """Section 6, ``fast``: argmin over k of ``S(r, j - k, k)`` for right column j, the largest k at ties."""
+    rows, columns, count = volume.shape
+    winners = np.full((rows, columns + count - 1), NONE)
+    costs = np.full(winners.shape, IMPOSSIBLE_COST)
+    for r, j in np.ndindex(winners.shape):
+        for k in range(count):
+            here = volume[r, j - k, k] if 0 <= j - k < columns else IMPOSSIBLE_COST
+            if here != IMPOSSIBLE_COST and here <= costs[r, j]:
+                winners[r, j], costs[r, j] = k, here
+    return winners, costs
+
+
+def absolute(index, minimum):
+    """Indices as disparities, int16 with NO_DISPARITY."""
+    return np.where(index == NONE, NO_DISPARITY, index + minimum).astype(np.int16)
+
+
+def cross_check(winner, right_winner, minimum, tolerance):
+    """Section 6: 0 where kept or without winner, else OCCLUSION or MISMATCH, of ``absolute`` disparities."""
+    count = right_winner.shape[1] - winner.shape[1] + 1
+    result = np.zeros(winner.shape, np.uint16)
+    for r, c in np.argwhere(winner != NO_DISPARITY):
+        seen = [int(d) for d in right_winner[r, c : c + count]]
+        d, back = int(winner[r, c]), seen[winner[r, c] - minimum]
+        if back == NO_DISPARITY or abs(d - back) > tolerance:
+            agrees = any(seen[k] == minimum + k for k in range(count))
+            result[r, c] = MISMATCH if agrees else OCCLUSION
+    return result
+
+
+# ---- 7. Median ---------------------------------------------------------------------------------------------
+def median(values, kept, size):
+    """Section 7: kept pixels get the median over the kept pixels of their window."""
+    result = values.copy()
+    radius = size // 2
+    for r, c in np.argwhere(kept):
+        near = np.s_[max(0, r - radius) : r + radius + 1, max(0, c - radius) : c + radius + 1]
+        ordered = sorted(values[near][kept[near]])
+        middle = len(ordered) // 2
+        if len(ordered) % 2:
+            result[r, c] = ordered[middle]
+        else:
+            result[r, c] = (ordered[middle - 1] + ordered[middle]) / np.float32(2)
+    return result
+
+
+# ---- 8. Regularisation of intervals ------------------------------------------------------------------------
+def segments(low):
+    """Section 8: runs of low-confidence pixels in a row, as sets of pixels."""
+    runs = []
+    for r in range(low.shape[0]):
+        for c in range(low.shape[1]):
+            if low[r, c]:
+                if c == 0 or not low[r, c - 1]:
+                    runs.append(set())
+                runs[-1].add((r, c))
+    return runs
+
+
+def neighbourhood(runs, i, depth):
+    """Section 8: A(segment i), the segments reached in at most ``depth`` steps between touching segments."""
+    reached = {i}
+    for _ in range(depth):
+        beside = {(r + step, c) for j in reached for r, c in runs[j] for step in (-1, 1)}
+        reached |= {j for j, run in enumerate(runs) if run & beside}
+    return reached
+
+
+def quantile(values, share):
+    """Section 8: linear interpolation between order statistics, as a Fraction."""
+    ordered = sorted(Fraction(float(value)) for value in values)
+    position = share * (len(ordered) - 1)
+    below = math.floor(position)
+    above = min(below + 1, len(ordered) - 1)
+    return ordered[below] + (position - below) * (ordered[above] - ordered[below])
+
+
+def regularize(lower, upper, low, depth, share):
+    """Section 8: low pixels get the quantiles ``1 - share`` and ``share`` of all bounds of A."""
+    lower, upper = lower.copy(), upper.copy()
+    old_lower, old_upper = lower.copy(), upper.copy()
+    share = Fraction(Decimal(str(share)))
+    runs = segments(low)
+    for i, run in enumerate(runs):
+        pixels = [pixel for j in neighbourhood(runs, i, depth) for pixel in runs[j]]
+        for pixel in run:
+            lower[pixel] = float(quantile([old_lower[p] for p in pixels], 1 - share))
+            upper[pixel] = float(quantile([old_upper[p] for p in pixels], share))
+    return lower, upper
+
+
+def widen(lower, upper, disparity):
+    """Section 8: the last law, lower <= disparity <= upper."""
+    return np.minimum(lower, disparity), np.maximum(upper, disparity)
+
+
+# ---- 9. Validity -------------------------------------------------------------------------------------------
+def right_bits(right_window_state, columns):
+    """Section 9, bits 1 and 7: no facing right window is usable; 7 where the right mask has a part in it."""
+    count = right_window_state.shape[1] - columns + 1
+    bits = np.zeros((right_window_state.shape[0], columns), np.uint16)
+    for r, c in np.ndindex(bits.shape):
+        facing = right_window_state[r, c : c + count]
+        if (facing != 0).all():
+            bits[r, c] = RIGHT_MASKED if (facing & MASKED).any() else NO_CANDIDATE
+    return bits
+
+
+def validity(left_pixel_state, left_window_state, right_window_state, refined):
+    """Section 9: the bits a tile knows. Without refinement ``refined`` is False everywhere."""
+    searched = possible(left_window_state, right_window_state)
+    bits = right_bits(right_window_state, left_window_state.shape[1])
+    for r, c in np.ndindex(bits.shape):
+        if left_window_state[r, c]:
+            bits[r, c] |= LEFT_WINDOW
+        if left_pixel_state[r, c] & MASKED:
+            bits[r, c] |= LEFT_MASKED
+        if searched[r, c].any():
+            if not searched[r, c].all():
+                bits[r, c] |= RANGE_INCOMPLETE
+            if not refined[r, c]:
+                bits[r, c] |= NOT_REFINED
+    return bits
+
+
+# ---- The whole method on one pair, untiled -----------------------------------------------------------------
+def cut(image, column, width, radius, fill):
+    """Columns ``[column, column + width)`` and ``radius`` pixels more on every side, ``fill`` outside."""
+    rows, columns = image.shape
+    result = np.full((rows + 2 * radius, width + 2 * radius), fill, image.dtype)
+    for c in range(width + 2 * radius):
+        if 0 <= column - radius + c < columns:
+            result[radius : radius + rows, c] = image[:, column - radius + c]
+    return result
+
+
+def match_view(view, minimum, maximum, config):
+    """Sections 1, 2: the cost volume of ``view.left`` over a search range, and the states of the windows."""
+    window, radius = config.cost.window, config.cost.window // 2
+    columns = view.left.shape[1]
+    facing = columns + maximum - minimum
+    left_state = cut(view.left_state, 0, columns, radius, NO_DATA)
+    right_state = cut(view.right_state, minimum, facing, radius, NO_DATA)
+    volume = census_cost(
+        cut(view.left, 0, columns, radius, 0),
+        cut(view.right, minimum, facing, radius, 0),
+        left_state,
+        right_state,
+        window,
+    )
+    if config.sgm is not None:
+        volume = aggregate(volume, window, config.sgm.p1, config.sgm.p2)
+    return volume, window_state(left_state, window), window_state(right_state, window)
+
+
+def facing_winners(view, volume, config):
+    """Section 6: d_R of every right pixel that faces the left image, by either method."""
+    minimum, maximum = config.disparity.minimum, config.disparity.maximum
+    if config.cross_check.method == "fast":
+        return absolute(right_winners(volume)[0], minimum)
+    swapped = SimpleNamespace(
+        left=view.right, right=view.left, left_state=view.right_state, right_state=view.left_state
+    )
+    right_volume, _, _ = match_view(swapped, -maximum, -minimum, config)
+    # The right view's disparity is -d: its smallest at ties is the largest d.
+    seen = absolute(winner_takes_all(right_volume), -maximum)
+    seen = np.where(seen == NO_DISPARITY, NO_DISPARITY, -seen).astype(np.int16)
+    return cut(seen, minimum, volume.shape[1] + maximum - minimum, 0, NO_DISPARITY)
+
+
+def percentiles_of(amounts, searched, config):
+    """Section 4: p1 and p99 as given, or 0 and the largest possible ambiguity, or of the whole image."""
+    settings = config.ambiguity
+    if settings.p1 is not None:
+        return settings.p1, settings.p99
+    if settings.normalization == "range":
+        count = config.disparity.maximum - config.disparity.minimum + 1
+        return 0.0, float(len(etas(settings.eta_max, settings.eta_step)) * count)
+    histogram = np.bincount(amounts[searched])
+    return float(percentile(histogram, 1)), float(percentile(histogram, 99))
+
+
+def match_arrays(left, right, left_state, right_state, config):
+    """All sections on one small pair; ``config`` has the YAML's sections as attributes, None = switched off.
+
+    Returns ``disparity``, ``lower``, ``upper``, ``confidence`` (float32) and ``validity`` (uint16) as written
+    to the files, and the raw products they come from.
+    """
+    left_state = left_state | np.where(np.isfinite(left), 0, NO_DATA).astype(np.uint8)
+    right_state = right_state | np.where(np.isfinite(right), 0, NO_DATA).astype(np.uint8)
+    view = SimpleNamespace(left=left, right=right, left_state=left_state, right_state=right_state)
+    minimum, maximum = config.disparity.minimum, config.disparity.maximum
+    volume, left_windows, right_windows = match_view(view, minimum, maximum, config)
+    cost_span = span(config.cost.window, config.sgm and config.sgm.p2)
+
+    winner = winner_takes_all(volume)
+    searched = winner != NONE
+    disparity, refined = vfit(volume, winner, minimum)
+    if config.refinement is None:
+        disparity = np.where(searched, winner + minimum, np.nan).astype(np.float32)
+        refined[:] = False
+    flags = validity(left_state, left_windows, right_windows, refined)
+    lower, upper = (np.full(winner.shape, np.nan, np.float32) for _ in range(2))
+    if config.interval is not None:
+        bounds = alpha_cut(volume, config.interval.alpha, cost_span, extend=config.refinement is not None)
+        lower, upper = (np.where(searched, b + minimum, np.nan).astype(np.float32) for b in bounds)
+    raw = SimpleNamespace(
+        volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags
+    )
+
+    flags = flags.copy()
+    if config.cross_check is not None:
+        seen = facing_winners(view, volume, config)
+        flags |= cross_check(absolute(winner, minimum), seen, minimum, config.cross_check.tolerance)
+    kept = (flags & INVALID) == 0
+
+    confidence = np.full(winner.shape, np.nan, np.float32)
+    if config.ambiguity is not None and searched.any():
+        amounts = ambiguity(volume, config.ambiguity.eta_max, config.ambiguity.eta_step, cost_span)
+        confidence = normalize(amounts, searched, *percentiles_of(amounts, searched, config))
+
+    if config.median is not None:
+        disparity = median(disparity, kept, config.median.size)
+        if config.interval is not None:
+            lower, upper = (median(bound, kept, config.median.size) for bound in (lower, upper))
+    if config.regularization is not None:
+        settings = config.regularization
+        low = low_confidence(confidence, settings.threshold, settings.kernel)
+        lower, upper = regularize(lower, upper, low, settings.depth, settings.quantile)
+        flags |= np.where(low, REGULARIZED, 0).astype(np.uint16)
+    if config.interval is not None:
+        lower, upper = widen(lower, upper, disparity)
+
+    hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
+    shown = (flags & hidden) == 0
+    disparity, lower, upper = (
+        np.where(shown, band, np.float32(np.nan)) for band in (disparity, lower, upper)
+    )
+    return SimpleNamespace(
+        disparity=disparity, lower=lower, upper=upper, confidence=confidence, validity=flags, raw=raw
+    )
+
+
+# ---- Inputs for the tests ----------------------------------------------------------------------------------
+def patch_pair(seed, rows, columns, count, window, style="shifted"):
+    """A padded pair of patches with few grey levels, so that ties abound: float32 pixels, no states yet.
+
+    ``shifted``: the right view is the left one moved by a varying disparity, with some noise; ``noise``:
+    nothing in common; ``flat``: almost no texture.
+    """
+    random = np.random.default_rng(seed)
+    rows, columns = rows + 2 * (window // 2), columns + 2 * (window // 2)
+    left = random.integers(0, 2 if style == "flat" else 12, (rows, columns))
+    right = random.integers(0, 2 if style == "flat" else 12, (rows, columns + count - 1))
+    if style == "flat":
+        left[random.random(left.shape) < 0.9] = 0
+        right[random.random(right.shape) < 0.9] = 0
+    if style == "shifted":
+        for r in range(rows):
+            if r % 4 == 0:
+                k = int(random.integers(0, count))
+            right[r, k : k + columns] = left[r]
+            noisy = random.random(right.shape[1]) < 0.1
+            right[r, noisy] = random.integers(0, 12, noisy.sum())
+    return left.astype(np.float32), right.astype(np.float32)
+
+
+@st.composite
+def states(draw, shape):
+    """Pixel states of a patch: usable, scattered holes and masks, edges without data, or nothing usable."""
+    rows, columns = shape
+    kind = draw(st.sampled_from(["usable", "scattered", "scattered", "scattered", "edges", "both", "empty"]))
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    state = np.zeros(shape, np.uint8)
+    if kind in ("scattered", "both"):
+        for _ in range(random.integers(1, 4)):
+            state[random.integers(rows), random.integers(columns)] = random.integers(1, 4)
+    if kind in ("edges", "both"):
+        state[: random.integers(0, 2)] |= NO_DATA
+        state[rows - random.integers(0, 2) :] |= MASKED
+        state[:, : random.integers(0, columns // 4 + 1)] |= NO_DATA
+        state[:, columns - random.integers(0, columns // 4 + 1) :] |= np.uint8(random.integers(1, 3))
+    if kind == "empty" and draw(st.booleans()):
+        state[:] = draw(st.integers(1, 3))
+    return state
+
+
+@st.composite
+def scenes(draw, counts=(1, 2, 3, 5, 9, 16, 31, 32, 33), windows=(3, 3, 5, 7), rows=8, columns=20):
+    """Two padded patches with their states, a window, a search range and penalties, as a namespace."""
+    window, count = draw(st.sampled_from(windows)), draw(st.sampled_from(counts))
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    rows, columns = int(random.integers(1, rows + 1)), int(random.integers(1, columns + 1))
+    style = draw(st.sampled_from(["shifted", "shifted", "noise", "flat"]))
+    left, right = patch_pair(random, rows, columns, count, window, style)
+    p1 = draw(st.integers(0, 40))
+    return SimpleNamespace(
+        left=left,
+        right=right,
+        left_state=draw(states(left.shape)),
+        right_state=draw(states(right.shape)),
+        window=window,
+        minimum=draw(st.sampled_from([0, -count + 1, -200, 7])),
+        count=count,
+        p1=p1,
+        p2=p1 + draw(st.integers(0, 60)),
+        regularized=draw(st.sampled_from([True, True, False])),
+    )
+
+
+def volume_of(scene):
+    """The cost volume of a scene."""
+    cost = census_cost(scene.left, scene.right, scene.left_state, scene.right_state, scene.window)
+    return aggregate(cost, scene.window, scene.p1, scene.p2) if scene.regularized else cost
+
+
+def span_of(scene):
+    """The declared span of a scene's cost."""
+    return span(scene.window, scene.p2 if scene.regularized else None)
+
+
+def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True):
+    """The fields of ``sat_intervals.kernels.matching.Settings`` for a scene; None = the step is off."""
+    cost_span = span_of(scene)
+    weights = np.zeros(0, np.uint16)
+    if eta_max is not None:
+        levels = [math.floor(eta * cost_span) for eta in etas(eta_max, eta_step)]
+        weights = np.array([sum(x <= level for level in levels) for x in range(cost_span + 1)], np.uint16)
+    return {
+        "minimum": scene.minimum,
+        "count": scene.count,
+        "window": scene.window,
+        "p1": scene.p1,
+        "p2": scene.p2,
+        "regularized": scene.regularized,
+        "cut_level": NONE if alpha is None else cut_level(alpha, cost_span),
+        "weights": weights,
+        "refine": refine,
+    }
+
+
+def halves(shape, least=-16, most=16):
+    """Hypothesis float32 images of halves of integers, whose values often tie."""
+    return hnp.arrays(np.float32, shape, elements=st.integers(least, most).map(lambda value: value / 2))

@@ -1,0 +1,403 @@
+"""Settings: defaults, ranges, messages, shipped files, and the exact thresholds that follow from them."""
+
+import re
+from collections.abc import Mapping
+from decimal import Decimal
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from sat_intervals.config import (
+    Ambiguity,
+    Census,
+    Config,
+    ConfigError,
+    Disparity,
+    Interval,
+    Sgm,
+    allowed,
+    load_config,
+    preset_names,
+    preset_text,
+)
+from sat_intervals.errors import SatIntervalsError
+
+RANGE = {"disparity": {"minimum": -60, "maximum": 0}}
+
+
+def settings(**sections: Any) -> Config:
+    return load_config(RANGE, sections)
+
+
+def message(source: Any, overrides: Mapping[str, Any] | None = None) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(source, overrides)
+    text = str(caught.value)
+    assert len(text.splitlines()) == 1
+    return text
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def write(text: str | bytes) -> Path:
+        file = tmp_path / "settings.yaml"
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return file
+
+    return write
+
+
+# --- defaults and shipped files
+
+
+def test_load_config__completes_with_the_defaults() -> None:
+    assert load_config(RANGE) == Config(disparity=Disparity(minimum=-60, maximum=0))
+
+
+def test_default_yaml__holds_every_setting_at_its_default() -> None:
+    values = yaml.safe_load(preset_text())
+    assert list(values) == list(Config.model_fields)
+    for section, keys in values.items():
+        model = getattr(settings(), section)
+        assert list(keys) == list(type(model).model_fields)
+    assert load_config(values) == settings()
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: str) -> None:
+    section = None
+    commented = []
+    for line in preset_text(name).splitlines():
+        if found := re.fullmatch(r"(\w+):", line):
+            section = type(getattr(settings(), found[1]))
+        elif found := re.fullmatch(r"  (\w+): \S+ +# (.*)", line):
+            field = section.model_fields[found[1]]
+            assert found[2] == f"{field.description} ({allowed(field)})"
+            commented.append((section, found[1]))
+        else:
+            assert not line or line.startswith("#")
+    models = [type(getattr(settings(), name)) for name in Config.model_fields]
+    assert commented == [(model, key) for model in models for key in model.model_fields]
+
+
+@pytest.mark.parametrize(("name", "p1", "p2"), [("urban", 20, 80), ("mountain", 38, 464), ("homogeneous", 72, 309)])
+def test_preset_text__changes_census_and_penalties_only(name: str, p1: int, p2: int) -> None:
+    config = load_config(yaml.safe_load(preset_text(name)))
+    assert config == settings(cost={"window": 11}, sgm={"p1": p1, "p2": p2})
+
+
+def test_preset_names__are_the_shipped_files() -> None:
+    assert preset_names() == ("default", "homogeneous", "mountain", "urban")
+
+
+def test_preset_text__unknown_name_tells_the_known_ones() -> None:
+    with pytest.raises(ConfigError) as caught:
+        preset_text("urbn")
+    assert str(caught.value) == (
+        "unknown preset 'urbn', did you mean urban? (known: default, homogeneous, mountain, urban)"
+    )
+
+
+# --- sources
+
+
+def test_load_config__reads_a_file_by_path_or_name(write) -> None:
+    file = write("disparity: {minimum: -60, maximum: 0}\nsgm: null\n")
+    assert load_config(file) == load_config(str(file)) == settings(sgm=None)
+
+
+@pytest.mark.parametrize("text", ["", "# only comments\n", "---\n"])
+def test_load_config__empty_file_is_the_defaults(write, text: str) -> None:
+    assert load_config(write(text), RANGE) == load_config(RANGE)
+
+
+def test_load_config__overrides_win_key_by_key() -> None:
+    source = {"disparity": {"minimum": -60, "maximum": 0}, "sgm": {"p1": 4, "p2": 64}, "median": None}
+    config = load_config(source, {"disparity": {"minimum": -9}, "sgm": {"p1": 2}, "median": {"size": 5}})
+    assert config.disparity == Disparity(minimum=-9, maximum=0)
+    assert config.sgm == Sgm(p1=2, p2=64)
+    assert config.median is not None
+    assert config.median.size == 5
+    assert load_config(config, {"sgm": None}).sgm is None
+    assert source["sgm"] == {"p1": 4, "p2": 64}
+
+
+def test_load_config__takes_its_own_result_and_any_mapping() -> None:
+    config = settings(interval={"alpha": 0.85})
+    assert load_config(config) == config
+    assert load_config(MappingProxyType(config.model_dump())) == config
+
+
+def test_load_config__accepts_numpy_scalars() -> None:
+    config = load_config({"disparity": {"minimum": np.int16(-9), "maximum": np.int64(3)}})
+    assert config.disparity == Disparity(minimum=-9, maximum=3)
+    assert settings(interval={"alpha": np.float64(0.9)}) == settings()
+
+
+@given(st.decimals(min_value="0.001", max_value="1", places=6))
+def test_config__comes_back_from_json(alpha: Decimal) -> None:
+    config = settings(interval={"alpha": float(alpha)}, median=None)
+    assert config.interval == Interval(alpha=alpha)
+    assert load_config(config.model_dump(mode="json")) == config
+    assert Config.model_validate_json(config.model_dump_json()) == config
+
+
+def test_config__is_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        settings().tiles.size = 64
+
+
+@pytest.mark.parametrize(
+    "section",
+    ["sgm", "refinement", "cross_check", "median", "regularization"],
+)
+def test_load_config__null_switches_a_step_off(section: str) -> None:
+    assert getattr(settings(**{section: None}), section) is None
+
+
+@pytest.mark.parametrize("section", ["ambiguity", "interval"])
+def test_load_config__null_switches_off_what_regularization_does_not_need(section: str) -> None:
+    assert getattr(settings(**{section: None, "regularization": None}), section) is None
+
+
+def test_load_config__takes_explicit_percentiles() -> None:
+    assert settings(ambiguity={"p1": 40, "p99": 812.5}).ambiguity == Ambiguity(p1=40.0, p99=812.5)
+
+
+def test_largest_ambiguity__counts_every_eta_of_every_candidate() -> None:
+    assert settings().largest_ambiguity == 70 * 61
+    assert settings(ambiguity=None, regularization=None).largest_ambiguity == 0
+
+
+# --- what is refused
+
+REFUSED = [
+    # section, its keys, the message
+    ("disparity", {"minimum": 5}, "disparity: minimum 5 is above maximum 0, swap them"),
+    ("disparity", {"minimum": -16001}, "disparity.minimum is -16001, allowed: integer >= -16000, <= 16000"),
+    ("disparity", {"maximum": 16001}, "disparity.maximum is 16001, allowed: integer >= -16000, <= 16000"),
+    ("disparity", {"maximum": "5"}, "disparity.maximum is '5', allowed: integer >= -16000, <= 16000"),
+    ("disparity", {"maximum": 5.0}, "disparity.maximum is 5.0, allowed: integer >= -16000, <= 16000"),
+    ("disparity", {"maximum": True}, "disparity.maximum is true, allowed: integer >= -16000, <= 16000"),
+    ("disparity", {"maximum": None}, "disparity.maximum is null, allowed: integer >= -16000, <= 16000"),
+    ("disparity", None, "disparity is null, allowed: section of minimum, maximum"),
+    ("cost", None, "cost is null, allowed: section of method, window"),
+    ("cost", {"method": "mccnn"}, "cost.method is 'mccnn', allowed: census"),
+    ("cost", {"window": 4}, "cost.window is 4, allowed: integer >= 3, <= 11, odd"),
+    ("cost", {"window": 1}, "cost.window is 1, allowed: integer >= 3, <= 11, odd"),
+    ("cost", {"window": 13}, "cost.window is 13, allowed: integer >= 3, <= 11, odd"),
+    ("cost", {"windows": 5}, "unknown key 'cost.windows', did you mean window? (known: method, window)"),
+    ("sgm", {"p1": 0}, "sgm.p1 is 0, allowed: integer >= 1"),
+    ("sgm", {"p2": 0}, "sgm.p2 is 0, allowed: integer >= 1"),
+    ("sgm", {"p1": 33}, "sgm: p1 33 is above p2 32, the penalty of a larger step"),
+    ("sgm", {"p2": 8168}, "sgm.p2 is 8168, allowed: <= 8167 with cost.window 5, so that costs summed over"),
+    ("sgm", [8, 32], "sgm is [8, 32], allowed: section of p1, p2 or null"),
+    ("ambiguity", {"eta_max": 0}, "ambiguity.eta_max is 0, allowed: number > 0, <= 1"),
+    ("ambiguity", {"eta_max": 1.1}, "ambiguity.eta_max is 1.1, allowed: number > 0, <= 1"),
+    ("ambiguity", {"eta_max": float("nan")}, "ambiguity.eta_max is NaN, allowed: number > 0, <= 1"),
+    ("ambiguity", {"eta_step": 0.0001}, "ambiguity.eta_step is 0.0001, allowed: number >= 0.001, <= 1"),
+    ("ambiguity", {"eta_step": 0.8}, "ambiguity: eta_step 0.8 is above eta_max 0.7"),
+    (
+        "ambiguity",
+        {"normalization": "none"},
+        "ambiguity.normalization is 'none', allowed: percentile or range",
+    ),
+    ("ambiguity", {"p1": -1, "p99": 9}, "ambiguity.p1 is -1, allowed: number >= 0 or null"),
+    ("ambiguity", {"p1": 1, "p99": float("inf")}, "ambiguity.p99 is inf, allowed: number >= 0 or null"),
+    ("ambiguity", {"p1": 1, "p99": True}, "ambiguity.p99 is true, allowed: number >= 0 or null"),
+    ("ambiguity", {"p1": 9}, "ambiguity: p1 is 9.0, p99 is null: give both or none"),
+    ("ambiguity", {"p99": 9}, "ambiguity: p1 is null, p99 is 9.0: give both or none"),
+    ("ambiguity", {"p1": 9, "p99": 1}, "ambiguity: p1 9.0 is above p99 1.0, swap them"),
+    (
+        "ambiguity",
+        {"p1": 1, "p99": 9, "normalization": "range"},
+        "ambiguity: p1 and p99 stand for percentiles: leave them out with normalization range",
+    ),
+    ("ambiguity", None, "regularization needs ambiguity, which null switches off: give ambiguity or set"),
+    ("interval", None, "regularization needs interval, which null switches off: give interval or set"),
+    ("interval", {"alpha": 0}, "interval.alpha is 0, allowed: number > 0, <= 1"),
+    ("interval", {"alpha": 1.01}, "interval.alpha is 1.01, allowed: number > 0, <= 1"),
+    ("interval", {"alpha": "0.9"}, "interval.alpha is '0.9', allowed: number > 0, <= 1"),
+    ("interval", {"alpha": True}, "interval.alpha is true, allowed: number > 0, <= 1"),
+    ("interval", {"alpha": None}, "interval.alpha is null, allowed: number > 0, <= 1"),
+    ("refinement", {"method": "quadratic"}, "refinement.method is 'quadratic', allowed: vfit"),
+    ("cross_check", {"method": "slow"}, "cross_check.method is 'slow', allowed: fast or accurate"),
+    ("cross_check", {"tolerance": -1}, "cross_check.tolerance is -1, allowed: integer >= 0"),
+    ("median", {"size": 2}, "median.size is 2, allowed: integer >= 3, odd"),
+    ("median", {"size": 1}, "median.size is 1, allowed: integer >= 3, odd"),
+    ("regularization", {"threshold": 1.5}, "regularization.threshold is 1.5, allowed: number >= 0, <= 1"),
+    ("regularization", {"kernel": 4}, "regularization.kernel is 4, allowed: integer >= 1, odd"),
+    ("regularization", {"depth": -1}, "regularization.depth is -1, allowed: integer >= 0"),
+    ("regularization", {"quantile": 0.4}, "regularization.quantile is 0.4, allowed: number >= 0.5, <= 1"),
+    ("tiles", {"size": 100}, "tiles.size is 100, allowed: integer >= 64, multiple of 64"),
+    ("tiles", {"size": 0}, "tiles.size is 0, allowed: integer >= 64, multiple of 64"),
+    ("tiles", {"overlap": 0}, "tiles.overlap is 0, allowed: integer >= 1"),
+    ("tiles", {"overlap": 2}, "tiles.overlap is 2, allowed: >= 3 with cost.window 5"),
+    ("tiles", None, "tiles is null, allowed: section of size, overlap"),
+    ("products", {"keep_rejected": 1}, "products.keep_rejected is 1, allowed: true or false"),
+    ("products", None, "products is null, allowed: section of keep_rejected"),
+    (
+        "regularisation",
+        {},
+        "unknown key 'regularisation', did you mean regularization? (known: disparity, cost",
+    ),
+    (7, {}, "unknown key '7' (known: disparity, cost, sgm"),
+]
+
+
+@pytest.mark.parametrize(("section", "keys", "expected"), REFUSED)
+def test_load_config__refuses_with_key_value_and_what_is_allowed(section: Any, keys: Any, expected: str, write) -> None:
+    given = RANGE | {section: RANGE["disparity"] | keys if section == "disparity" and keys else keys}
+    assert message(given).startswith(expected)
+    file = write(yaml.safe_dump(given))
+    assert message(file).startswith(f"{file}: {expected}")
+
+
+def test_load_config__a_file_is_not_blamed_for_overrides(write) -> None:
+    file = write("tiles: {size: 1, overlap: 2}\n")
+    assert message(file, RANGE | {"tiles": {"size": 2}}).startswith("tiles.size is 2, allowed:")
+    assert message(file, RANGE).startswith(f"{file}: tiles.size is 1, allowed:")
+    assert message(file, RANGE | {"tiles": {"size": 64}}).startswith(f"{file}: tiles.overlap is 2, allowed:")
+
+
+def test_load_config__missing_search_range_is_named() -> None:
+    assert message(None) == "disparity is missing, allowed: section of minimum, maximum"
+    assert message({"disparity": {"minimum": 0}}) == (
+        "disparity.maximum is missing, allowed: integer >= -16000, <= 16000"
+    )
+
+
+def test_load_config__tells_several_errors_in_one_line() -> None:
+    assert message(RANGE | {"tiles": {"size": 1}, "median": {"size": 2}}) == (
+        "median.size is 2, allowed: integer >= 3, odd; tiles.size is 1, allowed: integer >= 64, multiple of 64"
+    )
+
+
+@pytest.mark.parametrize(("window", "largest"), [(3, 8183), (5, 8167), (7, 8143), (9, 8111), (11, 8071)])
+def test_load_config__p2_is_held_to_what_16_bits_hold(window: int, largest: int) -> None:
+    assert settings(cost={"window": window}, sgm={"p2": largest}).cost_span <= 65534
+    assert f"allowed: <= {largest} with" in message(RANGE | {"cost": {"window": window}, "sgm": {"p2": largest + 1}})
+    assert 8 * (window**2 - 1 + largest + 1) > 65534
+
+
+def test_config_error__is_of_the_family() -> None:
+    assert issubclass(ConfigError, SatIntervalsError)
+    assert issubclass(SatIntervalsError, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("disparity: {minimum: -60\ncost: [", "line 2: "),
+        ("sgm: {p1: 1}\ntiles: {}\nsgm: {p1: 2}\n", "line 3: key 'sgm' appears twice"),
+        ("sgm:\n  p1: 1\n  p1: 1\n", "line 3: key 'p1' appears twice"),
+        ("a: 1\n---\nb: 2\n", "line 2: but found another document"),
+        ("sgm: !!python/name:os.system\n", "line 1: could not determine a constructor"),
+        ("sgm: *nowhere\n", "line 1: found undefined alias"),
+        ("[1, 2]: 3\n", "line 1: found unhashable key"),
+        ("- disparity\n", "holds ['disparity'], allowed: sections disparity, cost, sgm"),
+        ("urban", "holds 'urban', allowed: sections disparity, cost, sgm"),
+        ("sgm: {p1: 2024-13-45}\n", "month must be in 1..12"),
+        (b"II*\x00\x08\x00\x00\x00", "unacceptable character"),
+        (b"sgm: \xff\n", "unacceptable character"),
+    ],
+)
+def test_load_config__unreadable_yaml_names_file_and_line(write, text: str | bytes, expected: str) -> None:
+    file = write(text)
+    assert message(file).startswith(f"{file}: {expected}")
+
+
+def test_load_config__merged_keys_may_be_given_again(write) -> None:
+    file = write("cross_check: &check {method: fast}\nrefinement: {<<: *check, method: vfit}\n")
+    assert load_config(file, RANGE) == settings()
+
+
+def test_load_config__unreadable_file_is_named(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.yaml"
+    assert message(missing) == f"{missing}: No such file or directory"
+    assert message(tmp_path) == f"{tmp_path}: Is a directory"
+
+
+def test_load_config__refuses_other_sources() -> None:
+    assert message([RANGE]).endswith("allowed: a YAML file, a mapping or a Config")
+
+
+# --- thresholds
+
+
+@pytest.mark.parametrize(
+    ("window", "sgm", "span"),
+    [(5, (8, 32), 448), (11, (20, 80), 1600), (11, (38, 464), 4672), (11, (72, 309), 3432), (5, None, 24)],
+)
+def test_cost_span__is_the_theoretical_one(window: int, sgm: tuple[int, int] | None, span: int) -> None:
+    penalties = None if sgm is None else {"p1": sgm[0], "p2": sgm[1]}
+    assert settings(cost={"window": window}, sgm=penalties).cost_span == span
+
+
+def test_cut_level__keeps_ties_that_binary_floats_lose() -> None:
+    urban = settings(cost={"window": 11}, sgm={"p1": 20, "p2": 80})
+    assert int((1 - 0.9) * urban.cost_span) == 159
+    assert urban.cut_level == 160
+
+
+def test_ambiguity_levels__are_70_exact_multiples() -> None:
+    config = settings()
+    assert config.ambiguity_levels == tuple(i * 448 // 100 for i in range(70))
+
+
+@given(st.integers(1, 1000), st.sampled_from([3, 5, 7, 9, 11]), st.integers(1, 600))
+def test_cut_level__is_the_floor_of_the_written_decimal(thousandths: int, window: int, p2: int) -> None:
+    config = settings(interval={"alpha": thousandths / 1000}, cost={"window": window}, sgm={"p1": 1, "p2": p2})
+    assert config.cut_level == (1000 - thousandths) * config.cost_span // 1000
+
+
+@given(st.integers(1, 100), st.integers(1, 100))
+def test_ambiguity_levels__stay_below_eta_max(maximum: int, step: int) -> None:
+    maximum, step = max(maximum, step), min(maximum, step)
+    config = settings(ambiguity={"eta_max": maximum / 100, "eta_step": step / 100})
+    assert config.ambiguity_levels == tuple(hundredths * 448 // 100 for hundredths in range(0, maximum, step))
+
+
+@given(
+    eta_max=st.decimals("0.01", 1, places=2),
+    eta_step=st.decimals("0.01", 1, places=2),
+    window=st.sampled_from([3, 5, 7]),
+    sgm=st.none() | st.builds(Sgm, p1=st.just(1), p2=st.integers(1, 40)),
+)
+def test_ambiguity_weights__count_the_etas_that_reach_a_cost(
+    eta_max: Decimal, eta_step: Decimal, window: int, sgm: Sgm | None
+) -> None:
+    eta_max, eta_step = max(eta_max, eta_step), min(eta_max, eta_step)
+    config = Config(
+        disparity=Disparity(minimum=0, maximum=1),
+        cost=Census(window=window),
+        sgm=sgm,
+        ambiguity=Ambiguity(eta_max=eta_max, eta_step=eta_step),
+    )
+    weights = config.ambiguity_weights
+    assert weights is not None
+    assert weights.dtype == np.uint16
+    etas = [i * eta_step for i in range(101) if i * eta_step < eta_max]
+    assert weights.tolist() == [
+        sum(above <= eta * config.cost_span for eta in etas) for above in range(config.cost_span + 1)
+    ]
+
+
+def test_thresholds__are_none_where_their_step_is_off() -> None:
+    config = settings(ambiguity=None, interval=None, regularization=None)
+    assert config.cut_level is None
+    assert config.ambiguity_levels is None
+    assert config.ambiguity_weights is None
+
+
+@given(st.integers(-16000, 16000), st.integers(-16000, 16000))
+def test_count__is_the_number_of_candidates(one: int, other: int) -> None:
+    disparity = Disparity(minimum=min(one, other), maximum=max(one, other))
+    assert disparity.count == len(range(disparity.minimum, disparity.maximum + 1))
