@@ -24,9 +24,7 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles in OUT/tiles."),
         click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
         click.option("--quiet", is_flag=True, help="Print errors only."),
-        click.option(
-            "--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."
-        ),
+        click.option("--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."),
     ]
     for option in reversed(options):
         command = option(command)
@@ -54,9 +52,7 @@ def overrides(disparity: tuple[int, int] | None, tile_size: int | None, overlap:
 @click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image.")
 @click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image.")
 @click.option("--band", type=int, metavar="N", help="Band to match, where an image has several.")
-@click.option(
-    "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
-)
+@click.option("--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match.")
 @run_options
 def match(
     left: str,

@@ -47,9 +47,7 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     whole = Window(0, 0, *left_image.shape)
     patch = match_patch(_reader(left_image), _reader(right_image), whole, whole, whole, config)
     raw = patch.raw
-    rows = Rows(
-        raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner
-    )
+    rows = Rows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
     scale = Scale(np.nan, np.nan)
     if config.ambiguity:
         histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)

@@ -253,9 +253,7 @@ def match_tile(job: Job, tile: Tile) -> None:
     grid, config = job.store.grid, job.config
     image = Window(0, 0, job.left.height, job.left.width)
     started = time.perf_counter()
-    patch = match_patch(
-        reader(job.left, "left"), reader(job.right, "right"), tile.core, grid.region, image, config
-    )
+    patch = match_patch(reader(job.left, "left"), reader(job.right, "right"), tile.core, grid.region, image, config)
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with _timed(seconds, "write"):
         job.store.write_arrays(tile, _left_behind(patch, tile, job))
@@ -314,9 +312,7 @@ def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) 
         raise RunError(f"tiles {', '.join(missing)} are missing in {job.store.path}: run the same command again")
     if searched:
         return
-    usable = {
-        side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")
-    }
+    usable = {side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")}
     empty = [image.path for image, side in ((job.left, "left"), (job.right, "right")) if not usable[side]]
     reason = f"{' and '.join(empty)} hold no data" if empty else "their data do not meet over the search range"
     search = job.config.disparity
@@ -337,9 +333,7 @@ def _tags(config: Config) -> dict[str, str]:
     return tags
 
 
-def _report(
-    job: Job, inputs: dict[str, Any], scale: Scale, tally: Tally, seconds: dict[str, float]
-) -> dict[str, Any]:
+def _report(job: Job, inputs: dict[str, Any], scale: Scale, tally: Tally, seconds: dict[str, float]) -> dict[str, Any]:
     """The content of run.json."""
     grid, config = job.store.grid, job.config
     packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
@@ -355,9 +349,7 @@ def _report(
             "overlap": config.tiles.overlap,
         },
         "cost_span": config.cost_span,
-        "ambiguity_percentiles": None
-        if config.ambiguity is None
-        else {"p1": scale.p1, "p99": scale.p99},
+        "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS

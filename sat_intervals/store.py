@@ -109,9 +109,7 @@ class Store:
         lines = len(SIDES), 2, len(SEAM_PRODUCTS), size
         _create(group, "seams", (self.grid.rows, self.grid.columns, *lines), None, (1, 1, *lines), np.int16)
         counts = self.ambiguities + 1
-        _create(
-            group, "histogram", (self.grid.rows, self.grid.columns, counts), None, (1, 1, counts), np.uint32
-        )
+        _create(group, "histogram", (self.grid.rows, self.grid.columns, counts), None, (1, 1, counts), np.uint32)
 
     @property
     def _arrays(self) -> Path:
@@ -189,9 +187,7 @@ class Store:
             start, share = grid_column * self.grid.size, grid_column * self._reach
             width = min(self._reach, columns - start)
             here, there = np.s_[:, start : start + width], np.s_[:, share : share + width]
-            wins = (cost[there] < best[here]) | (
-                (cost[there] == best[here]) & (winner[there] > merged[here])
-            )
+            wins = (cost[there] < best[here]) | ((cost[there] == best[here]) & (winner[there] > merged[here]))
             best[here] = np.where(wins, cost[there], best[here])
             merged[here] = np.where(wins, winner[there], merged[here])
         return merged

@@ -89,9 +89,7 @@ class Grid:
         """The tile at a place of the grid."""
         row = self.region.row + grid_row * self.size
         column = self.region.column + grid_column * self.size
-        return Tile(
-            grid_row, grid_column, Window(row, column, self.size, self.size).clipped(self.region)
-        )
+        return Tile(grid_row, grid_column, Window(row, column, self.size, self.size).clipped(self.region))
 
 
 def facing(window: Window, minimum: int, maximum: int) -> Window:

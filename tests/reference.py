@@ -109,9 +109,7 @@ def path_cost(cost, empty, step, p1, p2):
                 smaller, larger = np.full(count, least + p2), np.full(count, least + p2)
                 smaller[1:] = path[q][:-1] + p1
                 larger[:-1] = path[q][1:] + p1
-                path[r, c] += (
-                    np.minimum.reduce([path[q], smaller, larger, np.full(count, least + p2)]) - least
-                )
+                path[r, c] += np.minimum.reduce([path[q], smaller, larger, np.full(count, least + p2)]) - least
     return path
 
 
@@ -184,9 +182,7 @@ def alpha_cut(volume, alpha, cost_span, extend):
         if not costs:
             continue
         least = min(costs.values())
-        cut = [
-            k for k, s in costs.items() if 1 - Fraction(s - least, cost_span) >= Fraction(Decimal(str(alpha)))
-        ]
+        cut = [k for k, s in costs.items() if 1 - Fraction(s - least, cost_span) >= Fraction(Decimal(str(alpha)))]
         first, last = min(cut), max(cut)
         lower[r, c] = max(first - 1, 0) if extend and costs[first] == least else first
         upper[r, c] = min(last + 1, count - 1) if extend and costs[last] == least else last
@@ -427,9 +423,7 @@ def match_arrays(left, right, left_state, right_state, config):
     if config.interval is not None:
         bounds = alpha_cut(volume, config.interval.alpha, cost_span, extend=config.refinement is not None)
         lower, upper = (np.where(searched, b + minimum, np.nan).astype(np.float32) for b in bounds)
-    raw = SimpleNamespace(
-        volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags
-    )
+    raw = SimpleNamespace(volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags)
 
     flags = flags.copy()
     if config.cross_check is not None:
@@ -456,9 +450,7 @@ def match_arrays(left, right, left_state, right_state, config):
 
     hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
     shown = (flags & hidden) == 0
-    disparity, lower, upper = (
-        np.where(shown, band, np.float32(np.nan)) for band in (disparity, lower, upper)
-    )
+    disparity, lower, upper = (np.where(shown, band, np.float32(np.nan)) for band in (disparity, lower, upper))
     return SimpleNamespace(
         disparity=disparity, lower=lower, upper=upper, confidence=confidence, validity=flags, raw=raw
     )

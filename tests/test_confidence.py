@@ -183,9 +183,7 @@ confidences = st.sampled_from([0, 0.25, 0.5, 0.59, 0.6, 0.61, 0.75, 1, N]).map(n
 
 @bounded
 @given(
-    confidence=hnp.arrays(
-        np.float32, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=confidences
-    ),
+    confidence=hnp.arrays(np.float32, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9), elements=confidences),
     threshold=st.sampled_from([0.0, 0.25, 0.6, 1.0]),
     kernel=st.sampled_from([1, 3, 5, 7, 21]),
 )

@@ -366,9 +366,7 @@ def test_finish_rows__of_a_patch_equals_reference(seed, config, holes):
     whole = Window(0, 0, *left.shape)
     patch = match_patch(reader(left, left_state), reader(right, right_state), whole, whole, whole, config)
     raw = patch.raw
-    rows = Rows(
-        raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner
-    )
+    rows = Rows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
     scale = Scale(np.nan, np.nan)
     if config.ambiguity is not None:
         histogram = np.bincount(raw.ambiguity[raw.winner != N], minlength=config.largest_ambiguity + 1)

@@ -73,6 +73,45 @@ def _insert(values, count, value):
     values[i] = value
 
 
+@njit(nogil=True, forceinline=True)
+def _median_around(values, kept, r, c, radius, window):
+    """Median of the kept pixels within ``radius`` of one that is kept itself."""
+    rows, columns = values.shape
+    count = 0
+    for i in range(max(0, r - radius), min(rows, r + radius + 1)):
+        for j in range(max(0, c - radius), min(columns, c + radius + 1)):
+            if kept[i, j]:
+                _insert(window, count, values[i, j])
+                count += 1
+    middle = window[count // 2]
+    if count % 2 == 0:
+        middle = (window[count // 2 - 1] + middle) / np.float32(2)
+    return middle
+
+
+@njit(nogil=True, forceinline=True)
+def _ordered(a, b, c):
+    """Three values in ascending order; comparisons and selections only, which vectorise."""
+    a, b = (a, b) if a < b else (b, a)
+    b, c = (b, c) if b < c else (c, b)
+    a, b = (a, b) if a < b else (b, a)
+    return a, b, c
+
+
+@njit(nogil=True)
+def _median_of_nine(values, r, result):
+    """Medians of whole 3 x 3 windows along the inside of a row (Devillard 1998)."""
+    above, here, below = values[r - 1], values[r], values[r + 1]
+    for c in range(1, here.size - 1):
+        low_1, middle_1, high_1 = _ordered(above[c - 1], here[c - 1], below[c - 1])
+        low_2, middle_2, high_2 = _ordered(above[c], here[c], below[c])
+        low_3, middle_3, high_3 = _ordered(above[c + 1], here[c + 1], below[c + 1])
+        low = _ordered(low_1, low_2, low_3)[2]
+        middle = _ordered(middle_1, middle_2, middle_3)[1]
+        high = _ordered(high_1, high_2, high_3)[0]
+        result[c] = _ordered(low, middle, high)[1]
+
+
 @njit(nogil=True, cache=True)
 def median(values, kept, size):
     """Median of the kept pixels of each kept pixel's window; the other pixels keep their value.
@@ -96,18 +135,16 @@ def median(values, kept, size):
     radius = size // 2
     result = values.copy()
     window = np.empty(size * size, np.float32)
+    nine = np.empty(columns, np.float32)
     for r in range(rows):
+        whole_rows = size == 3 and 0 < r < rows - 1
+        if whole_rows:
+            _median_of_nine(values, r, nine)
         for c in range(columns):
             if not kept[r, c]:
                 continue
-            count = 0
-            for i in range(max(0, r - radius), min(rows, r + radius + 1)):
-                for j in range(max(0, c - radius), min(columns, c + radius + 1)):
-                    if kept[i, j]:
-                        _insert(window, count, values[i, j])
-                        count += 1
-            middle = window[count // 2]
-            if count % 2 == 0:
-                middle = (window[count // 2 - 1] + middle) / np.float32(2)
-            result[r, c] = middle
+            if whole_rows and 0 < c < columns - 1 and kept[r - 1 : r + 2, c - 1 : c + 2].all():
+                result[r, c] = nine[c]
+            else:
+                result[r, c] = _median_around(values, kept, r, c, radius, window)
     return result

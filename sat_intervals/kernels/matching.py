@@ -337,9 +337,7 @@ def _sweep(left, right, settings, output, core, buffer, keep):
         patch.paths[:] = 0
         patch.lowest[:] = 0
     bounds = core.row, core.column, core.height, core.width
-    _sweep_up(
-        patch, settings, output.row, output.column, volume, keep, raw, bounds, index, right_cost, right_best
-    )
+    _sweep_up(patch, settings, output.row, output.column, volume, keep, raw, bounds, index, right_cost, right_best)
     cost = right_cost[:, : core.width + settings.count - 1]
     winner = right_best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY

@@ -1,0 +1,249 @@
+"""A procedural satellite scene with exact truth: two epipolar views of one surface, from a seed alone.
+
+The surface has image rows, ground columns `u` (px of 0.5 m) and heights (m). A row of it is a polyline with
+four nodes a pixel; where it jumps (houses, cars, rims of trees) the two nodes meet halfway: a vertical wall.
+A view puts it at columns `x = u + a (height - DATUM)` and shows the highest point of each ray.
+
+Why the truth is exact: the point at a pixel centre is where a ray crosses that polyline, in closed form. Its
+disparity is `(a_right - a_left) (height - DATUM)`, `x_right = x_left + d`, and the same polyline tells whether
+the right view shows it too. (Beside a step the blur mixes both sides; the truth is that of the centre.)
+"""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Arrays = Sequence[Array]
+Profile = tuple[int, Array, Array, Array]  # row; ground column (px), height (m) and radiance of its nodes
+
+VIEWS = (-0.4, 0.6)  # a of the left and of the right view, px a metre
+DATUM, PIXEL = 12.0, 0.5  # m: the height of disparity 0, the size of a pixel
+OVER, FRACTIONS = 4, np.arange(4) / 4  # nodes, and samples, a pixel; where they are in it
+MARGIN = 64  # px of ground around the image: more than a parallax (20 px) or a shadow (60 rows, 45 px)
+STEP = 0.8  # m between neighbouring nodes, from which on they are a wall
+SLOPE_LIGHT = (0.5, 0.65)  # what slopes along columns and rows add: the sun is 50 degrees high, upper left
+SHADOW_SHIFT, SHADOW_DROP, AMBIENT = 3, 0.75, 0.25  # nodes and m a row; share of the light in a shadow
+OFFSET, GAIN = np.array([[90, 62], [2400, 2570]])  # DN = offset + gain * radiance; left, right
+MID_LEVEL, SATURATION = 600.0, 4095  # DN at which the signal to noise holds; 12 bits
+CORNER = (0.32, 0.13)  # legs of the empty corner, shares of rows and columns
+SPARE = 3  # px between the truth and the ends of the search range
+
+QUARTER = 230  # px between the roads that enclose a quarter
+HOUSES, BLOCKS, HALLS, FIELD, WOOD, PARK = range(6)  # kinds of quarter; for each of them:
+ALBEDO = np.array([0.24, 0.22, 0.26, 0.30, 0.12, 0.25])
+CONTRAST = np.array([0.25, 0.15, 0.08, 0.04, 0.30, 0.12])
+STREET = np.array([42, 46, 70, 130, 190, 96])  # px from one to the next
+PLAN = np.array([[1, 1, 0, 3], [1, 2, 0, 4], [5, 1, 1, 3], [0, 1, 4, 2]])  # neighbouring quarters, repeated
+FLAT, GABLE, TREE, FOREST, ROOFTOP = range(5)
+# Kinds of quarter; cell along a street (px), rows of cells a street, their shift, how far a thing strays
+# across (px); half length, half width (px); height (m) from, to; albedo from, to; share of cells taken; shape.
+THINGS = (
+    ((HOUSES,), 30, 1, 0, 4, 11, 8, 5, 8.5, 0.2, 0.6, 0.95, GABLE),
+    ((BLOCKS,), 44, 1, 0, 2, 21, 12.5, 8, 31, 0.2, 0.7, 0.6, FLAT),
+    ((BLOCKS,), 44, 1, 0, 3, 21, 11, 8, 20, 0.2, 0.45, 0.7, GABLE),
+    ((HALLS,), 84, 1, 0, 3, 38, 23, 6, 11, 0.25, 0.8, 0.95, FLAT),
+    ((HOUSES, BLOCKS, HALLS), 12, 4, 0, 2, 2.5, 1.8, 1, 2, 0.1, 0.7, 0.4, ROOFTOP),
+    ((HOUSES, BLOCKS, HALLS), 14, 1, 0.5, 3, 4.2, 1.7, 1.5, 1.6, 0.05, 0.7, 0.5, FLAT),  # cars
+    ((HOUSES, BLOCKS, PARK), 17, 2, 0, 5, 5, 5, 3, 9, 0.14, 0.32, 0.4, TREE),
+    ((FIELD, PARK), 40, 3, 0, 9, 6, 6, 4, 10, 0.14, 0.32, 0.2, FOREST),
+    ((WOOD, PARK), 20, 9, 0, 3, 7, 7, 7, 14, 0.14, 0.32, 0.6, FOREST),
+    ((WOOD,), 17, 11, 0, 3, 6.5, 6.5, 7, 14, 0.14, 0.32, 1, FOREST),
+    ((WOOD,), 16, 12, 0, 3, 6, 6, 6, 12, 0.14, 0.32, 1, FOREST),
+    ((WOOD,), 15, 13, 0, 3, 5, 5, 6, 11, 0.14, 0.32, 1, FOREST),
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Two views and their truth, in arrays (rows, columns); pixel centres are at integers."""
+
+    left: Array  # uint16, 12 bits, 0 = no data
+    right: Array  # the same
+    truth: Array  # float32 px, x_right = x_left + truth; at hidden pixels too, NaN where left has no data
+    visible: Array  # bool, the right image shows the same point
+    minimum: int  # px; [minimum, maximum] is a search range that encloses the truth
+    maximum: int
+
+
+def make_scene(
+    rows: int = 600, columns: int = 800, seed: int = 0, *, psf: float = 0.6, snr: float = 95, block: int = 64
+) -> Scene:
+    """A scene with blur `psf` (sigma, px), signal to noise `snr` (infinite: none); `block`: rows at a time."""
+    random, halo = np.random.default_rng([seed, 1]), int(np.ceil(3 * psf))
+    kernel = np.exp(-0.5 * (np.arange(-halo * OVER, halo * OVER + 1) / OVER / max(psf, 0.01)) ** 2)
+    across, down = kernel / kernel.sum(), kernel[::OVER] / kernel[::OVER].sum()
+    at = np.arange(-halo * OVER, (columns + halo) * OVER) / OVER
+    centres = slice(halo * OVER, (halo + columns) * OVER, OVER)
+    images, lines = np.zeros((2, rows, columns), np.uint16), deque[Array](maxlen=down.size)
+    truth, visible = np.full((rows, columns), np.nan, np.float32), np.zeros((rows, columns), bool)
+    starts = np.ceil(CORNER[1] * columns * (1 - np.arange(rows) / (CORNER[0] * rows))).clip(0).astype(int)
+    for profile in profiles(rows, columns, seed, halo, block):
+        (height, left, seen), (_, right, _) = (look(profile, view, at) for view in (0, 1))
+        fine = np.stack([left, right])
+        lines.append(sum(w * fine[:, k : k + columns * OVER : OVER] for k, w in enumerate(across)))
+        if 0 <= (row := profile[0]) < rows:
+            truth[row] = (VIEWS[1] - VIEWS[0]) * (height[centres] - DATUM)
+            truth[row, : starts[row]] = np.nan  # which makes the comparisons below false
+            partner = np.arange(columns) + truth[row]
+            visible[row] = seen[centres] & (partner >= starts[row]) & (partner <= columns - 1)
+        if (row := profile[0] - halo) >= 0:
+            light = sum(w * line for w, line in zip(down, lines, strict=True))
+            level = OFFSET[:, None] + GAIN[:, None] * light
+            level += random.standard_normal(level.shape) * np.sqrt(level * MID_LEVEL) / snr
+            images[:, row, starts[row] :] = np.rint(level).clip(1, SATURATION)[:, starts[row] :]
+    minimum, maximum = int(np.floor(np.nanmin(truth))) - SPARE, int(np.ceil(np.nanmax(truth))) + SPARE
+    return Scene(images[0], images[1], truth, visible, minimum, maximum)
+
+
+def look(profile: Profile, view: int, x: Array) -> tuple[Array, Array, Array]:
+    """What view 0 (left) or 1 has at columns `x`: height (m), radiance, and whether the other shows it too."""
+    row, u, height, radiance = profile
+    here, there = (u + a * (height - DATUM) for a in (VIEWS[view], VIEWS[1 - view]))
+    k, share = _highest_crossing(here, x, VIEWS[view])
+    high, shown, other = (v[k] + share * (v[k + 1] - v[k]) for v in (height, radiance, there))
+    if VIEWS[1 - view] > 0:
+        seen = other > np.maximum.accumulate(there)[k] - 1e-6
+    else:
+        seen = other < np.minimum.accumulate(there[::-1])[::-1][k + 1] + 1e-6
+    wall = np.flatnonzero(np.abs(height[k + 1] - height[k]) > STEP)
+    k = k[wall]
+    floor = (high[wall] - np.minimum(height[k], height[k + 1])) % 3
+    window = np.where((floor > 1.3) & (row % 6 > 2), 0.6, 1)
+    shown[wall] = window * np.where(height[k + 1] > height[k], 0.8 * radiance[k + 1], 0.35 * radiance[k])
+    return high, shown, seen
+
+
+def _highest_crossing(x: Array, at: Array, slant: float) -> tuple[Array, Array]:
+    """Where the rays at columns `at` cross polyline `x`: a share of the way from node k to node k + 1."""
+    # Rays lean: the highest crossing is the first from the left where slant is positive, else from the right.
+    if slant < 0:
+        k, share = _highest_crossing(-x[::-1], -at, -slant)
+        return x.size - 2 - k, 1 - share
+    k = np.searchsorted(np.maximum.accumulate(x), at) - 1
+    return k, (at - x[k]) / (x[k + 1] - x[k])
+
+
+def profiles(rows: int, columns: int, seed: int = 0, halo: int = 0, block: int = 64) -> Iterator[Profile]:
+    """The lit surface of the rows from -halo to rows + halo - 1, with MARGIN px on either side."""
+    lattice = np.pad(np.random.default_rng([seed, 0]).uniform(-1, 1, (256, 256)), (0, 1), mode="wrap")
+    grid = np.arange((columns + 2 * MARGIN) * OVER) / OVER - MARGIN
+    shade = np.full(grid.size, -np.inf)  # m, the height of the shadow of the rows above
+    for first in range(-MARGIN, rows + halo, block):
+        surface = _surface(lattice, np.arange(first, min(first + block, rows + halo)), columns)
+        for row, (height, albedo) in enumerate(np.moveaxis(surface, 1, 0), first):
+            lit = np.clip(1 - (shade - height) / 0.4, 0, 1)
+            shade[SHADOW_SHIFT:] = np.maximum(shade, height)[:-SHADOW_SHIFT] - SHADOW_DROP
+            half = (np.abs(np.diff(height)) > STEP) / (2 * OVER)
+            if row >= -halo:
+                u = grid + np.append(half, 0) - np.append(0, half)
+                yield row, u, height, albedo * (AMBIENT + (1 - AMBIENT) * lit)
+
+
+def _surface(lattice: Array, rows: Array, columns: int) -> Array:
+    """Height (m) and albedo, times the light its slope gives, of the nodes of some rows: (2, rows, nodes)."""
+    r, c = np.append(rows, rows[-1] + 1.0)[:, None], np.arange(-MARGIN, columns + MARGIN + 2.0)[None]
+    height, grain, quarter = _terrain(lattice, r, c), _noise(lattice, r, c, 4, 2), _quarter(lattice, r, c)
+    albedo = np.where(height > 0, _ground(lattice, r, c, grain, quarter), 0.07 + 0.0015 * grain)
+    along, down = np.diff(height)[:-1] / PIXEL, np.diff(height, axis=0)[:, :-1] / PIXEL
+    albedo[:-1, :-1] *= 1 + SLOPE_LIGHT[0] * along + SLOPE_LIGHT[1] * down
+    pixels = np.stack([height, albedo, grain])[:, :-1, :-1, None]
+    nodes = pixels[:, :, :-1] + np.diff(pixels, axis=2) * FRACTIONS
+    for salt, (kinds, *thing) in enumerate(THINGS):
+        y, x = np.nonzero(np.isin(quarter[0][:-1, :-2], kinds))
+        near, frame = _place(lattice, r[y, 0], c[0, x], [v[y, x] for v in quarter], salt, thing)
+        y, x = y[near], x[near]
+        nodes[:2, y, x] = _draw(nodes[:, y, x], frame, thing)
+    return nodes[:2].reshape(2, rows.size, -1)
+
+
+def _ground(lattice: Array, r: Array, c: Array, grain: Array, quarter: Arrays) -> Array:
+    """Albedo of gardens, fields, streets and roads; `grain` is their finest texture."""
+    kind, border, angle, number = quarter
+    p, q = _turned(r, c, angle)
+    parcel = lattice[(number + np.floor(p / 75).astype(int)) & 255, np.floor(q / 130).astype(int) & 255]
+    crop = np.where(kind == FIELD, 0.3 * parcel + 0.025 * np.sin(0.9 * p), 0)
+    soil = ALBEDO[kind] * (1 + CONTRAST[kind] * grain + 0.1 * _noise(lattice, r, c, 36, 2) + crop)
+    street = np.abs(q - STREET[kind] * np.round(q / STREET[kind]))
+    kerb = np.maximum(5 - street, 7 - border)  # px into a street or a road; pavements are 2 px wide
+    return np.where(kerb > -2, np.where(kerb > 0, 0.15, 0.26) * (1 + 0.08 * grain), soil)
+
+
+def _place(lattice: Array, r: Array, c: Array, quarter: Arrays, salt: int, thing: Sequence[float]) -> Arrays:
+    """Which of the positions (n,) are near one of THINGS, and a frame (6, m) for those.
+
+    Frame: px along and across from its centre, its angle, its base (m), two random numbers of its own (0 to 1).
+    """
+    along, lanes, shift, stray, length, width, *_, share, shape = thing
+    kind, _, angle, number = quarter
+    angle, across = angle + salt * (shape == FOREST), STREET[kind] / lanes
+    p, q = _turned(r, c, angle)
+    i, j = np.floor(p / along).astype(int), np.floor(q / across - shift).astype(int)
+    dice = [lattice[(i + number + 17 * n) & 255, (j + 29 * salt + 7 * n) & 255] for n in range(5)]
+    p0, q0 = (i + 0.5) * along + (along / 2 - length) * dice[0], (j + 0.5 + shift) * across + stray * dice[1]
+    near = (np.hypot(p - p0, q - q0) < np.hypot(length, width) + 1) & (dice[2] < 2 * share - 1)
+    frame = np.stack([p - p0, q - q0, angle, 0 * p, dice[3] / 2 + 0.5, dice[4] / 2 + 0.5])[:, near]
+    column, row = _turned(q0[near], p0[near], -frame[2])
+    _, border, _, home = _quarter(lattice, row, column)
+    frame[3] = _terrain(lattice, row, column)
+    free = (home == number[near]) & (border > 7 + length) & (frame[3] > 1)
+    return np.flatnonzero(near)[free], frame[:, free]
+
+
+def _draw(nodes: Array, frame: Array, thing: Sequence[float]) -> Array:
+    """Height and albedo (2, m, OVER) of nodes (height, albedo, grain) with a thing, where it is the higher."""
+    *_, length, width, low, high, dark, bright, _, shape = thing
+    (p, q, angle, base, size, tone), (ground, _, grain) = frame[..., None], nodes
+    sun_p, sun_q = _turned(np.array(SLOPE_LIGHT[1]), np.array(SLOPE_LIGHT[0]), angle)
+    p = (p + FRACTIONS * np.cos(angle)) / (length * (0.7 + 0.3 * size))
+    q = (q - FRACTIONS * np.sin(angle)) / (width * (0.7 + 0.3 * size))
+    top, color = base + low + (high - low) * size**1.5, (dark + (bright - dark) * tone**2) * (1 + 0.1 * grain)
+    inside = np.maximum(np.abs(p), np.abs(q)) < 1
+    if shape == GABLE:
+        top, color = top - 0.5 * PIXEL * width * np.abs(q), color * (1 - 0.5 * sun_q * np.sign(q))
+    elif shape == ROOFTOP:
+        top, inside = ground + low, inside & (ground > base + 4)
+    elif shape != FLAT:
+        bulge = 1 - p * p - q * q - 0.4 * grain  # a ragged crown
+        inside, color = bulge > 0, color * np.maximum(1 + 0.5 * grain - 0.9 * (sun_p * p + sun_q * q), 0.2)
+        top = base + (top - base) * np.sqrt(np.clip(bulge, 0, 1)) * (1 + 0.15 * grain)
+    return np.where(inside & (top > ground), np.broadcast_arrays(top, color), nodes[:2])
+
+
+def _quarter(lattice: Array, r: Array, c: Array) -> Arrays:
+    """The quarter at some rows and columns: its kind, px to its border, its streets' angle, its number."""
+    y = (0.9 * r + 0.44 * c) / QUARTER + 0.25 * _noise(lattice, r, c, 500, 2)
+    x = (0.9 * c - 0.44 * r) / QUARTER + 0.25 * _noise(lattice, c, r, 500, 2)
+    i, j = np.floor(y).astype(int), np.floor(x).astype(int)
+    border = QUARTER * (0.5 - np.maximum(np.abs(y - i - 0.5), np.abs(x - j - 0.5)))
+    return PLAN[i & 3, j & 3], border, 1.5 * lattice[i & 255, j & 255], 137 * i + 1009 * j
+
+
+def _turned(r: Array, c: Array, angle: Array) -> tuple[Array, Array]:
+    """Coordinates (px) along and across a direction."""
+    return c * np.cos(angle) + r * np.sin(angle), r * np.cos(angle) - c * np.sin(angle)
+
+
+def _terrain(lattice: Array, r: Array, c: Array) -> Array:
+    """Height (m) of the ground: hills, and 0 on a river that winds through the image."""
+    away = np.abs(0.95 * r - 0.3 * c - 380 + 110 * _noise(lattice, r, c, 400, 3))
+    rise = np.clip((away - 18) / 150, 0, 1)
+    return np.asarray(rise * (2 - rise) * np.maximum(7 + 5 * _noise(lattice, r, c, 280, 4), 1))
+
+
+def _noise(lattice: Array, r: Array, c: Array, spacing: float, octaves: int) -> Array:
+    """Smooth noise, about -1 to 1: nodes of the lattice `spacing` px apart, and ever finer and weaker ones."""
+    total = np.zeros(())
+    for scale in 0.5 ** np.arange(octaves):
+        y, x = r / (spacing * scale) + 31.7 / scale, c / (spacing * scale) + 17.1 / scale
+        i, j = np.floor(y).astype(int), np.floor(x).astype(int)
+        fy, fx = (f * f * (3 - 2 * f) for f in (y - i, x - j))
+        i, j = i & 255, j & 255
+        top = lattice[i, j] * (1 - fx) + lattice[i, j + 1] * fx
+        bottom = lattice[i + 1, j] * (1 - fx) + lattice[i + 1, j + 1] * fx
+        total = total + scale * (top + (bottom - top) * fy)
+    return total
