@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 STAGES = {
+    "scene": "making a scene",
     "kernels": "preparing kernels (compiled once a machine, then about a second)",
     "tiles": "matching tiles",
     "bands": "finishing rows",
@@ -65,6 +66,10 @@ class Console:
         self._told[stage] = tenth
         left = f", {(total - done) / rate:.0f} s left" if rate > 0 and done < total else ""
         self._terminal.print(f"{STAGES[stage]}: {done}/{total}{left}")
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        self._terminal.print(text)
 
     def summary(self, report: dict[str, Any], out: Path) -> None:
         """The table at the end of a run."""

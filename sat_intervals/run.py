@@ -100,7 +100,7 @@ def match_pair(
     check_pair(left, right, config.disparity.minimum, config.disparity.maximum)
     region = _region(left, window)
     out = Path(out)
-    _check_output(out, overwrite)
+    check_output(out, overwrite)
     grid = Grid(region, config.tiles.size)
     store = Store(out / "tiles", grid, config.disparity.count, config.largest_ambiguity)
     inputs = {"left": _described(left), "right": _described(right)}
@@ -137,7 +137,8 @@ def _region(left: Image, window: Window | None) -> Window:
     return window
 
 
-def _check_output(out: Path, overwrite: bool) -> None:
+def check_output(out: Path, overwrite: bool) -> None:
+    """Make the folder of a run, or tell why it cannot be used."""
     there = [name for name in OUTPUTS if (out / name).exists()]
     if there and not overwrite:
         raise SatIntervalsError(f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite")

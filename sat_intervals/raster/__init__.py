@@ -1,0 +1,22 @@
+"""GeoTIFF in and out: images, their georeferencing, and the files of a run. The only home of rasterio and pyproj."""
+
+from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
+from sat_intervals.raster.images import Image, InputError, check_pair, open_image
+from sat_intervals.raster.layers import north_up, read_layers, write_layer
+from sat_intervals.raster.windows import read_window
+from sat_intervals.raster.writer import OutputError, OutputWriter
+
+__all__ = [
+    "ControlPoint",
+    "Georeferencing",
+    "Image",
+    "InputError",
+    "OutputError",
+    "OutputWriter",
+    "check_pair",
+    "north_up",
+    "open_image",
+    "read_layers",
+    "read_window",
+    "write_layer",
+]

@@ -1,0 +1,50 @@
+"""What every use of GDAL here needs: an image without georeferencing taken as it is, and errors in one line."""
+
+import re
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rasterio import Env
+from rasterio._err import CPLE_BaseError  # what rasterio.shutil.copy lets through
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.io import DatasetReader, DatasetWriter
+
+GDAL_ERRORS = (RasterioError, CPLE_BaseError)
+
+# rasterio warns whenever it opens an image without georeferencing, which an epipolar image may well be. Datasets are
+# opened by their classes, not by rasterio.open, so that the warning counts as given in this package: the filter is
+# for this package alone. `warnings.catch_warnings` would not do: threads that use it undo each other's filters.
+_QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
+_LOCK = threading.Lock()
+
+
+@contextmanager
+def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
+    """A raster open for reading; from any thread."""
+    with Env():
+        _accept_no_georeferencing()
+        with DatasetReader(path, **options) as dataset:
+            yield dataset
+
+
+def create(path: str, **options: Any) -> DatasetWriter:
+    """A new GeoTIFF; to be called inside a `rasterio.Env`."""
+    _accept_no_georeferencing()
+    return DatasetWriter(path, "w", driver="GTiff", **options)
+
+
+def reason(error: BaseException) -> str:
+    """What GDAL said first of a failure, in one line."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return " ".join(str(error).split())
+
+
+def _accept_no_georeferencing() -> None:
+    """Set the filter where it is missing: others, such as pytest between tests, restore the filters they knew."""
+    with _LOCK:
+        if _QUIET not in warnings.filters:
+            warnings.filterwarnings("ignore", category=NotGeoreferencedWarning, module=_QUIET[3].pattern)

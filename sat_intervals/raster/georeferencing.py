@@ -1,0 +1,83 @@
+"""Where an image lies, as its file tells."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from rasterio.control import GroundControlPoint
+from rasterio.crs import CRS
+from rasterio.rpc import RPC
+from rasterio.transform import Affine
+
+from sat_intervals.tiling import Window
+
+
+class ControlPoint(NamedTuple):
+    """A ground control point: row and column in pixels from the image's upper left corner, map x, y and height z."""
+
+    row: float
+    column: float
+    x: float
+    y: float
+    z: float
+
+
+@dataclass(frozen=True)
+class Georeferencing:
+    """CRS and transform, or control points, or RPCs, or nothing: what a file has, and no more.
+
+    ``transform`` takes pixels (column, row) to the CRS; ``rpcs`` hold offsets in pixels of this image.
+    """
+
+    crs: CRS | None = None
+    transform: Affine | None = None
+    gcps: tuple[ControlPoint, ...] = ()
+    gcps_crs: CRS | None = None
+    rpcs: RPC | None = None
+
+    @classmethod
+    def of(cls, dataset: Any) -> "Georeferencing":
+        """The georeferencing of an open rasterio dataset."""
+        points, points_crs = dataset.gcps
+        return cls(
+            crs=dataset.crs,
+            transform=None if dataset.transform == Affine.identity() else dataset.transform,
+            gcps=tuple(ControlPoint(point.row, point.col, point.x, point.y, point.z or 0.0) for point in points),
+            gcps_crs=points_crs,
+            rpcs=dataset.rpcs,
+        )
+
+    @property
+    def pixel_size(self) -> tuple[float, float] | None:
+        """Width and height of a pixel in units of the CRS; None without a transform."""
+        if self.transform is None:
+            return None
+        a, b, _, d, e, _ = self.transform[:6]
+        return math.hypot(a, d), math.hypot(b, e)
+
+    def shifted(self, window: Window) -> "Georeferencing":
+        """The georeferencing of a region of the image, its first pixel being that of ``window``."""
+        row, column = window.row, window.column
+        transform, rpcs = self.transform, self.rpcs
+        if transform is not None:
+            a, b, c, d, e, f = transform[:6]
+            transform = Affine(a, b, c + a * column + b * row, d, e, f + d * column + e * row)
+        if rpcs is not None:
+            offsets = {"line_off": rpcs.line_off - row, "samp_off": rpcs.samp_off - column}
+            rpcs = RPC(**rpcs.to_dict() | offsets)
+        gcps = tuple(point._replace(row=point.row - row, column=point.column - column) for point in self.gcps)
+        return replace(self, transform=transform, gcps=gcps, rpcs=rpcs)
+
+    def creation_options(self) -> dict[str, Any]:
+        """The arguments by which rasterio gives it to a new GeoTIFF, which holds a transform or control points."""
+        options: dict[str, Any] = {}
+        if self.gcps and self.transform is None:
+            points = [GroundControlPoint(row, column, x, y, z) for row, column, x, y, z in self.gcps]
+            options |= {"gcps": points, "crs": self.gcps_crs or CRS()}
+        else:
+            options |= {"crs": self.crs, "transform": self.transform}
+        if self.rpcs is not None:
+            errors = {"ERR_BIAS": self.rpcs.err_bias, "ERR_RAND": self.rpcs.err_rand}  # to_gdal leaves out zeros
+            known = {name: str(value) for name, value in errors.items() if value is not None}
+            options["rpcs"] = self.rpcs.to_gdal() | known
+        return options

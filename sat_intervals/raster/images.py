@@ -1,0 +1,200 @@
+"""Images in: what a raster file holds, and whether two make a pair."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.io import DatasetReader
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import gdal
+from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.tiling import Window
+
+# Of what GDAL makes the mask of a band whose file has none: nothing, the no-data value, the alpha band.
+_NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
+# Pixel sizes that differ by less, relatively, are one size written with other digits.
+_SAME_SIZE = 1e-6
+
+
+class InputError(SatIntervalsError):
+    """An input that cannot be used."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """One band of a raster file, and all that a worker in whatever process needs to read any window of it.
+
+    Attributes
+    ----------
+    path
+        Local file (absolute), URL, or any name that GDAL opens.
+    band
+        Counted from 1.
+    height, width
+        Pixels.
+    dtype
+        NumPy name of the file's type.
+    nodata
+        Value that stands for no data: the user's, else the file's, else None.
+    use_mask
+        Whether the file has a mask, inside or in a ``.msk`` beside it.
+    alpha
+        Band, counted from 1, that is 0 where there is no data; None without one.
+    mask
+        The user's mask: a file of the same size, not 0 where the image must not be used; None without one.
+    georeferencing
+        As in the file.
+    """
+
+    path: str
+    band: int
+    height: int
+    width: int
+    dtype: str
+    nodata: float | None
+    use_mask: bool
+    alpha: int | None
+    mask: str | None
+    georeferencing: Georeferencing
+
+
+def open_image(
+    path: str | os.PathLike[str],
+    *,
+    band: int | None = None,
+    nodata: float | None = None,
+    mask: str | os.PathLike[str] | None = None,
+) -> Image:
+    """Look at an image without reading a pixel.
+
+    Parameters
+    ----------
+    path
+        Local file, URL, or any name that GDAL opens.
+    band
+        Counted from 1; needed where there are several, an alpha band not counted.
+    nodata
+        Takes the place of the file's value; one that the file's type cannot hold matches nothing. The file's mask and
+        alpha count all the same, and NaN and infinity are always no data.
+    mask
+        File of the same size, of which the first band is not 0 where the image must not be used.
+
+    Raises
+    ------
+    InputError
+        Nothing there that can be matched, or a mask that does not fit.
+    """
+    name = _absolute(path)
+    with opened(name) as dataset:
+        bands, alphas = _kinds(dataset)
+        band = _chosen(name, bands, band)
+        image = Image(
+            path=name,
+            band=band,
+            height=dataset.height,
+            width=dataset.width,
+            dtype=dataset.dtypes[band - 1],
+            nodata=dataset.nodatavals[band - 1] if nodata is None else float(nodata),
+            use_mask=dataset.mask_flag_enums[band - 1] not in _NO_MASK,
+            alpha=alphas[0] if alphas else None,
+            mask=None if mask is None else _absolute(mask),
+            georeferencing=Georeferencing.of(dataset),
+        )
+    if "complex" in image.dtype:
+        raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
+    if image.mask is not None:
+        _check_mask(image, image.mask)
+    return image
+
+
+def check_pair(left: Image, right: Image, minimum: int, maximum: int) -> None:
+    """Hold that rows correspond and that the disparities from ``minimum`` to ``maximum`` pixels can be searched.
+
+    Widths and origins may differ: a disparity counts columns, not ground.
+
+    Raises
+    ------
+    InputError
+        Images that are no epipolar pair, or a search range that does not suit them.
+    """
+    pair = f"{left.path} and {right.path}"
+    if left.height != right.height:
+        raise InputError(
+            f"{pair} have {left.height} and {right.height} rows, but rows must correspond: resample the pair together"
+        )
+    here, there = left.georeferencing, right.georeferencing
+    if here.crs and there.crs and here.crs != there.crs:
+        names = f"{here.crs.to_string()} and {there.crs.to_string()}"
+        raise InputError(f"{pair} have different CRS, {names}: resample the pair together")
+    sizes = here.pixel_size, there.pixel_size
+    if sizes[0] and sizes[1] and not np.allclose(sizes[0], sizes[1], rtol=_SAME_SIZE, atol=0):
+        names = "{:.9g} x {:.9g} and {:.9g} x {:.9g}".format(*sizes[0], *sizes[1])
+        raise InputError(f"{pair} have different pixel sizes, {names}: resample the pair together")
+    _check_range(left, right, minimum, maximum)
+
+
+@contextmanager
+def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
+    """A raster open for reading, of which ``window`` is wanted; what GDAL has against it is an `InputError`."""
+    try:
+        with gdal.reading(path) as dataset:
+            yield dataset
+    except gdal.GDAL_ERRORS as error:
+        if window is None:
+            raise InputError(
+                f"{path} cannot be read: {gdal.reason(error)}: give the path of a raster, such as a GeoTIFF"
+            ) from error
+        raise InputError(
+            f"{path} cannot be read at rows {window.row} to {window.row_stop - 1}, columns {window.column} to "
+            f"{window.column_stop - 1}: {gdal.reason(error)}: the file may be cut short, give a whole copy"
+        ) from error
+
+
+def _absolute(path: str | os.PathLike[str]) -> str:
+    """A local file wherever the process works; other names of GDAL as they are."""
+    name = os.fspath(path)
+    return os.path.abspath(name) if os.path.exists(name) else name
+
+
+def _kinds(dataset: DatasetReader) -> tuple[list[int], list[int]]:
+    """Numbers of the image bands and of the alpha bands."""
+    alphas = [band for band, kind in enumerate(dataset.colorinterp, start=1) if kind == ColorInterp.alpha]
+    return [band for band in dataset.indexes if band not in alphas], alphas
+
+
+def _chosen(path: str, bands: list[int], band: int | None) -> int:
+    """The band to match."""
+    if not bands:
+        raise InputError(f"{path} has no image band: name a raster, or one of the subdatasets if it has some")
+    if band is None and len(bands) > 1:
+        raise InputError(f"{path} has {len(bands)} bands: choose one of {bands[0]} to {bands[-1]} with --band")
+    if band is not None and band not in bands:
+        there = f"1 band, {bands[0]}" if len(bands) == 1 else f"bands {bands[0]} to {bands[-1]}"
+        raise InputError(f"{path} has no image band {band}, it has {there}: choose with --band")
+    return bands[0] if band is None else band
+
+
+def _check_mask(image: Image, mask: str) -> None:
+    with opened(mask) as dataset:
+        if dataset.shape != (image.height, image.width):
+            raise InputError(
+                f"{mask} has {dataset.height} x {dataset.width} pixels, {image.path} {image.height} x {image.width}: "
+                "give a mask of the image's size"
+            )
+
+
+def _check_range(left: Image, right: Image, minimum: int, maximum: int) -> None:
+    search = f"disparities {minimum} to {maximum}"
+    if left.width - 1 + maximum < 0 or minimum > right.width - 1:
+        raise InputError(
+            f"{search} lead every pixel of {left.path}, {left.width} columns, out of {right.path}, {right.width}: "
+            "check their sign, x_right = x_left + disparity"
+        )
+    if maximum - minimum + 1 > right.width:
+        raise InputError(
+            f"{search} are {maximum - minimum + 1}, more than the {right.width} columns of {right.path}: search fewer"
+        )

@@ -1,0 +1,67 @@
+"""Pixels in: any window of an image, with the states of its pixels."""
+
+import numpy as np
+from rasterio.windows import Window as Area
+
+from sat_intervals.products import MASKED, NO_DATA
+from sat_intervals.raster.images import Image, opened
+from sat_intervals.tiling import Window
+
+# Types whose every value is a float32.
+_FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
+
+
+def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of a window, which may lie partly or wholly outside the image, and what they are good for.
+
+    Any thread or process may call it: the file is opened each time (0.15 ms, against some ms for the pixels of a tile).
+
+    Returns
+    -------
+    pixels
+        ``(height, width)``, float32 where that holds every value of the file's type, else float64; 0 where not usable.
+    state
+        ``(height, width)`` uint8: 0 = usable; bit NO_DATA = outside the image, no-data value, the file's mask or alpha,
+        NaN or infinity; bit MASKED = the user's mask.
+
+    Raises
+    ------
+    InputError
+        Pixels that cannot be read, as in a file cut short; it names the file and the rows and columns.
+    """
+    inside = window.clipped(Window(0, 0, image.height, image.width))
+    pixels = np.zeros((window.height, window.width), np.float32 if image.dtype in _FLOAT32_HOLDS else np.float64)
+    state = np.full(pixels.shape, NO_DATA, np.uint8)
+    if inside.height and inside.width:
+        place = inside.relative_to(window).slices
+        values, state[place] = _read_inside(image, inside)
+        np.copyto(pixels[place], values, where=state[place] == 0)
+    return pixels, state
+
+
+def _read_inside(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Values in the file's type, and states, of a window that lies inside the image."""
+    area = Area(window.column, window.row, window.width, window.height)
+    with opened(image.path, window) as dataset:
+        values = dataset.read(image.band, window=area)
+        usable = np.isfinite(values) & _differs(values, image.nodata)
+        # Asked for one by one, since GDAL's mask of a band is but the first there is of: mask, no-data value, alpha.
+        if image.use_mask:
+            usable &= dataset.read_masks(image.band, window=area) != 0
+        if image.alpha is not None:
+            usable &= dataset.read(image.alpha, window=area) != 0
+    state = np.where(usable, 0, NO_DATA).astype(np.uint8)
+    if image.mask is not None:
+        with opened(image.mask, window) as dataset:
+            state[dataset.read(1, window=area) != 0] |= MASKED
+    return values, state
+
+
+def _differs(values: np.ndarray, nodata: float | None) -> np.ndarray:
+    """Where values are not the no-data value as their type holds it: 0.1 is no float32, and 300 no uint8 at all."""
+    if nodata is None:
+        return np.ones(values.shape, bool)
+    with np.errstate(over="ignore", invalid="ignore"):
+        stored = np.asarray(nodata).astype(values.dtype)
+    held = values.dtype.kind == "f" or stored == nodata
+    return np.asarray(values != stored) if held else np.ones(values.shape, bool)

@@ -1,0 +1,221 @@
+"""Files out: the bands and the validity of a run as Cloud-Optimized GeoTIFFs, all of them under their names or none."""
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from rasterio import Env
+from rasterio.io import DatasetWriter
+from rasterio.shutil import copy
+from rasterio.windows import Window as Area
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import gdal
+from sat_intervals.raster.files import INTERVALS, VALIDITY, File
+from sat_intervals.raster.georeferencing import Georeferencing
+
+# Folder, inside that of the run, where files grow until they are whole. What a killed run left there is replaced.
+_SCRATCH = ".unpublished"
+# Strips are kept as they come, in blocks low enough that a strip fills most of those it touches.
+_STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "pixel", "bigtiff": "IF_SAFER"}
+# Read by whatever reads GeoTIFF; figures of the choice in tests/benchmarks.
+_COG = {"COMPRESS": "DEFLATE", "LEVEL": "6", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
+# Blocks in GDAL's hands, in bytes: strips of 40 000 columns are written without reading back.
+_CACHE = 128 << 20
+_WAY_OUT = "make room or choose another folder"
+
+
+class OutputError(SatIntervalsError):
+    """An output that cannot be written."""
+
+
+class OutputWriter:
+    """``intervals.tif`` and ``validity.tif``, from full-width strips of rows in increasing order.
+
+    ::
+
+        with OutputWriter(folder, height, width, georeferencing, tags) as writer:
+            writer.write(row, intervals, validity)  # strip by strip
+            writer.publish()
+
+    Memory follows the strip. Until `publish` the files are in a hidden folder inside ``folder``, as plain GeoTIFFs of
+    18 bytes a pixel and then as Cloud-Optimized GeoTIFFs; leaving the context removes it, whatever happened.
+
+    Parameters
+    ----------
+    folder
+        Where the files go; made if missing.
+    height, width
+        Pixels.
+    georeferencing
+        That of the pixels written.
+    tags
+        Metadata of both files.
+    threads
+        That compress; None for one a core.
+
+    Raises
+    ------
+    OutputError
+        What cannot be written, from every method.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        height: int,
+        width: int,
+        georeferencing: Georeferencing,
+        tags: Mapping[str, str],
+        *,
+        threads: int | None = None,
+    ) -> None:
+        self._folder = Path(folder)
+        self._scratch = self._folder / _SCRATCH
+        self._shape = height, width
+        self._georeferencing = georeferencing
+        self._tags = dict(tags)
+        self._threads = "ALL_CPUS" if threads is None else str(threads)
+        self._strips: dict[File, DatasetWriter] = {}
+        self._sums = {INTERVALS: 0, VALIDITY: 0}
+
+    def __enter__(self) -> Self:
+        with self._failing(self._folder):
+            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch.mkdir(parents=True)
+        try:
+            self._check_space()
+            for file in (INTERVALS, VALIDITY):
+                self._strips[file] = self._create(file)
+        except BaseException:
+            self._clean()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._clean()
+
+    def write(self, row: int, intervals: np.ndarray, validity: np.ndarray) -> None:
+        """Write the strip that begins at ``row``: ``(4, rows, width)`` in the order of BANDS, and ``(rows, width)``."""
+        area = Area(0, row, self._shape[1], validity.shape[0])
+        for file, bands in ((INTERVALS, intervals), (VALIDITY, validity[np.newaxis])):
+            bands = np.ascontiguousarray(bands, file.dtype)
+            with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
+                self._strips[file].write(bands, window=area)
+            self._sums[file] += _sum(bands)
+
+    def build(self) -> None:
+        """Make the files that `publish` names, and read them back."""
+        while self._strips:
+            file, strips = self._strips.popitem()
+            whole = self._scratch / file.name
+            options = _COG | {"NUM_THREADS": self._threads}
+            with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
+                strips.close()
+                copy(strips.name, str(whole), driver="COG", **options)
+                _flush(whole)
+                self._verify(whole, self._sums[file])
+            os.unlink(strips.name)
+
+    def publish(self, texts: Mapping[str, str] | None = None) -> None:
+        """Give the files their names, with further text files (name to content) that belong to them."""
+        self.build()
+        texts = texts or {}
+        for name, text in texts.items():
+            with self._failing(self._folder / name):
+                (self._scratch / name).write_text(text, encoding="utf-8")
+                _flush(self._scratch / name)
+        names = (INTERVALS.name, VALIDITY.name, *texts)
+        try:
+            for name in names:
+                with self._failing(self._folder / name):
+                    os.replace(self._scratch / name, self._folder / name)
+        except BaseException:  # of some, old or new, none
+            for name in names:
+                with suppress(OSError):
+                    os.unlink(self._folder / name)
+            raise
+
+    def _create(self, file: File) -> DatasetWriter:
+        """A plain GeoTIFF for the strips, with all that is said of the file."""
+        height, width = self._shape
+        kind = {"count": file.count, "dtype": file.dtype, "nodata": file.nodata}
+        options = _STRIPS | kind | self._georeferencing.creation_options()
+        with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
+            strips = gdal.create(str(self._scratch / f"strips-{file.name}"), height=height, width=width, **options)
+            strips.update_tags(**self._tags)
+            file.describe(strips)
+        return strips
+
+    def _verify(self, whole: Path, expected: int) -> None:
+        """Read a file back, overviews included: GDAL may take a full disk for written."""
+        found = 0
+        with gdal.reading(str(whole)) as dataset:
+            levels = range(len(dataset.overviews(1)))
+            for _, area in dataset.block_windows(1):
+                found += _sum(dataset.read(window=area))
+        for level in levels:
+            with gdal.reading(str(whole), overview_level=level) as dataset:
+                for _, area in dataset.block_windows(1):
+                    dataset.read(window=area)
+        if found != expected:
+            raise OSError(errno.EIO, "it is not what was written that can be read back")
+
+    def _check_space(self) -> None:
+        needed, free = self._bytes, shutil.disk_usage(self._folder).free
+        if needed > free:
+            raise OutputError(
+                f"{self._folder} has {_size(free)} left, the bands need {_size(needed)} to begin with: {_WAY_OUT}"
+            )
+
+    @property
+    def _bytes(self) -> int:
+        """Of all bands uncompressed."""
+        height, width = self._shape
+        return height * width * sum(file.count * np.dtype(file.dtype).itemsize for file in (INTERVALS, VALIDITY))
+
+    @contextmanager
+    def _failing(self, path: Path) -> Iterator[None]:
+        """Turn what fails into an error that names the file as the user knows it, and the system's reason."""
+        try:
+            yield
+        except (*gdal.GDAL_ERRORS, OSError) as error:
+            raise OutputError(f"{path} cannot be written: {self._reason(error)}: {_WAY_OUT}") from error
+
+    def _reason(self, error: Exception) -> str:
+        if isinstance(error, OSError) and error.strerror:
+            return error.strerror
+        # GDAL keeps the system's reason to itself. A Cloud-Optimized GeoTIFF is made with its overviews twice.
+        free = shutil.disk_usage(self._folder).free
+        full = f"{os.strerror(errno.ENOSPC)}, {_size(free)} free: " if free < 2 * self._bytes else ""
+        return full + gdal.reason(error)
+
+    def _clean(self) -> None:
+        for strips in self._strips.values():
+            with suppress(*gdal.GDAL_ERRORS):
+                strips.close()
+        self._strips.clear()
+        shutil.rmtree(self._scratch, ignore_errors=True)
+
+
+def _sum(bands: np.ndarray) -> int:
+    """Sum of an array's bits taken as unsigned integers: one figure in whatever order blocks are read."""
+    return int(bands.view(f"uint{8 * bands.itemsize}").sum(dtype=np.uint64))
+
+
+def _flush(path: Path) -> None:
+    """Have the system write a file to the disk, and tell if it cannot."""
+    with open(path, "rb") as stream:
+        os.fsync(stream.fileno())
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:,.1f} MB"

@@ -1,0 +1,176 @@
+"""Files to files on real workers: the laws of tiles, resume, reports."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import rasterio
+
+from sat_intervals import match_arrays, match_pair, run
+from sat_intervals.config import load_config
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.products import INVALID, NO_DATA
+from sat_intervals.raster import open_image, read_window
+from sat_intervals.scene import make_scene
+from sat_intervals.tiling import Window
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A procedural pair of 300 x 420 pixels on disk, with its settings."""
+    folder = tmp_path_factory.mktemp("pair")
+    scene = make_scene(300, 420, seed=3)
+    for name, image in (("left", scene.left), ("right", scene.right)):
+        profile = {"driver": "GTiff", "height": 300, "width": 420, "count": 1, "dtype": "uint16", "nodata": 0}
+        transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
+        with rasterio.open(folder / f"{name}.tif", "w", crs="EPSG:32631", transform=transform, **profile) as file:
+            file.write(image, 1)
+    settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}}
+    return folder / "left.tif", folder / "right.tif", settings
+
+
+def bands(out):
+    with rasterio.open(out / "intervals.tif") as intervals, rasterio.open(out / "validity.tif") as validity:
+        return intervals.read(), validity.read(1)
+
+
+def in_tiles(settings, size, overlap=100, **more):
+    return settings | {"tiles": {"size": size, "overlap": overlap}} | more
+
+
+@pytest.mark.parametrize("more", [{}, {"cross_check": {"method": "accurate"}}, {"sgm": None}])
+def test_match_pair__equals_match_arrays_in_one_tile(pair, tmp_path, more):
+    left, right, settings = pair
+    settings = settings | more
+    match_pair(left, right, tmp_path / "out", settings)
+    with rasterio.open(left) as first, rasterio.open(right) as second:
+        arrays = [np.ma.masked_equal(file.read(1), 0) for file in (first, second)]
+    whole = match_arrays(*arrays, settings)
+    intervals, validity = bands(tmp_path / "out")
+    np.testing.assert_array_equal(intervals, [whole[name] for name in ("disparity", "lower", "upper", "confidence")])
+    np.testing.assert_array_equal(validity, whole["validity"])
+
+
+@pytest.mark.parametrize("more", [{}, {"cross_check": {"method": "accurate"}}])
+def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, tmp_path, more):
+    left, right, settings = pair
+    match_pair(left, right, tmp_path / "whole", in_tiles(settings, 512, **more))
+    match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 128, **more))
+    (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
+    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
+    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
+    assert differs[0].sum() / judged.sum() <= 0.002
+    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.005
+
+
+def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path):
+    left, right, settings = pair
+    for name, size in (("whole", 512), ("tiles", 64)):
+        match_pair(left, right, tmp_path / name, in_tiles(settings, size, overlap=3, sgm=None))
+    np.testing.assert_array_equal(bands(tmp_path / "whole")[0], bands(tmp_path / "tiles")[0])
+    np.testing.assert_array_equal(bands(tmp_path / "whole")[1], bands(tmp_path / "tiles")[1])
+
+
+@pytest.mark.parametrize("workers", [{"workers": 2}, {"workers": 2, "processes": True}])
+def test_match_pair__gives_the_same_bytes_whatever_the_workers(pair, tmp_path, workers):
+    left, right, settings = pair
+    settings = in_tiles(settings, 128, overlap=20)
+    match_pair(left, right, tmp_path / "one", settings, workers=1)
+    match_pair(left, right, tmp_path / "more", settings, **workers)
+    for name in ("intervals.tif", "validity.tif"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "more" / name).read_bytes()
+
+
+def test_match_pair__reports_what_a_small_overlap_left(pair, tmp_path):
+    left, right, settings = pair
+    wide = match_pair(left, right, tmp_path / "wide", in_tiles(settings, 128, overlap=100))["overlap_left"]
+    narrow = match_pair(left, right, tmp_path / "narrow", in_tiles(settings, 128, overlap=3))["overlap_left"]
+    # 3 x 4 tiles: 3 * 3 borders between columns and 2 * 4 between rows
+    assert wide["borders"] == narrow["borders"] == 17
+    assert wide["bounds_share"] < narrow["bounds_share"] <= narrow["worst"]["bounds_share"]
+    assert narrow["winner_share"] > 0.01
+
+
+def test_match_pair__writes_a_complete_report(pair, tmp_path):
+    left, right, settings = pair
+    report = match_pair(left, right, tmp_path / "out", settings)
+    assert report == json.loads((tmp_path / "out" / "run.json").read_text())
+    counts, validity = report["counts"], bands(tmp_path / "out")[1]
+    assert counts["pixels"] == validity.size
+    assert counts["valid"] == (validity & INVALID == 0).sum()
+    for name, flag in report["validity_bits"].items():
+        assert counts["flags"][name] == np.count_nonzero(validity & (1 << flag["bit"]))
+    assert report["inputs"]["left"]["bytes"] == left.stat().st_size
+    assert report["cost_span"] == 448
+    assert load_config(report["settings"]) == load_config(settings)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+
+
+def test_match_pair__window_is_the_crop_of_the_whole(pair, tmp_path):
+    left, right, settings = pair
+    window = Window(90, 120, 128, 150)
+    settings = settings | {"ambiguity": {"normalization": "range"}, "cross_check": None, "regularization": None}
+    match_pair(left, right, tmp_path / "whole", settings)
+    match_pair(left, right, tmp_path / "part", settings, window=window)
+    whole, part = bands(tmp_path / "whole")[0][(slice(None), *window.slices)], bands(tmp_path / "part")[0]
+    inner = np.s_[:, 1:-1, 1:-1]  # the median sees beyond the region's border
+    assert (whole[inner] != part[inner]).mean() < 0.01 + np.isnan(whole).mean()
+    with rasterio.open(tmp_path / "part" / "intervals.tif") as file, rasterio.open(left) as image:
+        assert file.transform == image.transform * rasterio.Affine.translation(window.column, window.row)
+        assert file.crs == image.crs
+
+
+def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkeypatch):
+    left, right, settings = pair
+    settings = in_tiles(settings, 128, overlap=20)
+    match_pair(left, right, tmp_path / "undisturbed", settings)
+    matched = []
+    match_tile = run.match_tile
+
+    def fail_once(job, tile):
+        matched.append(tile.name)
+        if tile.name == "1_2" and matched.count("1_2") == 1:
+            raise OSError("disk gone")
+        return match_tile(job, tile)
+
+    monkeypatch.setattr(run, "match_tile", fail_once)
+    with pytest.raises(RunError, match="1 of 12 tiles failed.*\n.*tile 1_2: disk gone"):
+        match_pair(left, right, tmp_path / "out", settings)
+    assert not list((tmp_path / "out").glob("*.*"))
+    match_pair(left, right, tmp_path / "out", settings)
+    assert sorted(matched) == sorted({*matched, "1_2"} - {""}) + [] or matched.count("1_2") == 2
+    assert len(matched) == 13
+    for name in ("intervals.tif", "validity.tif"):
+        assert (tmp_path / "undisturbed" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+
+
+def test_match_pair__never_mixes_runs(pair, tmp_path):
+    left, right, settings = pair
+    out = tmp_path / "out"
+    match_pair(left, right, out, in_tiles(settings, 128), keep_tiles=True)
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(left, right, out, in_tiles(settings, 128))
+    for name in ("intervals.tif", "validity.tif", "run.json"):
+        (out / name).unlink()
+    with pytest.raises(SatIntervalsError, match="settings.sgm.p1 was 8, now 7"):
+        match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}))
+    match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}), overwrite=True)
+
+
+def test_match_pair__says_which_image_is_empty(pair, tmp_path):
+    left, _, settings = pair
+    empty = tmp_path / "empty.tif"
+    shutil.copy(left, empty)
+    with rasterio.open(empty, "r+") as file:
+        file.write(np.zeros(file.shape, "uint16"), 1)
+    with pytest.raises(SatIntervalsError, match="empty.tif hold no data"):
+        match_pair(left, empty, tmp_path / "out", settings)
+    assert not list((tmp_path / "out").glob("*.*"))
+
+
+def test_read_window__of_an_opened_image_gives_states(pair):
+    image = open_image(pair[0])
+    pixels, state = read_window(image, Window(-2, -2, 4, 4))
+    assert pixels.shape == state.shape == (4, 4)
+    assert (state[:2] == NO_DATA).all()
