@@ -1,6 +1,7 @@
 """All tiles of a pair, on this machine's cores, then the final bands. The only home of dask."""
 
 import json
+import logging
 import os
 import platform
 import time
@@ -230,8 +231,10 @@ def _client(workers: int, processes: bool) -> Iterator[Client]:
         n_workers=shape[0],
         threads_per_worker=shape[1],
         processes=processes,
-        dashboard_address=None,
-        silence_logs=50,
+        host="127.0.0.1" if processes else None,
+        dashboard_address="127.0.0.1:0",
+        worker_dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
     )
     with cluster, Client(cluster) as client:
         yield client
