@@ -112,6 +112,16 @@ def _median_of_nine(values, r, result):
         result[c] = _ordered(low, middle, high)[1]
 
 
+@njit(nogil=True)
+def _whole_windows(kept, r, whole):
+    """Which 3 x 3 windows along the inside of a row are kept as a whole."""
+    above, here, below = kept[r - 1], kept[r], kept[r + 1]
+    for c in range(1, here.size - 1):
+        left = above[c - 1] & here[c - 1] & below[c - 1]
+        right = above[c + 1] & here[c + 1] & below[c + 1]
+        whole[c] = left & above[c] & here[c] & below[c] & right
+
+
 @njit(nogil=True, cache=True)
 def median(values, kept, size):
     """Median of the kept pixels of each kept pixel's window; the other pixels keep their value.
@@ -135,16 +145,16 @@ def median(values, kept, size):
     radius = size // 2
     result = values.copy()
     window = np.empty(size * size, np.float32)
-    nine = np.empty(columns, np.float32)
+    nine, whole = np.empty(columns, np.float32), np.zeros(columns, np.bool_)
     for r in range(rows):
-        whole_rows = size == 3 and 0 < r < rows - 1
-        if whole_rows:
+        if size == 3 and 0 < r < rows - 1:
             _median_of_nine(values, r, nine)
+            _whole_windows(kept, r, whole)
+        else:
+            whole[:] = False
         for c in range(columns):
-            if not kept[r, c]:
-                continue
-            if whole_rows and 0 < c < columns - 1 and kept[r - 1 : r + 2, c - 1 : c + 2].all():
+            if whole[c]:
                 result[r, c] = nine[c]
-            else:
+            elif kept[r, c]:
                 result[r, c] = _median_around(values, kept, r, c, radius, window)
     return result

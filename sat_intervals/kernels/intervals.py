@@ -94,55 +94,59 @@ def _area(s, depth, above, below, visited, area):
 
 
 @njit(nogil=True)
-def _select(values, count, rank):
-    """The value of a rank among the first ``count``; afterwards none behind the rank is smaller (Hoare 1961)."""
-    left, right = 0, count - 1
-    while left < right:
-        pivot = values[(left + right) // 2]
-        i, j = left, right
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if rank <= j:
-            right = j
-        elif rank >= i:
-            left = i
-        else:
-            break
-    return values[rank]
-
-
-@njit(nogil=True)
-def _quantile(values, count, quantile):
-    """Quantile of the first ``count`` values, interpolated linearly; reorders them."""
-    rank = quantile * (count - 1)
-    below = int(rank)
-    first = np.float64(_select(values, count, below))
-    part = rank - below
-    if below + 1 == count or part == 0.0:
-        return first
-    second = np.float64(values[below + 1 : count].min())
-    if part < 0.5:
-        return first + (second - first) * part
-    return second - (second - first) * (1.0 - part)  # as numpy rounds it
-
-
-@njit(nogil=True)
-def _gather(values, segment_row, start, stop, area, count, into):
-    """Copy the values of all pixels of some segments; returns how many."""
+def _count(steps, segment_row, start, stop, area, members, counts):
+    """Count the values of all pixels of some segments; returns how many."""
+    counts[:] = 0
     size = 0
-    for i in range(count):
+    for i in range(members):
         s = area[i]
-        length = stop[s] - start[s]
-        into[size : size + length] = values[segment_row[s], start[s] : stop[s]]
-        size += length
+        row = steps[segment_row[s]]
+        for c in range(start[s], stop[s]):
+            counts[row[c]] += 1
+        size += stop[s] - start[s]
     return size
+
+
+@njit(nogil=True)
+def _quantile(counts, size, quantile):
+    """Quantile of the ``size`` values that are counted, interpolated linearly between the two ranks around it."""
+    rank = quantile * (size - 1)
+    below = int(rank)
+    value = 0
+    seen = counts[0]
+    while seen <= below:
+        value += 1
+        seen += counts[value]
+    first = value
+    while seen <= min(below + 1, size - 1):
+        value += 1
+        seen += counts[value]
+    return first + (value - first) * (rank - below)
+
+
+@njit(nogil=True)
+def _half_pixels(lower, upper, low):
+    """Bounds as steps of half a pixel above the least one: the least one, the number of steps, both as int32."""
+    least, most = np.inf, -np.inf
+    for r in range(low.shape[0]):
+        for c in range(low.shape[1]):
+            if low[r, c]:
+                least, most = min(least, lower[r, c]), max(most, upper[r, c])
+    lower_steps, upper_steps = np.zeros(low.shape, np.int32), np.zeros(low.shape, np.int32)
+    for r in range(low.shape[0]):
+        for c in range(low.shape[1]):
+            if low[r, c]:
+                lower_steps[r, c] = np.int32(2 * (lower[r, c] - least))
+                upper_steps[r, c] = np.int32(2 * (upper[r, c] - least))
+    bins = int(2 * (most - least)) + 1 if most >= least else 0
+    return least, bins, lower_steps, upper_steps
+
+
+@njit(nogil=True)
+def _same_neighbours(s, t, above, below):
+    """Whether two segments of a row touch the same segments, at least one."""
+    same = (above[s] == above[t]).all() and (below[s] == below[t]).all()
+    return same and (above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1])
 
 
 @njit(nogil=True, cache=True)
@@ -155,7 +159,8 @@ def regularize(lower, upper, low, depth, quantile, first, last):
     Parameters
     ----------
     lower, upper
-        ``(rows, columns)`` float32 bounds, a number wherever ``low``.
+        ``(rows, columns)`` float32 bounds, whole multiples of half a pixel (integers and means of two) wherever ``low``:
+        so quantiles come from counts.
     low
         bool of the same shape: low-confidence pixels.
     depth
@@ -178,25 +183,19 @@ def regularize(lower, upper, low, depth, quantile, first, last):
     for r in range(row_start.size - 1):
         segment_row[row_start[r] : row_start[r + 1]] = r
     visited, area = np.full(segments, -1, np.int64), np.empty(segments, np.int64)
-    values = np.empty((stop - start).sum(), np.float32)
+    base, bins, lower_steps, upper_steps = _half_pixels(lower, upper, low)
+    counts = np.empty(bins, np.int32)
     new_lower, new_upper = lower[first:last].copy(), upper[first:last].copy()
     low_bound = high_bound = 0.0
     for s in range(row_start[first], row_start[last]):
         # Segments of a row that touch the same segments have, from two steps on, the same area: without this, a row
         # of short segments beside one long segment would cost their number squared.
         if not (depth > 1 and s > row_start[segment_row[s]] and _same_neighbours(s - 1, s, above, below)):
-            count = _area(s, depth, above, below, visited, area)
-            size = _gather(lower, segment_row, start, stop, area, count, values)
-            low_bound = _quantile(values, size, 1.0 - quantile)
-            size = _gather(upper, segment_row, start, stop, area, count, values)
-            high_bound = _quantile(values, size, quantile)
+            members = _area(s, depth, above, below, visited, area)
+            size = _count(lower_steps, segment_row, start, stop, area, members, counts)
+            low_bound = base + 0.5 * _quantile(counts, size, 1.0 - quantile)
+            size = _count(upper_steps, segment_row, start, stop, area, members, counts)
+            high_bound = base + 0.5 * _quantile(counts, size, quantile)
         new_lower[segment_row[s] - first, start[s] : stop[s]] = low_bound
         new_upper[segment_row[s] - first, start[s] : stop[s]] = high_bound
     return new_lower, new_upper
-
-
-@njit(nogil=True)
-def _same_neighbours(s, t, above, below):
-    """Whether two segments of a row touch the same segments, at least one."""
-    same = (above[s] == above[t]).all() and (below[s] == below[t]).all()
-    return same and (above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1])

@@ -1,0 +1,20 @@
+"""What several test modules need."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real pairs; where it is absent: skip, or fail with SAT_INTERVALS_REQUIRE_SHARED=1."""
+    folder = Path(os.environ.get("SAT_INTERVALS_SHARED", ROOT.parent / "shared")) / "data"
+    if not folder.is_dir():
+        message = f"no real pairs in {folder}: SAT_INTERVALS_SHARED names the folder that holds data/"
+        if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1":
+            pytest.fail(message)
+        pytest.skip(message)
+    return folder
