@@ -5,14 +5,15 @@ import logging
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from distributed import Client, LocalCluster, as_completed
@@ -29,6 +30,8 @@ from sat_intervals.seams import seam_lines, seam_report
 from sat_intervals.store import Store
 from sat_intervals.summary import Tally
 from sat_intervals.tiling import Grid, Tile, Window
+
+Item = TypeVar("Item")
 
 STRIP_ROWS = 256
 OUTPUTS = ("intervals.tif", "validity.tif", "run.json")
@@ -292,7 +295,7 @@ def _finish(
         with _timed(seconds, "bands"):
             strips = (Rows(**strip) for strip in store.strips(STRIP_ROWS))
             row = 0
-            for final in finish_strips(strips, scale, config):
+            for final in _ahead(finish_strips(_ahead(strips), scale, config)):
                 writer.write(row, final.intervals, final.validity)
                 tally.add(final.intervals, final.validity)
                 row += final.validity.shape[0]
@@ -307,6 +310,16 @@ def _finish(
         writer.publish({"run.json": json.dumps(report, indent=1) + "\n"})
         progress("files", 1, 1)
     return report
+
+
+def _ahead(items: Iterable[Item]) -> Iterator[Item]:
+    """The same items, each made in a thread of its own while the one before is used."""
+    with ThreadPoolExecutor(1) as thread:
+        iterator = iter(items)
+        following = thread.submit(next, iterator, None)
+        while (item := following.result()) is not None:
+            following = thread.submit(next, iterator, None)
+            yield item
 
 
 def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) -> None:

@@ -39,7 +39,7 @@ SEAM_PRODUCTS = ("winner", "lower", "upper")
 
 # Rows of a shard that are compressed together, so that strips read no more than they need.
 _ROWS_TOGETHER = 256
-_COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle")
+_COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 
 
 class StoreError(SatIntervalsError):

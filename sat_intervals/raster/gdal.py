@@ -7,12 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 from rasterio import Env
-from rasterio._err import CPLE_BaseError  # what rasterio.shutil.copy lets through
+from rasterio._err import CPLE_BaseError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader, DatasetWriter
 
-GDAL_ERRORS = (RasterioError, CPLE_BaseError)
+# rasterio.shutil.copy lets the last two through; SystemError is its word for a failure that GDAL does not explain.
+GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 
 # rasterio warns whenever it opens an image without georeferencing, which an epipolar image may well be. Datasets are
 # opened by their classes, not by rasterio.open, so that the warning counts as given in this package: the filter is
@@ -24,10 +26,10 @@ _LOCK = threading.Lock()
 @contextmanager
 def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
     """A raster open for reading; from any thread."""
-    with Env():
-        _accept_no_georeferencing()
-        with DatasetReader(path, **options) as dataset:
-            yield dataset
+    _accept_no_georeferencing()
+    # rasterio casts the no-data value to see whether the type holds it: -1.8e308, of ArcGIS, is no float32
+    with Env(), np.errstate(over="ignore"), DatasetReader(path, **options) as dataset:
+        yield dataset
 
 
 def create(path: str, **options: Any) -> DatasetWriter:
@@ -40,7 +42,7 @@ def reason(error: BaseException) -> str:
     """What GDAL said first of a failure, in one line."""
     while error.__cause__ is not None:
         error = error.__cause__
-    return " ".join(str(error).split())
+    return "GDAL names no cause" if isinstance(error, SystemError) else " ".join(str(error).split())
 
 
 def _accept_no_georeferencing() -> None:
