@@ -1,8 +1,8 @@
 """Whole-image steps on raw products: cross-checking, confidence, medians, regularisation, final bands.
 
 Everything here sees full-width rows, with a halo of rows above and below, so that nothing depends on the tiling
-(method: sections 4, 6 to 9). The order is: winner and V-fit (in the tile), cross-check, median, quantiles, widening, NaN for
-invalid pixels.
+(method: sections 4, 6 to 9). The order is: winner and V-fit (in the tile), cross-check, median, quantiles, widening,
+NaN for invalid pixels.
 """
 
 from collections.abc import Iterable, Iterator

@@ -21,11 +21,11 @@ from distributed import Client, LocalCluster, as_completed
 from sat_intervals.config import Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
+from sat_intervals.inputs import identity
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.patch import Patch, match_patch
 from sat_intervals.products import FLAGS, NO_DISPARITY
-from sat_intervals.inputs import identity
-from sat_intervals.raster import Image, OutputWriter, check_pair, open_image, read_window
+from sat_intervals.raster import Image, OutputWriter, check_pair, check_space, open_image, read_window
 from sat_intervals.seams import seam_lines, seam_report
 from sat_intervals.store import Store
 from sat_intervals.summary import Tally
@@ -105,6 +105,7 @@ def match_pair(
     region = _region(left, window)
     out = Path(out)
     check_output(out, overwrite)
+    check_space(out, region.height, region.width)
     grid = Grid(region, config.tiles.size)
     store = Store(out / "tiles", grid, config.disparity.count, config.largest_ambiguity)
     inputs = {"left": _described(left), "right": _described(right)}
@@ -334,8 +335,8 @@ def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) 
     reason = f"{' and '.join(empty)} hold no data" if empty else "their data do not meet over the search range"
     search = job.config.disparity
     raise SatIntervalsError(
-        f"{job.left.path}, {job.right.path}: no pixel can be matched in [{search.minimum}, {search.maximum}], {reason}: "
-        "check no-data values, masks, window and search range"
+        f"{job.left.path}, {job.right.path}: no pixel can be matched in [{search.minimum}, {search.maximum}], "
+        f"{reason}: check no-data values, masks, window and search range"
     )
 
 

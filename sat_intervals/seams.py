@@ -74,8 +74,8 @@ def seam_report(lines: np.ndarray, grid: Grid) -> dict[str, Any]:
 
     Returns
     -------
-    ``borders``, ``pixels`` (with a winner for either neighbour), ``winner_share`` and ``bounds_share`` over all borders; ``worst``: the
-    same of the border with the largest ``bounds_share``, None without inner borders.
+    ``borders``; ``pixels``, those with a winner for either neighbour; ``winner_share`` and ``bounds_share`` over all
+    borders; ``worst``, the same of the border with the largest ``bounds_share``, None without inner borders.
     """
     borders = dict(_borders(lines, grid))
     total = _Difference(*(sum(counts) for counts in zip((0, 0, 0), *borders.values(), strict=True)))

@@ -22,7 +22,7 @@ class Tally:
         self.widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
 
     def add(self, intervals: np.ndarray, validity: np.ndarray) -> None:
-        """Count some rows: ``intervals`` ``(4, rows, columns)`` in the order of BANDS, ``validity`` of the same rows."""
+        """Count some rows: ``intervals`` ``(4, rows, columns)`` in the order of BANDS, and their ``validity``."""
         valid = validity & INVALID == 0
         self.pixels += validity.size
         self.valid += int(valid.sum())

@@ -19,8 +19,8 @@ FLOORS = [
     {"run", "in_memory"},
     {"finish", "patch", "demo"},
     {"store", "raster", "config", "seams", "summary"},
-    {"tiling", "kernels", "scene", "inputs"},
-    {"products", "errors", "configs"},
+    {"kernels", "scene", "inputs"},
+    {"tiling", "products", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 

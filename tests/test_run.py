@@ -152,7 +152,7 @@ def test_match_pair__never_mixes_runs(pair, tmp_path):
         match_pair(left, right, out, in_tiles(settings, 128))
     for name in ("intervals.tif", "validity.tif", "run.json"):
         (out / name).unlink()
-    with pytest.raises(SatIntervalsError, match="settings.sgm.p1 was 8, now 7"):
+    with pytest.raises(SatIntervalsError, match=r"settings\.sgm\.p1 was 8, now 7"):
         match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}))
     match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}), overwrite=True)
 
@@ -163,7 +163,7 @@ def test_match_pair__says_which_image_is_empty(pair, tmp_path):
     shutil.copy(left, empty)
     with rasterio.open(empty, "r+") as file:
         file.write(np.zeros(file.shape, "uint16"), 1)
-    with pytest.raises(SatIntervalsError, match="empty.tif hold no data"):
+    with pytest.raises(SatIntervalsError, match=r"empty\.tif hold no data"):
         match_pair(left, empty, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
 

@@ -31,7 +31,7 @@ def alpha_cut(curve, limit):
 
 
 @njit(nogil=True)
-def _segments(low):
+def find_segments(low):
     """The runs of low-confidence pixels: their first and last columns, and the first segment of each row."""
     rows, columns = low.shape
     count = 0
@@ -56,7 +56,7 @@ def _segments(low):
 
 
 @njit(nogil=True)
-def _touching(start, stop, row_start, neighbours, step):
+def find_touching(start, stop, row_start, neighbours, step):
     """Fill ``neighbours[s] = first, after last`` of the segments in row ``r + step`` that share a column with s."""
     rows = row_start.size - 1
     for r in range(rows):
@@ -159,8 +159,8 @@ def regularize(lower, upper, low, depth, quantile, first, last):
     Parameters
     ----------
     lower, upper
-        ``(rows, columns)`` float32 bounds, whole multiples of half a pixel (integers and means of two) wherever ``low``:
-        so quantiles come from counts.
+        ``(rows, columns)`` float32 bounds, whole multiples of half a pixel (integers and means of two) wherever
+        ``low``, so that quantiles come from counts.
     low
         bool of the same shape: low-confidence pixels.
     depth
@@ -174,11 +174,11 @@ def regularize(lower, upper, low, depth, quantile, first, last):
     -------
     ``(lower, upper)``, float32 of shape ``(last - first, columns)``; pixels that are not low keep their bounds.
     """
-    start, stop, row_start = _segments(low)
+    start, stop, row_start = find_segments(low)
     segments = start.size
     above, below = np.zeros((segments, 2), np.int64), np.zeros((segments, 2), np.int64)
-    _touching(start, stop, row_start, above, -1)
-    _touching(start, stop, row_start, below, 1)
+    find_touching(start, stop, row_start, above, -1)
+    find_touching(start, stop, row_start, below, 1)
     segment_row = np.empty(segments, np.int64)
     for r in range(row_start.size - 1):
         segment_row[row_start[r] : row_start[r + 1]] = r

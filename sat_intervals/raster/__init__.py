@@ -4,7 +4,7 @@ from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image
 from sat_intervals.raster.layers import north_up, read_layers, write_layer
 from sat_intervals.raster.windows import read_window
-from sat_intervals.raster.writer import OutputError, OutputWriter
+from sat_intervals.raster.writer import OutputError, OutputWriter, check_space
 
 __all__ = [
     "ControlPoint",
@@ -14,6 +14,7 @@ __all__ = [
     "OutputError",
     "OutputWriter",
     "check_pair",
+    "check_space",
     "north_up",
     "open_image",
     "read_layers",

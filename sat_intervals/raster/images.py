@@ -144,13 +144,14 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
         with gdal.reading(path) as dataset:
             yield dataset
     except gdal.GDAL_ERRORS as error:
+        reason = gdal.reason(error).removeprefix(f"{path}: ").rstrip(".")
         if window is None:
             raise InputError(
-                f"{path} cannot be read: {gdal.reason(error)}: give the path of a raster, such as a GeoTIFF"
+                f"{path} cannot be read: {reason}: give the path of a raster, such as a GeoTIFF"
             ) from error
         raise InputError(
             f"{path} cannot be read at rows {window.row} to {window.row_stop - 1}, columns {window.column} to "
-            f"{window.column_stop - 1}: {gdal.reason(error)}: the file may be cut short, give a whole copy"
+            f"{window.column_stop - 1}: {reason}: the file may be cut short, give a whole copy"
         ) from error
 
 
@@ -173,7 +174,7 @@ def _chosen(path: str, bands: list[int], band: int | None) -> int:
     if band is None and len(bands) > 1:
         raise InputError(f"{path} has {len(bands)} bands: choose one of {bands[0]} to {bands[-1]} with --band")
     if band is not None and band not in bands:
-        there = f"1 band, {bands[0]}" if len(bands) == 1 else f"bands {bands[0]} to {bands[-1]}"
+        there = f"band {bands[0]} only" if len(bands) == 1 else f"bands {bands[0]} to {bands[-1]}"
         raise InputError(f"{path} has no image band {band}, it has {there}: choose with --band")
     return bands[0] if band is None else band
 

@@ -6,9 +6,12 @@ import numpy as np
 from rasterio import Env
 from rasterio.crs import CRS
 from rasterio.transform import Affine
+from rasterio.windows import Window as Area
 
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.images import opened
+from sat_intervals.tiling import Window
 
 
 def north_up(epsg: int, x: float, y: float, pixel: float) -> Georeferencing:
@@ -29,7 +32,8 @@ def write_layer(
         dataset.write(pixels, 1)
 
 
-def read_layers(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read all bands of a file: ``(bands, rows, columns)`` in the file's type."""
-    with gdal.reading(str(path)) as dataset:
-        return np.asarray(dataset.read())
+def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> np.ndarray:
+    """Read all bands of a file, or of a window inside it: ``(bands, rows, columns)`` in the file's type."""
+    area = window and Area(window.column, window.row, window.width, window.height)
+    with opened(str(path), window) as dataset:
+        return np.asarray(dataset.read(window=area))

@@ -92,7 +92,7 @@ class OutputWriter:
             shutil.rmtree(self._scratch, ignore_errors=True)
             self._scratch.mkdir(parents=True)
         try:
-            self._check_space()
+            check_space(self._folder, *self._shape)
             for file in (INTERVALS, VALIDITY):
                 self._strips[file] = self._create(file)
         except BaseException:
@@ -171,19 +171,6 @@ class OutputWriter:
         if found != expected:
             raise OSError(errno.EIO, "what can be read back is not what was written")
 
-    def _check_space(self) -> None:
-        needed, free = self._bytes, shutil.disk_usage(self._folder).free
-        if needed > free:
-            raise OutputError(
-                f"{self._folder} has {_size(free)} left, the bands need {_size(needed)} to begin with: {_WAY_OUT}"
-            )
-
-    @property
-    def _bytes(self) -> int:
-        """Of all bands uncompressed."""
-        height, width = self._shape
-        return height * width * sum(file.count * np.dtype(file.dtype).itemsize for file in (INTERVALS, VALIDITY))
-
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:
         """Turn what fails into an error that names the file as the user knows it, and the system's reason."""
@@ -197,7 +184,7 @@ class OutputWriter:
             return error.strerror
         # GDAL keeps the system's reason to itself. A Cloud-Optimized GeoTIFF is made with its overviews twice.
         free = shutil.disk_usage(self._folder).free
-        full = f"{os.strerror(errno.ENOSPC)}, {_size(free)} free: " if free < 2 * self._bytes else ""
+        full = f"{os.strerror(errno.ENOSPC)}, {_size(free)} free: " if free < 2 * _bytes(*self._shape) else ""
         return full + gdal.reason(error)
 
     def _clean(self) -> None:
@@ -206,6 +193,26 @@ class OutputWriter:
                 strips.close()
         self._strips.clear()
         shutil.rmtree(self._scratch, ignore_errors=True)
+
+
+def check_space(folder: Path, height: int, width: int) -> None:
+    """Refuse a folder that has no room for the bands of so many pixels.
+
+    Raises
+    ------
+    OutputError
+        With the figures.
+    """
+    needed, free = _bytes(height, width), shutil.disk_usage(folder).free
+    if needed > free:
+        raise OutputError(
+            f"{folder} has {_size(free)} left, the bands need {_size(needed)} to begin with: {_WAY_OUT}"
+        )
+
+
+def _bytes(height: int, width: int) -> int:
+    """Of all bands uncompressed."""
+    return height * width * sum(file.count * np.dtype(file.dtype).itemsize for file in (INTERVALS, VALIDITY))
 
 
 def _sum(bands: np.ndarray) -> int:
