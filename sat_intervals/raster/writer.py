@@ -11,6 +11,7 @@ from typing import Self
 
 import numpy as np
 from rasterio import Env
+from rasterio.enums import Resampling
 from rasterio.io import DatasetWriter
 from rasterio.shutil import copy
 from rasterio.windows import Window as Area
@@ -28,6 +29,8 @@ _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "pi
 # 49 bits a pixel; level 6, 3.2 and 46; no compression, 9.1 and 186. Predictors make it slower and larger (4.3 and 63):
 # bounds are whole numbers and V-fits fractions of small ones, which come back byte for byte.
 _COG = {"COMPRESS": "DEFLATE", "LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
+# Pixels of a side below which there is no smaller overview.
+_OVERVIEW_SIZE = 512
 # Bytes of blocks in GDAL's hands, by default a twentieth of the machine's memory: enough for strips of 100 000 columns.
 _CACHE = 128 << 20
 _WAY_OUT = "make room or choose another folder"
@@ -121,6 +124,7 @@ class OutputWriter:
             whole = self._scratch / file.name
             options = _COG | {"NUM_THREADS": self._threads}
             with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
+                self._add_overviews(strips)
                 strips.close()
                 copy(strips.name, str(whole), driver="COG", **options)
                 _flush(whole)
@@ -156,6 +160,13 @@ class OutputWriter:
             strips.update_tags(**self._tags)
             file.describe(strips)
         return strips
+
+    def _add_overviews(self, strips: DatasetWriter) -> None:
+        """Add overviews to the strips: the COG driver, left to itself, takes twice the time of all the rest for them."""
+        size = max(self._shape)
+        factors = [2**level for level in range(1, 32) if size > _OVERVIEW_SIZE << (level - 1)]
+        if factors:
+            strips.build_overviews(factors, Resampling.nearest)
 
     def _verify(self, whole: Path, expected: int) -> None:
         """Read a file back, overviews included: GDAL may take a full disk for written."""
