@@ -94,7 +94,8 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
     if volume > memory:
         raise SatIntervalsError(
             f"{left.shape[0]} x {left.shape[1]} pixels x {config.disparity.count} disparities "
-            f"need {volume / 1e9:.1f} GB, the machine has {memory / 1e9:.1f} GB: write the arrays to files and use match_pair, which works in tiles"
+            f"need {volume / 1e9:.1f} GB, the machine has {memory / 1e9:.1f} GB: "
+            "write the arrays to files and use match_pair, which works in tiles"
         )
 
 

@@ -393,14 +393,14 @@ def test_median__worked_example():
 
 @st.composite
 def bands(draw, number=1):
-    """Images of one shape, which pixels are kept, and a window's size."""
-    shape = draw(st.integers(1, 8)), draw(st.integers(1, 9))
-    kept = draw(hnp.arrays(bool, shape))
-    return (
-        *(draw(reference.halves(shape)) for _ in range(number)),
-        kept,
-        draw(st.sampled_from([3, 5, 7])),
-    )
+    """Images of one shape, which pixels are kept, from few to all, and a window's size."""
+    shape = draw(st.integers(1, 8)), draw(st.integers(1, 9) | st.integers(30, 70))
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    kept = random.random(shape) < draw(st.sampled_from([0.3, 0.7, 0.97, 1]))
+    # Few different values, or hardly two that are equal.
+    few_values = draw(st.booleans())
+    values = random.integers(-9, 9, (number, *shape)) / 2 if few_values else random.normal(0, 9, (number, *shape))
+    return *values.astype(np.float32), kept, draw(st.sampled_from([3, 3, 5, 7]))
 
 
 @bounded

@@ -14,14 +14,14 @@ from sat_intervals.products import IMPOSSIBLE_COST, MISMATCH, NO_DISPARITY, OCCL
 def vfit(curve, k, count):
     """Sub-pixel shift of the winner ``k`` by V-fit (Haller et al. 2010), within half a pixel.
 
-    Returns ``(shift, refined)``: 0 and False at the range's ends, beside an impossible candidate and where the three
-    costs are equal.
+    Returns ``(shift, refined)``: 0 and False at the range's ends and beside an impossible candidate. The winner is the
+    first of its ties, so the cost before it is larger and the three are never equal.
     """
     if k == 0 or k == count - 1:
         return 0.0, False
     here, before, after = np.int64(curve[k]), np.int64(curve[k - 1]), np.int64(curve[k + 1])
     steepest = max(before, after)
-    if steepest in (IMPOSSIBLE_COST, here):
+    if steepest == IMPOSSIBLE_COST:
         return 0.0, False
     return (before - after) / (2 * (steepest - here)), True
 

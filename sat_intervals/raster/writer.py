@@ -162,7 +162,7 @@ class OutputWriter:
         return strips
 
     def _add_overviews(self, strips: DatasetWriter) -> None:
-        """Add overviews to the strips: the COG driver, left to itself, takes twice the time of all the rest for them."""
+        """Add overviews to the strips: the COG driver, left to itself, takes longer for them than for all the rest."""
         size = max(self._shape)
         factors = [2**level for level in range(1, 32) if size > _OVERVIEW_SIZE << (level - 1)]
         if factors:

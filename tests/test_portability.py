@@ -1,0 +1,37 @@
+"""The kernels on other processors, and without compilation: in processes of their own, as numba decides at import."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+
+
+def run_tests(environment, *selection):
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *selection]
+    result = subprocess.run(
+        command, cwd=TESTS.parent, env=os.environ | environment, capture_output=True, text=True, timeout=600
+    )
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    assert " passed" in result.stdout
+
+
+# generic: SSE2 alone; haswell: AVX2. Vectors of 512 bits are split by LLVM.
+@pytest.mark.parametrize("processor", ["generic", "haswell"])
+def test_kernels__equal_their_twins_on_processors_without_avx512(tmp_path, processor):
+    environment = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path)}
+    run_tests(environment, "tests/test_intervals.py::test_match_arrays__equals_reference")
+
+
+def test_kernels__plain_ones_equal_their_twins_without_compilation(tmp_path):
+    run_tests(
+        {"NUMBA_DISABLE_JIT": "1"},
+        "tests/test_disparity.py",
+        "tests/test_confidence.py",
+        "tests/test_intervals.py",
+        "-k",
+        "worked_example and not match__ and not alpha_cut",
+    )
