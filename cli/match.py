@@ -20,7 +20,11 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
         click.option("--overlap", type=int, help="Pixels read around a core."),
         click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
-        click.option("--processes", is_flag=True, help="Workers are processes, not threads."),
+        click.option(
+            "--cluster",
+            metavar="SPEC",
+            help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
+        ),
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles in OUT/tiles."),
         click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
         click.option("--quiet", is_flag=True, help="Print errors only."),
@@ -31,14 +35,29 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def overrides(disparity: tuple[int, int] | None, tile_size: int | None, overlap: int | None) -> dict[str, Any]:
+def overrides(
+    disparity: tuple[int, int] | None = None,
+    tile_size: int | None = None,
+    overlap: int | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
+) -> dict[str, Any]:
     """The settings that the command line gives, as sections."""
-    sections: dict[str, dict[str, Any]] = {"disparity": {}, "tiles": {}}
-    if disparity is not None:
-        sections["disparity"] = {"minimum": disparity[0], "maximum": disparity[1]}
-    given = {"size": tile_size, "overlap": overlap}
-    sections["tiles"] = {name: value for name, value in given.items() if value is not None}
-    return {name: section for name, section in sections.items() if section}
+    minimum, maximum = disparity or (None, None)
+    is_address = cluster is not None and "://" in cluster
+    sections = {
+        "disparity": {"minimum": minimum, "maximum": maximum},
+        "tiles": {"size": tile_size, "overlap": overlap},
+        "cluster": {
+            "workers": workers,
+            "kind": "address" if is_address else cluster,
+            "address": cluster if is_address else None,
+        },
+    }
+    given = {
+        name: {key: value for key, value in section.items() if value is not None} for name, section in sections.items()
+    }
+    return {name: section for name, section in given.items() if section}
 
 
 @click.command(short_help="Match a pair: disparity, interval, confidence, validity.")
@@ -70,7 +89,7 @@ def match(
     tile_size: int | None,
     overlap: int | None,
     workers: int | None,
-    processes: bool,
+    cluster: str | None,
     keep_tiles: bool,
     overwrite: bool,
     quiet: bool,
@@ -88,7 +107,7 @@ def match(
     from sat_intervals.config import load_config
     from sat_intervals.tiling import Window
 
-    config = load_config(config_file, overrides(disparity, tile_size, overlap))
+    config = load_config(config_file, overrides(disparity, tile_size, overlap, workers, cluster))
     with Console(quiet) as console:
         from sat_intervals.raster import open_image
         from sat_intervals.run import match_pair
@@ -99,8 +118,6 @@ def match(
             out,
             config,
             window=Window(*window) if window else None,
-            workers=workers,
-            processes=processes,
             keep_tiles=keep_tiles,
             overwrite=overwrite,
             progress=console.progress,

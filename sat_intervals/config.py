@@ -181,6 +181,33 @@ class Tiles(Section):
     overlap: int = Field(100, ge=1, description="pixels read around it and dropped; more leave fewer seams")
 
 
+class Cluster(Section):
+    """Where tiles are matched; nothing here changes the results."""
+
+    kind: Literal["threads", "processes", "address", "slurm", "pbs", "lsf", "sge"] = Field(
+        "threads", description="of this machine, an existing scheduler, or jobs of a batch system"
+    )
+    workers: int | None = Field(None, ge=1, description="tiles in work at once on this machine; null: one a core")
+    address: str | None = Field(None, description="of the dask scheduler, such as tcp://host:8786")
+    jobs: int = Field(1, ge=1, description="jobs of the batch system, the least number where maximum_jobs is set")
+    maximum_jobs: int | None = Field(None, ge=1, description="most jobs, as many as the tiles left keep busy")
+    cores: int = Field(1, ge=1, description="of a job, and tiles it has in work at once")
+    memory: str = Field("4GB", description="of a job")
+    walltime: str | None = Field(None, description="of a job, such as 01:00:00")
+    queue: str | None = Field(None, description="of the batch system")
+    account: str | None = Field(None, description="that jobs are charged to")
+    directives: list[str] = Field([], description="a list of further directives of the job script, such as --exclusive")
+    retries: int = Field(2, ge=0, description="how often a tile that fails is tried again")
+
+    @model_validator(mode="after")
+    def _check_fit(self) -> Self:
+        if (self.kind == "address") != (self.address is not None):
+            raise ValueError("address belongs to kind address, and to no other")
+        if self.maximum_jobs is not None and self.maximum_jobs < self.jobs:
+            raise ValueError(f"maximum_jobs {self.maximum_jobs} is below jobs {self.jobs}, swap them")
+        return self
+
+
 class Products(Section):
     """What the written bands hold."""
 
@@ -201,6 +228,7 @@ class Config(Section):
     regularization: Regularization | None = Regularization()
     tiles: Tiles = Tiles()
     products: Products = Products()
+    cluster: Cluster = Cluster()
 
     @model_validator(mode="after")
     def _check_sections(self) -> Self:
@@ -329,7 +357,7 @@ def preset_text(name: str = "default") -> str:
 
 def allowed(field: FieldInfo) -> str:
     """Return in words which values a setting takes, from its own type and bounds: ``integer >= 1, odd``."""
-    nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false"}
+    nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false", str: "text"}
     signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
     kinds = get_args(field.annotation) or (field.annotation,)
     section = _section(field)

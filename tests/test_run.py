@@ -72,12 +72,12 @@ def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path)
     np.testing.assert_array_equal(bands(tmp_path / "whole")[1], bands(tmp_path / "tiles")[1])
 
 
-@pytest.mark.parametrize("workers", [{"workers": 2}, {"workers": 2, "processes": True}])
-def test_match_pair__gives_the_same_bytes_whatever_the_workers(pair, tmp_path, workers):
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_match_pair__gives_the_same_bytes_whatever_the_workers(pair, tmp_path, kind):
     left, right, settings = pair
     settings = in_tiles(settings, 128, overlap=20)
-    match_pair(left, right, tmp_path / "one", settings, workers=1)
-    match_pair(left, right, tmp_path / "more", settings, **workers)
+    match_pair(left, right, tmp_path / "one", settings | {"cluster": {"workers": 1}})
+    match_pair(left, right, tmp_path / "more", settings | {"cluster": {"kind": kind, "workers": 2}})
     for name in ("intervals.tif", "validity.tif"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "more" / name).read_bytes()
 
@@ -130,7 +130,7 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
     def fail_once(job, tile):
         with log.open("a") as file:
             print(tile.name, file=file)
-        if tile.name == "1_2" and log.read_text().split().count("1_2") == 1:
+        if tile.name == "1_2" and log.read_text().split().count("1_2") <= 3:
             raise OSError("disk gone")
         return match_tile(job, tile)
 
@@ -139,7 +139,9 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
         match_pair(left, right, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
     match_pair(left, right, tmp_path / "out", settings)
-    assert sorted(log.read_text().split()) == sorted([*(f"{row}_{column}" for row, column in np.ndindex(3, 4)), "1_2"])
+    assert sorted(log.read_text().split()) == sorted(
+        [*(f"{row}_{column}" for row, column in np.ndindex(3, 4)), *3 * ["1_2"]]  # tried three times
+    )
     for name in ("intervals.tif", "validity.tif"):
         assert (tmp_path / "undisturbed" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
 

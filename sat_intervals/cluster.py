@@ -1,0 +1,100 @@
+"""Where tiles are matched: threads or processes of this machine, a dask scheduler, or jobs of a batch system."""
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from distributed import Client, LocalCluster
+
+from sat_intervals.config import Cluster
+from sat_intervals.errors import SatIntervalsError
+
+_LOOPBACK = "127.0.0.1"
+
+
+@contextmanager
+def connected(settings: Cluster) -> Iterator[Client]:
+    """A client of the cluster that the settings name; closed, with what it started, at the end.
+
+    Raises
+    ------
+    SatIntervalsError
+        When a scheduler does not answer, or the extra for batch systems is not installed.
+    """
+    with ExitStack() as stack:
+        if settings.kind == "address":
+            yield stack.enter_context(_client_of(settings.address))
+            return
+        if settings.kind in ("threads", "processes"):
+            cluster = _local(settings)
+        else:
+            cluster = _batch_system(settings)
+            if settings.maximum_jobs:
+                cluster.adapt(minimum_jobs=settings.jobs, maximum_jobs=settings.maximum_jobs)
+            else:
+                cluster.scale(jobs=settings.jobs)
+        stack.enter_context(cluster)
+        yield stack.enter_context(Client(cluster))
+
+
+def _client_of(address: str | None) -> Client:
+    try:
+        return Client(address)
+    except (OSError, ValueError) as error:
+        raise SatIntervalsError(f"no dask scheduler answers at {address}: {error}") from error
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _local(settings: Cluster) -> LocalCluster:
+    workers = settings.workers or available_cores()
+    processes = settings.kind == "processes"
+    return LocalCluster(
+        n_workers=workers if processes else 1,
+        threads_per_worker=1 if processes else workers,
+        processes=processes,
+        host=_LOOPBACK if processes else None,
+        dashboard_address=f"{_LOOPBACK}:0",
+        worker_dashboard_address=f"{_LOOPBACK}:0",
+        silence_logs=logging.CRITICAL,
+    )
+
+
+def _batch_system(settings: Cluster) -> Any:
+    """The dask-jobqueue cluster of SLURM, PBS, LSF or SGE; what is not set comes from the user's dask configuration."""
+    try:
+        import dask_jobqueue
+    except ImportError as error:
+        raise SatIntervalsError(
+            f"cluster {settings.kind} needs dask-jobqueue: pip install sat-intervals[cluster]"
+        ) from error
+    options = {
+        "queue": settings.queue,
+        "account": settings.account,
+        "cores": settings.cores,
+        "processes": 1,
+        "memory": settings.memory,
+        "walltime": settings.walltime,
+        "job_extra_directives": settings.directives,
+    }
+    given = {name: value for name, value in options.items() if value not in (None, [])}
+    return getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")(**given, silence_logs=logging.CRITICAL)
+
+
+def job_script(settings: Cluster) -> str:
+    """The script of one job of a batch system, as it would be submitted.
+
+    Raises
+    ------
+    SatIntervalsError
+        For a cluster that submits no jobs.
+    """
+    if settings.kind in ("threads", "processes", "address"):
+        raise SatIntervalsError(f"cluster {settings.kind} submits no jobs: name slurm, pbs, lsf or sge")
+    with _batch_system(settings) as cluster:
+        return str(cluster.job_script())

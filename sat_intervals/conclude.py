@@ -1,0 +1,141 @@
+"""From the tiles of a job to the files of its run: strips, final bands, report."""
+
+import json
+import platform
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from datetime import UTC, datetime
+from importlib.metadata import version
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sat_intervals.config import Config
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
+from sat_intervals.job import Job
+from sat_intervals.products import FLAGS
+from sat_intervals.raster import OutputWriter
+from sat_intervals.seams import seam_report
+from sat_intervals.summary import Tally
+from sat_intervals.tile import timed
+
+Item = TypeVar("Item")
+
+STRIP_ROWS = 256
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage ("kernels", "tiles", "bands", "files"), how much of it is done, and how much there is."""
+
+
+def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
+    """Write the files of a run whose tiles are done; returns the content of run.json.
+
+    Parameters
+    ----------
+    job
+        The pair.
+    seconds
+        What earlier stages took; those of this one are added.
+    progress
+        Called strip by strip.
+
+    Raises
+    ------
+    RunError
+        Tiles are missing.
+    SatIntervalsError
+        No pixel could be matched, or a file cannot be written.
+    """
+    config, store, region = job.config, job.store, job.store.grid.region
+    histogram = store.histogram()
+    records = store.records()
+    _check_matched(job, records, int(histogram.sum()))
+    scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else Scale(np.nan, np.nan)
+    tally = Tally(config.disparity.count)
+    where = job.left.georeferencing.shifted(region)
+    with OutputWriter(job.out, region.height, region.width, where, _tags(config)) as writer:
+        with timed(seconds, "bands"):
+            strips = (Rows(**strip) for strip in store.strips(STRIP_ROWS))
+            row = 0
+            for final in _ahead(finish_strips(_ahead(strips), scale, config)):
+                writer.write(row, final.intervals, final.validity)
+                tally.add(final.intervals, final.validity)
+                row += final.validity.shape[0]
+                progress("bands", row, region.height)
+        with timed(seconds, "files"):
+            progress("files", 0, 1)
+            writer.build()
+        for stage in ("read", "match", "write"):
+            seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
+        seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
+        report = _report(job, scale, tally, seconds)
+        writer.publish({"run.json": json.dumps(report, indent=1) + "\n"})
+        progress("files", 1, 1)
+    return report
+
+
+def _ahead(items: Iterable[Item]) -> Iterator[Item]:
+    """The same items, each made in a thread of its own while the one before is used."""
+    with ThreadPoolExecutor(1) as thread:
+        iterator = iter(items)
+        following = thread.submit(next, iterator, None)
+        while (item := following.result()) is not None:
+            following = thread.submit(next, iterator, None)
+            yield item
+
+
+def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) -> None:
+    """An image without data is the user's mistake, and is told so."""
+    missing = [tile.name for tile in job.store.grid if tile.name not in records]
+    if missing:
+        raise RunError(f"tiles {', '.join(missing)} are missing in {job.store.path}: run the same command again")
+    if searched:
+        return
+    usable = {side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")}
+    empty = [image.path for image, side in ((job.left, "left"), (job.right, "right")) if not usable[side]]
+    reason = f"{' and '.join(empty)} hold no data" if empty else "their data do not meet over the search range"
+    search = job.config.disparity
+    raise SatIntervalsError(
+        f"{job.left.path}, {job.right.path}: no pixel can be matched in [{search.minimum}, {search.maximum}], "
+        f"{reason}: check no-data values, masks, window and search range"
+    )
+
+
+def _tags(config: Config) -> dict[str, str]:
+    """What the files say of themselves."""
+    tags = {
+        "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
+        "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
+    }
+    if config.interval:
+        tags["ALPHA"] = f"{config.interval.alpha} (level of possibility; coverage on reference scenes .91 to .99)"
+    return tags
+
+
+def _report(job: Job, scale: Scale, tally: Tally, seconds: dict[str, float]) -> dict[str, Any]:
+    """The content of run.json."""
+    grid, config = job.store.grid, job.config
+    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
+    return {
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "settings": config.model_dump(mode="json"),
+        "inputs": job.inputs,
+        "tiles": {
+            "region": asdict(grid.region),
+            "rows": grid.rows,
+            "columns": grid.columns,
+            "size": grid.size,
+            "overlap": config.tiles.overlap,
+        },
+        "cost_span": config.cost_span,
+        "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
+        "counts": tally.report(),
+        "validity_bits": {
+            flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
+        },
+        "overlap_left": seam_report(job.store.seams(), grid),
+        "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
+    }

@@ -1,0 +1,61 @@
+"""One tile on a worker: read, match, leave behind what the strips need."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.job import Job
+from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.patch import Patch, match_patch
+from sat_intervals.products import NO_DISPARITY
+from sat_intervals.raster import Image, read_window
+from sat_intervals.seams import seam_lines
+from sat_intervals.tiling import Tile, Window
+
+
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the seconds that the block takes to a stage."""
+    started = time.perf_counter()
+    yield
+    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
+
+
+def match_tile(job: Job, tile: Tile) -> None:
+    """Match one tile and write what it leaves behind; runs on a worker."""
+    seconds: dict[str, float] = {}
+    usable = {"left": 0, "right": 0}
+
+    def reader(image: Image, side: str) -> Any:
+        def read(window: Window) -> tuple[np.ndarray, np.ndarray]:
+            with timed(seconds, "read"):
+                pixels, state = read_window(image, window)
+            usable[side] += int((state == 0).sum())
+            return pixels, state
+
+        return read
+
+    grid, config = job.store.grid, job.config
+    image = Window(0, 0, job.left.height, job.left.width)
+    started = time.perf_counter()
+    patch = match_patch(reader(job.left, "left"), reader(job.right, "right"), tile.core, grid.region, image, config)
+    seconds["match"] = time.perf_counter() - started - seconds["read"]
+    with timed(seconds, "write"):
+        job.store.write_arrays(tile, _left_behind(patch, tile, job))
+    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds})
+
+
+def _left_behind(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
+    """What the tile's core adds to the store."""
+    raw = patch.raw
+    inner = tile.core.relative_to(patch.output).slices
+    arrays = {name: getattr(raw, name)[inner] for name in ("winner", "lower", "upper", "disparity", "validity")}
+    ambiguity = raw.ambiguity[inner]
+    histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.store.ambiguities)
+    if job.config.cross_check:
+        arrays |= {"right_cost": patch.right.cost, "right_winner": patch.right.winner}
+    seams = seam_lines(raw, patch.output, tile.core, job.store.grid.size)
+    return arrays | {"ambiguity": ambiguity, "histogram": histogram, "seams": seams}
