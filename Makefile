@@ -1,12 +1,12 @@
 # `make demo` and `make test` need python3 (3.11 or newer) and make; everything else goes into $(VENV).
 PYTHON ?= python3
 VENV ?= .venv
-EXTRAS ?= test,lint
+EXTRAS ?= test,lint,plot
 
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint pictures clean
 
 demo: $(READY)
 	$(BIN)/sat-intervals demo demo-out --overwrite
@@ -19,6 +19,13 @@ lint: $(READY)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m pytest --quiet tests/test_architecture.py
+
+# Those of README.md; 256 colours keep them small.
+pictures: $(READY)
+	$(BIN)/sat-intervals demo demo-out --overwrite --quiet
+	$(BIN)/sat-intervals plot demo-out --row 640 --columns 300 700 --dpi 72
+	mkdir -p .github/pictures
+	for name in overview profile; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "sat-intervals needs Python 3.11 or newer, $(PYTHON) is %d.%d: name another one with make PYTHON=..." % sys.version_info[:2])'

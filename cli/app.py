@@ -3,40 +3,40 @@
 The library is imported by the command that needs it: help and usage errors do not wait for numba.
 """
 
-import signal
 import traceback
 from typing import Any
 
 import click
 
+from sat_intervals.cli.ablate import ablate
+from sat_intervals.cli.batch import batch
 from sat_intervals.cli.demo import demo
+from sat_intervals.cli.evaluate import evaluate
 from sat_intervals.cli.match import match
+from sat_intervals.cli.plan import plan
+from sat_intervals.cli.plot import plot
+from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
+from sat_intervals.cli.signals import Ended, armed
+from sat_intervals.cli.status import status
 
-FAILED, USER_ERROR, INTERRUPTED, TERMINATED = 1, 2, 130, 143
-
-
-class _Terminated(BaseException):
-    """The process was asked to end (SIGTERM)."""
-
-
-def _terminate(number: int, frame: Any) -> None:
-    raise _Terminated
+FAILED, USER_ERROR = 1, 2
+RESUMED = ("match", "demo", "batch")
 
 
 class _Commands(click.Group):
     """Turns whatever goes wrong in a command into one line and an exit status."""
 
     def invoke(self, context: click.Context) -> Any:
-        signal.signal(signal.SIGTERM, _terminate)
         try:
-            return super().invoke(context)
+            with armed():
+                return super().invoke(context)
         except (click.ClickException, click.exceptions.Exit):
             raise
-        except (KeyboardInterrupt, click.Abort):
-            return _end(INTERRUPTED, "interrupted; the same command goes on from the tiles that are done")
-        except _Terminated:
-            return _end(TERMINATED, "terminated; the same command goes on from the tiles that are done")
+        except Ended as ended:
+            resumed = context.invoked_subcommand in RESUMED
+            again = "; the same command goes on from the tiles that are done" if resumed else ""
+            return _end(ended.status, f"{ended}{again}")
         except Exception as error:
             if context.meta.get("sat_intervals.debug"):
                 traceback.print_exception(error)
@@ -50,6 +50,10 @@ def _explained(error: Exception) -> tuple[int, str]:
         return FAILED, str(error)
     if isinstance(error, SatIntervalsError):
         return USER_ERROR, str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return FAILED, f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, MemoryError):
+        return FAILED, f"not enough memory: choose a smaller --tile-size or fewer --workers ({error})"
     return FAILED, f"{type(error).__name__}: {error} (this should not happen; --debug shows where)"
 
 
@@ -67,3 +71,10 @@ def main() -> None:
 main.add_command(match)
 main.add_command(config)
 main.add_command(demo)
+main.add_command(batch)
+main.add_command(plan)
+main.add_command(status)
+main.add_command(plot)
+main.add_command(report)
+main.add_command(evaluate)
+main.add_command(ablate)

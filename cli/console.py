@@ -6,8 +6,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from rich.console import Console as Terminal
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
+
+from sat_intervals.cli import signals
 
 STAGES = {
     "scene": "making a scene",
@@ -22,18 +24,17 @@ class Console:
     """Progress as a bar on a terminal, as plain lines elsewhere, not at all when quiet."""
 
     def __init__(self, quiet: bool) -> None:
-        self._terminal = Terminal(quiet=quiet, highlight=False)
+        # A path is no markup: square brackets and colons in it are its own.
+        self._terminal = Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[state]}", markup=False),
             console=self._terminal,
             transient=True,
             disable=quiet or not self._terminal.is_terminal,
         )
-        self._tasks: dict[str, TaskID] = {}
+        self._task: tuple[str, TaskID] | None = None
         self._began: dict[str, tuple[float, int]] = {}
         self._told: dict[str, int] = {}
 
@@ -47,29 +48,36 @@ class Console:
         self._bar.__exit__(kind, error, trace)
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Take note of how far a stage is."""
+        """Take note of how far a stage is; what is done in one step has no figures."""
+        signals.check()
         began, before = self._began.setdefault(stage, (time.monotonic(), done))
         elapsed = time.monotonic() - began
         rate = (done - before) / elapsed if elapsed > 0 else 0.0
+        state = _state(done, total, rate) if total > 1 else ""
         if self._bar.disable:
-            self._tell(stage, done, total, rate)
-            return
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bar.add_task(STAGES[stage], total=total, rate="")
-        self._bar.update(self._tasks[stage], completed=done, total=total, rate=f"{rate:.2g}/s" if done else "")
+            self._tell(stage, done, total, state)
+        else:
+            self._draw(stage, done, total, state)
 
-    def _tell(self, stage: str, done: int, total: int, rate: float) -> None:
+    def _draw(self, stage: str, done: int, total: int, state: str) -> None:
+        """The bar of a stage, in place of that of the stage before."""
+        if self._task is None or self._task[0] != stage:
+            if self._task:
+                self._bar.remove_task(self._task[1])
+            self._task = stage, self._bar.add_task(STAGES[stage], state="")
+        self._bar.update(self._task[1], completed=done, total=total if total > 1 else None, state=state)
+
+    def _tell(self, stage: str, done: int, total: int, state: str) -> None:
         """A plain line when a stage begins and at every tenth of it."""
         tenth = 10 * done // max(total, 1)
-        if self._told.get(stage) == tenth:
+        if self._told.get(stage) == tenth or (stage in self._told and not state):
             return
         self._told[stage] = tenth
-        left = f", {(total - done) / rate:.0f} s left" if rate > 0 and done < total else ""
-        self._terminal.print(f"{STAGES[stage]}: {done}/{total}{left}")
+        self._terminal.print(f"{STAGES[stage]}: {state}" if state else STAGES[stage], soft_wrap=True)
 
     def say(self, text: str) -> None:
         """Print a line."""
-        self._terminal.print(text)
+        self._terminal.print(text, soft_wrap=True)
 
     def summary(self, report: dict[str, Any], out: Path) -> None:
         """The table at the end of a run."""
@@ -90,6 +98,26 @@ class Console:
         for name in ("intervals.tif", "validity.tif", "run.json"):
             self._terminal.print(str(out / name), soft_wrap=True)
 
+    def batch_summary(self, report: dict[str, dict[str, Any]]) -> None:
+        """The table at the end of a batch: how each pair ended."""
+        table = Table("pair", "state", "valid", "median width", box=None, pad_edge=False)
+        for name, end in report.items():
+            counts = end.get("counts")
+            width = counts and counts["median_interval_width"]
+            valid = _share(counts["valid"], counts["pixels"]) if counts else ""
+            table.add_row(name, end["state"], valid, f"{width:.2f} px" if width is not None else "")
+        self._terminal.print(table)
+
 
 def _share(part: int, whole: int) -> str:
     return f"{100 * part / whole:.1f} %" if whole else "-"
+
+
+def _state(done: int, total: int, rate: float) -> str:
+    """How much of a stage is done, how fast, and the time left: ``12/30, 5/s, 4 s left``."""
+    if rate <= 0 or done >= total:
+        return f"{done}/{total}"
+    left = round((total - done) / rate)
+    time_left = f"{left} s" if left < 100 else f"{left // 3600} h {left % 3600 // 60:02} min"
+    speed = f"{rate:.0f}/s" if rate >= 1 else f"{1 / rate:.0f} s each"
+    return f"{done}/{total}, {speed}, {time_left} left"

@@ -45,7 +45,7 @@ def overrides(
     """The settings that the command line gives, as sections."""
     minimum, maximum = disparity or (None, None)
     is_address = cluster is not None and "://" in cluster
-    sections = {
+    sections: dict[str, dict[str, Any]] = {
         "disparity": {"minimum": minimum, "maximum": maximum},
         "tiles": {"size": tile_size, "overlap": overlap},
         "cluster": {
@@ -94,7 +94,7 @@ def match(
     overwrite: bool,
     quiet: bool,
 ) -> None:
-    r"""Match the epipolar images LEFT and RIGHT over a search range and write to the folder OUT.
+    """Match the epipolar images LEFT and RIGHT over a search range and write to the folder OUT.
 
     \b
     OUT/intervals.tif   disparity, lower, upper (pixels), confidence
@@ -102,7 +102,7 @@ def match(
     OUT/run.json        settings, inputs, figures
 
     Disparity is x_right - x_left. An interrupted run goes on where it was with the same command.
-    """
+    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
     from sat_intervals.tiling import Window

@@ -2,8 +2,10 @@
 
 import logging
 import os
+import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
 from typing import Any
 
 from distributed import Client, LocalCluster
@@ -28,7 +30,12 @@ def connected(settings: Cluster) -> Iterator[Client]:
             yield stack.enter_context(_client_of(settings.address))
             return
         if settings.kind in ("threads", "processes"):
-            cluster = _local(settings)
+            with _undisturbed():
+                client = stack.enter_context(Client(stack.enter_context(_local(settings))))
+            yield client
+            with _undisturbed():
+                stack.close()
+            return
         else:
             cluster = _batch_system(settings)
             if settings.maximum_jobs:
@@ -63,6 +70,21 @@ def _local(settings: Cluster) -> LocalCluster:
         worker_dashboard_address=f"{_LOOPBACK}:0",
         silence_logs=logging.CRITICAL,
     )
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Keep signals waiting for the end of the block, and for ever from the threads and processes it begins.
+
+    A terminal sends Ctrl-C to all processes: workers must not answer by themselves. And half a cluster cannot be
+    closed in good order.
+    """
+    resource_tracker.ensure_running()  # else begun with the first process, when it lets signals pass again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _batch_system(settings: Cluster) -> Any:

@@ -192,7 +192,7 @@ class Cluster(Section):
     jobs: int = Field(1, ge=1, description="jobs of the batch system, the least number where maximum_jobs is set")
     maximum_jobs: int | None = Field(None, ge=1, description="most jobs, as many as the tiles left keep busy")
     cores: int = Field(1, ge=1, description="of a job, and tiles it has in work at once")
-    memory: str = Field("4GB", description="of a job")
+    memory: str | None = Field(None, description="of a job, such as 4GB; tiles get smaller until they fit")
     walltime: str | None = Field(None, description="of a job, such as 01:00:00")
     queue: str | None = Field(None, description="of the batch system")
     account: str | None = Field(None, description="that jobs are charged to")

@@ -1,50 +1,238 @@
-"""Figures of merit of intervals against a known truth (method: section 10; paper section 4)."""
+"""Intervals of a run against a known truth, strip by strip, whatever the size of the images (method: section 10)."""
 
-from typing import NamedTuple
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sat_intervals.config import Config, Regularization, load_config
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.figures import Figures, Judged, Rules, bias_histogram
+from sat_intervals.kernels.areas import area_maximum
+from sat_intervals.kernels.confidence import low_confidence
+from sat_intervals.products import INVALID
+from sat_intervals.raster import Image, open_image, read_layers, read_window
+from sat_intervals.tiling import Window
 
-class IntervalFigures(NamedTuple):
-    """What intervals are worth.
+_READ_ROWS = 512  # a row of the blocks that runs write
+_JUDGED_PIXELS = 1 << 20  # at a time, 150 bytes each; those read and waiting are 25
+
+
+class Rows(NamedTuple):
+    """Full-width rows of what is judged and of the truth, all ``(rows, columns)``.
 
     Attributes
     ----------
-    count
-        Pixels with an interval and a known truth inside the search range.
-    accuracy
-        Share of them whose interval holds the truth; NaN of no pixel, as the following.
-    relative_size
-        Median width of an interval over the width of the search range.
-    mean_width
-        Mean width in pixels.
+    disparity, lower, upper, confidence
+        Floats, as in ``intervals.tif``: NaN for none.
+    validity
+        uint16 flags.
+    truth
+        True disparity, NaN where unknown or not to be judged.
     """
 
-    count: int
-    accuracy: float
-    relative_size: float
-    mean_width: float
+    disparity: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    confidence: np.ndarray
+    validity: np.ndarray
+    truth: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """Pixels with an interval and a truth."""
+        return np.asarray(np.isfinite(self.truth) & np.isfinite(self.lower))
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Pixels that were matched and passed cross-checking."""
+        return np.asarray(self.validity & INVALID == 0)
 
 
-def interval_figures(
-    lower: np.ndarray, upper: np.ndarray, truth: np.ndarray, minimum: int, maximum: int
-) -> IntervalFigures:
-    """Judge intervals by a true disparity.
+def evaluate_run(
+    out: str | Path,
+    truth: str | Path | None = None,
+    mask: str | Path | None = None,
+    *,
+    tolerance: float = 0.0,
+    remove_bias: bool = False,
+) -> dict[str, Any]:
+    """Judge the intervals in the folder of a run.
 
     Parameters
     ----------
-    lower, upper, truth
-        Pixels, of one shape; NaN where there is none.
-    minimum, maximum
-        The search range; a truth outside it is not judged.
+    out
+        Folder of ``intervals.tif``, ``validity.tif`` and ``run.json``.
+    truth
+        True disparity of the left image, or of the run's region of it: NaN and no data are unknown. By default
+        ``truth.tif`` beside the left image.
+    mask
+        Of the truth's size: pixels where it is 0 are not judged, such as the occluded ones.
+    tolerance
+        Pixels by which the truth may lie outside an interval that still counts as right.
+    remove_bias
+        Whether the median of disparity - truth, over valid pixels, is added to the truth first.
+
+    Returns
+    -------
+    Figures over valid pixels: for ``all``, ``high`` and ``low`` confidence ``count``, ``accuracy``, ``relative_size``
+    and ``mean_width`` (pixels), for ``low`` also ``relative_overestimation``; ``bad1`` and ``bad3``, the shares of
+    disparities wrong by more than 1 and 3 px; ``truth_outside_range``, the share of truths that were not searched;
+    ``deciles`` of confidence with their coverage. ``with_rejected`` holds the same over all pixels that have an
+    interval, None unless the run wrote those of rejected pixels. ``bias`` is the bias removed (pixels), None if it was
+    not asked for. ``cost`` and ``tolerance`` say what was judged and how.
+
+    Raises
+    ------
+    SatIntervalsError
+        No run, no truth, or sizes that do not fit.
     """
-    judged = np.isfinite(lower) & np.isfinite(upper) & (truth >= minimum) & (truth <= maximum)
-    low, high, true = lower[judged], upper[judged], truth[judged]
-    if true.size == 0:
-        return IntervalFigures(0, np.nan, np.nan, np.nan)
-    return IntervalFigures(
-        count=true.size,
-        accuracy=float(((low <= true) & (true <= high)).mean()),
-        relative_size=float(np.median(high - low) / max(maximum - minimum, 1)),
-        mean_width=float((high - low).mean()),
-    )
+    out = Path(out)
+    run, config = read_run(out)
+    truth_layer = _Layer.open(truth_of(out, run) if truth is None else truth, run)
+    mask_layer = None if mask is None else _Layer.open(mask, run)
+    rules = rules_of(config, tolerance)
+
+    def strips() -> Iterator[Rows]:
+        return _read_strips(out, run["tiles"]["region"], truth_layer, mask_layer)
+
+    return {
+        "cost": config.cost.method,
+        **evaluate(strips, rules, remove_bias=remove_bias, with_rejected=config.products.keep_rejected),
+    }
+
+
+def rules_of(config: Config, tolerance: float = 0.0) -> Rules:
+    """How a run is judged; where it did not regularise, low confidence is that of the default settings."""
+    low, search = config.regularization or Regularization(), config.disparity
+    return Rules(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance)
+
+
+def evaluate(
+    strips: Callable[[], Iterable[Rows]], rules: Rules, *, remove_bias: bool = False, with_rejected: bool = False
+) -> dict[str, Any]:
+    """Judge rows given strip by strip, from the top; ``strips`` is called once for every time they are gone through.
+
+    Returns what `evaluate_run` does, but for ``cost``.
+    """
+    bias = _median_bias(strips()) if remove_bias else None
+    rules = replace(rules, bias=bias or 0.0)
+    kept, written = Figures(rules), Figures(rules)
+    for rows, first, last in _with_halo(strips(), rules.depth):
+        kept.add(_judged(rows, rows.known & rows.valid, first, last, rules))
+        if with_rejected:
+            written.add(_judged(rows, rows.known, first, last, rules))
+    return {
+        **kept.report(),
+        "tolerance": rules.tolerance,
+        "bias": bias,
+        "with_rejected": written.report() if with_rejected else None,
+    }
+
+
+def _median_bias(strips: Iterable[Rows]) -> float:
+    """Median of disparity - truth over valid pixels, in pixels; 0 where there are none."""
+    histogram = bias_histogram()
+    for rows in strips:
+        chosen = rows.known & rows.valid
+        histogram.add(rows.disparity[chosen].astype(np.float64) - rows.truth[chosen])
+    return histogram.median() or 0.0
+
+
+def _judged(rows: Rows, chosen: np.ndarray, first: int, last: int, rules: Rules) -> Judged:
+    """The chosen pixels of the rows ``[first, last)``; the rows around them make their low-confidence areas whole."""
+    truth = rows.truth.astype(np.float64) + rules.bias
+    low = low_confidence(rows.confidence, rules.threshold, rules.kernel)
+    error = np.where(chosen, np.abs(truth - rows.disparity), np.nan)
+    area_error = area_maximum(error, low, rules.depth)
+    inner = slice(first, last)
+    chosen = chosen[inner]
+    bands = (truth, rows.disparity, rows.lower, rows.upper, rows.confidence)
+    true, disparity, lower, upper, confidence = (band[inner][chosen].astype(np.float64) for band in bands)
+    return Judged(true, disparity, lower, upper, confidence, low[inner][chosen], area_error[inner][chosen])
+
+
+def _with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, int]]:
+    """Rows with ``first`` and ``last``: those between have ``margin`` rows around them, as far as the image goes."""
+    waiting: Rows | None = None
+    first = 0
+    for strip in strips:
+        waiting = strip if waiting is None else Rows(*map(np.concatenate, zip(waiting, strip, strict=True)))
+        last = waiting.truth.shape[0] - margin
+        if last > first:
+            yield waiting, first, last
+            start = max(0, last - margin)
+            waiting, first = Rows(*(band[start:] for band in waiting)), last - start
+    if waiting is not None and waiting.truth.shape[0] > first:
+        yield waiting, first, waiting.truth.shape[0]
+
+
+# ---- Files -------------------------------------------------------------------------------------------------
+def read_run(out: Path) -> tuple[dict[str, Any], Config]:
+    """What a run says of itself, and its settings."""
+    file = out / "run.json"
+    try:
+        run = json.loads(file.read_text(encoding="utf-8"))
+        config = load_config(run["settings"])
+    except OSError as error:
+        raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
+    if config.interval is None:
+        raise SatIntervalsError(f"{out} has no intervals, its setting interval is null: run match with intervals")
+    return run, config
+
+
+def truth_of(out: Path, run: dict[str, Any]) -> Path:
+    """The truth that lies beside the left image of a run."""
+    left = Path(run["inputs"]["left"]["path"])
+    if not (left.parent / "truth.tif").exists():
+        raise SatIntervalsError(f"{out}: there is no truth.tif beside its left image {left}: give --truth")
+    return left.parent / "truth.tif"
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """A file of the size of a run, or of its left image, of which the run's region is wanted."""
+
+    image: Image
+    row: int
+    column: int
+
+    @classmethod
+    def open(cls, path: str | Path, run: dict[str, Any]) -> "_Layer":
+        image, region, left = open_image(path), run["tiles"]["region"], run["inputs"]["left"]
+        size = image.height, image.width
+        if size == (region["height"], region["width"]):
+            return cls(image, 0, 0)
+        if size == (left["height"], left["width"]):
+            return cls(image, region["row"], region["column"])
+        raise SatIntervalsError(
+            f"{image.path} has {image.height} x {image.width} pixels, the left image {left['height']} x "
+            f"{left['width']}, the run {region['height']} x {region['width']}: give a file of one of these sizes"
+        )
+
+    def read(self, window: Window) -> np.ndarray:
+        """The pixels of a window of the run as floats, NaN where there is no data."""
+        place = Window(self.row + window.row, self.column + window.column, window.height, window.width)
+        pixels, state = read_window(self.image, place)
+        return np.where(state == 0, pixels, np.nan)
+
+
+def _read_strips(out: Path, region: dict[str, int], truth: _Layer, mask: _Layer | None) -> Iterator[Rows]:
+    """Strips of rows, from the top; files are read by rows of blocks, which are then cut."""
+    height, width = region["height"], region["width"]
+    step = max(1, _JUDGED_PIXELS // width)
+    for row in range(0, height, _READ_ROWS):
+        window = Window(row, 0, min(_READ_ROWS, height - row), width)
+        true = truth.read(window)
+        if mask is not None:
+            true[np.nan_to_num(mask.read(window)) == 0] = np.nan
+        disparity, lower, upper, confidence = read_layers(out / "intervals.tif", window)
+        (validity,) = read_layers(out / "validity.tif", window)
+        rows = Rows(disparity, lower, upper, confidence, validity, true)
+        for first in range(0, window.height, step):
+            yield Rows(*(band[first : first + step] for band in rows))

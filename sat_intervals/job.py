@@ -12,6 +12,7 @@ from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.finish import Rows, Scale, finish_strips
 from sat_intervals.inputs import identity
+from sat_intervals.memory import fitted, parse_bytes
 from sat_intervals.patch import match_patch
 from sat_intervals.raster import Image, check_pair, check_space, open_image
 from sat_intervals.store import Store
@@ -45,6 +46,16 @@ class Job:
     out: Path
     inputs: dict[str, Any]
 
+    def begin(self, *, overwrite: bool = False) -> None:
+        """Open the store for what decides the bytes of a tile; to be called while it is locked."""
+        manifest = {
+            "version": version("sat-intervals"),
+            "settings": self.config.model_dump(mode="json", exclude={"cluster"}),
+            "inputs": self.inputs,
+            "region": asdict(self.store.grid.region),
+        }
+        self.store.open(manifest, overwrite=overwrite)
+
     @property
     def waiting(self) -> int:
         """Number of tiles that are not done."""
@@ -60,29 +71,24 @@ def prepare(
     window: Window | None = None,
     overwrite: bool = False,
 ) -> Job:
-    """Check all that can be checked before a pixel is read, and open the store; parameters as of `match_pair`."""
+    """Check all that can be checked before a pixel is read; parameters as of `match_pair`."""
     config, out = load_config(config), Path(out)
-    left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
-    check_pair(left, right, config.disparity.minimum, config.disparity.maximum)
+    if config.cluster.memory is not None:
+        config = fitted(config, parse_bytes(config.cluster.memory), config.cluster.cores)
+    left, right = checked_pair(left, right, config)
     region = _region(left, window)
     check_output(out, overwrite)
     check_space(out, region.height, region.width)
-    store = Store(
-        out / "tiles", Grid(region, config.tiles.size), config.disparity.count, config.largest_ambiguity
-    )
+    store = Store(out / "tiles", Grid(region, config.tiles.size), config.disparity.count, config.largest_ambiguity)
     inputs = {"left": _described(left), "right": _described(right)}
-    if overwrite:
-        store.remove()
-    # All that decides the bytes of a tile.
-    store.open(
-        {
-            "version": version("sat-intervals"),
-            "settings": config.model_dump(mode="json", exclude={"cluster"}),
-            "inputs": inputs,
-            "region": asdict(region),
-        }
-    )
     return Job(left, right, config, store, out, inputs)
+
+
+def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
+    """Open the images of a pair and check that they can be matched."""
+    left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
+    check_pair(left, right, config.disparity.minimum, config.disparity.maximum)
+    return left, right
 
 
 def check_output(out: Path, overwrite: bool) -> None:

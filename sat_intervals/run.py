@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, Future, as_completed
+from distributed import Client, as_completed
 
 from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
@@ -64,24 +64,28 @@ def match_pair(
     seconds: dict[str, float] = {}
     with timed(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
-    with timed(seconds, "kernels"):
-        progress("kernels", 0, 1)
-        compile_kernels(job.config)
-        progress("kernels", 1, 1)
-    with timed(seconds, "tiles"):
-        progress("tiles", len(job.store.grid) - job.waiting, len(job.store.grid))
-        if job.waiting:
-            with connected(job.config.cluster) as client:
-                for _, failures in matched(client, [job], progress):
-                    check_failures(job, failures)
-    report = conclude(job, seconds, progress)
-    if not keep_tiles:
-        job.store.remove()
+    with job.store.locked():
+        job.begin(overwrite=overwrite)
+        with timed(seconds, "kernels"):
+            progress("kernels", 0, 1)
+            compile_kernels(job.config)
+            progress("kernels", 1, 1)
+        with timed(seconds, "tiles"):
+            progress("tiles", len(job.store.grid) - job.waiting, len(job.store.grid))
+            if job.waiting:
+                with connected(job.config.cluster) as client:
+                    for _, failures in matched(client, [job], progress):
+                        check_failures(job, failures)
+        report = conclude(job, seconds, progress)
+        if not keep_tiles:
+            job.store.remove()
     return report
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
-    """Raise a RunError that names every tile that failed, if any did."""
+    """Remember every tile that failed and raise a RunError that names them, if there are any."""
+    for name, error in failures.items():
+        job.store.write_failure(name, str(error))
     if failures:
         lines = "\n".join(f"  tile {name}: {error}" for name, error in sorted(failures.items()))
         raise RunError(
@@ -90,9 +94,7 @@ def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
         )
 
 
-def matched(
-    client: Client, jobs: Sequence[Job], progress: Progress
-) -> Iterator[tuple[Job, dict[str, BaseException]]]:
+def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[tuple[Job, dict[str, BaseException]]]:
     """Match the tiles of jobs that are not done; yields each job as its last tile is through, with what failed.
 
     Tiles of several jobs are in flight at once, two a core and no more, so that the scheduler's memory does not grow
@@ -128,7 +130,7 @@ class _Flight:
         self._fill()
         for future in self._landing:
             error = future.exception()
-            i, tile = self._tiles.pop(future.key)
+            i, tile = self._tiles.pop(str(future.key))
             future.release()
             self._fill()
             yield i, tile, error
@@ -144,8 +146,8 @@ class _Flight:
                 return
             i, tile = following
             job = self._jobs[i]
-            future: Future = self._client.submit(
+            future = self._client.submit(
                 match_tile, job, tile, key=f"match-{i}-{tile.name}", retries=job.config.cluster.retries, pure=False
             )
-            self._tiles[future.key] = following
+            self._tiles[str(future.key)] = following
             self._landing.add(future)

@@ -5,12 +5,14 @@ when its record is there. Writing a tile again writes the same bytes. The manife
 bytes; a store with another manifest is never mixed in.
 """
 
+import fcntl
 import json
 import math
 import os
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +24,7 @@ from zarr.codecs import BloscCodec
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
-from sat_intervals.tiling import Grid, Tile
+from sat_intervals.tiling import Grid, Tile, Window
 
 # Raw products of the pixels of a core.
 PIXEL_ARRAYS = {
@@ -36,6 +38,8 @@ PIXEL_ARRAYS = {
 SIDES = ("top", "bottom", "left", "right")
 # The raw products that neighbours compare along a seam.
 SEAM_PRODUCTS = ("winner", "lower", "upper")
+
+_MANIFEST, _LOCK, _RECORDS, _FAILURES = "manifest.json", ".lock", "records", "failures"
 
 # Rows of a shard that are compressed together, so that strips read no more than they need.
 _ROWS_TOGETHER = 256
@@ -72,17 +76,43 @@ class Store:
         """Columns of the right view that a core sees."""
         return self.grid.size + self.count - 1
 
-    def open(self, manifest: Mapping[str, Any]) -> None:
-        """Create the store, or go on with the one that is there.
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep every other run out of the folder, until the block ends or this process dies.
+
+        Raises
+        ------
+        StoreError
+            When another run is at work there.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        with (self.path / _LOCK).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise StoreError(
+                    f"another run is at work in {self.path.parent}: wait for its end or choose another folder"
+                ) from error
+            yield
+
+    def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
+        """Create the store, or go on with the one that is there; to be called while it is `locked`.
+
+        Parameters
+        ----------
+        manifest
+            All that decides the bytes of a tile; ``region`` and ``settings`` tell the tiles.
+        overwrite
+            Whether what is there is dropped.
 
         Raises
         ------
         StoreError
             When the store that is there was begun with other settings, inputs or versions.
         """
-        file = self.path / "manifest.json"
+        file = self.path / _MANIFEST
         wanted = json.loads(json.dumps(manifest))
-        if file.exists():
+        if file.exists() and not overwrite:
             changed = list(_differences(json.loads(file.read_text()), wanted))
             if changed:
                 raise StoreError(
@@ -90,9 +120,11 @@ class Store:
                     "(use the same settings and inputs to go on, --overwrite to start afresh)"
                 )
             return
-        shutil.rmtree(self.path, ignore_errors=True)
+        file.unlink(missing_ok=True)  # first: without it nothing of the rest counts
+        for folder in (self._arrays, self.path / _RECORDS, self.path / _FAILURES):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
         self._create_arrays()
-        (self.path / "records").mkdir(parents=True)
         _write_whole(file, json.dumps(manifest, indent=1))
 
     def _create_arrays(self) -> None:
@@ -119,7 +151,7 @@ class Store:
         return zarr.open_array(self._arrays / name, mode=mode)
 
     def _record_file(self, tile: Tile) -> Path:
-        return self.path / "records" / f"{tile.name}.json"
+        return self.path / _RECORDS / f"{tile.name}.json"
 
     def is_done(self, tile: Tile) -> bool:
         """Whether the tile is complete."""
@@ -148,6 +180,10 @@ class Store:
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
         _write_whole(self._record_file(tile), json.dumps(record))
+
+    def write_failure(self, tile: str, reason: str) -> None:
+        """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
+        _write_whole(self.path / _FAILURES / f"{tile}.json", json.dumps(reason))
 
     def records(self) -> dict[str, dict[str, Any]]:
         """The records of the tiles that are done, by name."""
@@ -195,6 +231,50 @@ class Store:
     def remove(self) -> None:
         """Delete the store."""
         shutil.rmtree(self.path, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far the tiles of a run are.
+
+    Attributes
+    ----------
+    total, done
+        Numbers of tiles.
+    failed
+        Why tiles failed that are not done since, by name.
+    running
+        Whether a run is at work on them.
+    """
+
+    total: int
+    done: int
+    failed: dict[str, str]
+    running: bool
+
+
+def read_status(path: Path) -> Status:
+    """How far a run is, from its store alone.
+
+    Raises
+    ------
+    StoreError
+        Where there is no store.
+    """
+    if not (path / _MANIFEST).exists():
+        raise StoreError(f"{path.parent} holds no run that began: name the folder given to match")
+    manifest = json.loads((path / _MANIFEST).read_text())
+    grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
+    done = {file.stem for file in (path / _RECORDS).glob("[0-9]*.json")}
+    failures = {file.stem: json.loads(file.read_text()) for file in (path / _FAILURES).glob("[0-9]*.json")}
+    failed = {name: reason for name, reason in sorted(failures.items()) if name not in done}
+    store = Store(path, grid, 1, 0)
+    try:
+        with store.locked():
+            running = False
+    except StoreError:
+        running = True
+    return Status(len(grid), len(done), failed, running)
 
 
 def _create(

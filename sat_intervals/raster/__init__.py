@@ -3,6 +3,7 @@
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image
 from sat_intervals.raster.layers import north_up, read_layers, write_layer
+from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.windows import read_window
 from sat_intervals.raster.writer import OutputError, OutputWriter, check_space
 
@@ -18,6 +19,8 @@ __all__ = [
     "north_up",
     "open_image",
     "read_layers",
+    "read_small_image",
+    "read_small_layers",
     "read_window",
     "write_layer",
 ]

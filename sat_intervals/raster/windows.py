@@ -34,26 +34,26 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
     state = np.full(pixels.shape, NO_DATA, np.uint8)
     if inside.height and inside.width:
         place = inside.relative_to(window).slices
-        values, state[place] = _read_inside(image, inside)
+        values, state[place] = read_inside(image, inside)
         np.copyto(pixels[place], values, where=state[place] == 0)
     return pixels, state
 
 
-def _read_inside(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Values in the file's type, and states, of a window that lies inside the image."""
+def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Values in the file's type, and states, of a window that lies inside the image; with ``shape`` so many picked."""
     area = Area(window.column, window.row, window.width, window.height)
     with opened(image.path, window) as dataset:
-        values = dataset.read(image.band, window=area)
+        values = dataset.read(image.band, window=area, out_shape=shape)
         usable = np.isfinite(values) & _differs(values, image.nodata)
         # Asked for one by one, since GDAL's mask of a band is but the first there is of: mask, no-data value, alpha.
         if image.use_mask:
-            usable &= dataset.read_masks(image.band, window=area) != 0
+            usable &= dataset.read_masks(image.band, window=area, out_shape=shape) != 0
         if image.alpha is not None:
-            usable &= dataset.read(image.alpha, window=area) != 0
+            usable &= dataset.read(image.alpha, window=area, out_shape=shape) != 0
     state = np.where(usable, 0, NO_DATA).astype(np.uint8)
     if image.mask is not None:
         with opened(image.mask, window) as dataset:
-            state[dataset.read(1, window=area) != 0] |= MASKED
+            state[dataset.read(1, window=area, out_shape=shape) != 0] |= MASKED
     return values, state
 
 

@@ -1,0 +1,37 @@
+"""``sat-intervals ablate``: what each part of the method is worth, on pairs of known truth."""
+
+from pathlib import Path
+
+import click
+
+from sat_intervals.cli.pairs import judging_options, overrides, say_json
+
+
+@click.command(short_help="Compare the method's parts on pairs of known truth.")
+@click.argument("pairs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@judging_options  # type: ignore[untyped-decorator]
+def ablate(pairs: tuple[Path, ...], config_file: Path | None, accurate: bool, tolerance: float, as_json: bool) -> None:
+    """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS (the paper's table 2).
+
+    Every pair is matched once, in memory. Printed is the accuracy, the share of valid pixels whose interval holds the
+    truth, as means over the scenes of each group; the last column is the method itself, with regularisation.
+
+    A pair is a folder of left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum],
+    `group`), or a row of a CSV file of the columns left, right, truth, minimum, maximum and, if you like,
+    name and group, its paths relative to it.
+    """
+    from sat_intervals.ablation import ablate_pair
+    from sat_intervals.cli.tables import show_groups
+    from sat_intervals.config import load_config
+    from sat_intervals.pairs import find_pairs
+    from sat_intervals.tables import Scene, table_2
+
+    scenes = []
+    for pair in find_pairs(pairs):
+        click.echo(f"matching {pair.name}", err=True)
+        config = load_config(config_file, overrides(pair.minimum, pair.maximum, accurate))
+        scenes.append(Scene(pair.name, pair.group, ablate_pair(pair, config, tolerance=tolerance)))
+    if as_json:
+        say_json(scenes)
+    else:
+        show_groups(table_2(scenes), "accuracy, means over scenes, valid pixels")

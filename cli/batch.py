@@ -1,0 +1,54 @@
+"""``sat-intervals batch``: many pairs, one cluster."""
+
+from pathlib import Path
+
+import click
+
+from sat_intervals.cli.match import overrides, run_options
+
+
+@click.command(short_help="Match many pairs; run again, it does what is missing.")
+@click.argument("pairs", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+@run_options  # type: ignore[untyped-decorator]
+def batch(
+    pairs: Path,
+    out: Path,
+    config_file: Path | None,
+    tile_size: int | None,
+    overlap: int | None,
+    workers: int | None,
+    cluster: str | None,
+    keep_tiles: bool,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
+    """Match the pairs of a CSV, YAML or JSON file, each into its own folder of OUT.
+
+    Columns: name, left, right, minimum, maximum, left_mask, right_mask, and any setting such as sgm.p2. A pair that
+    fails does not stop the others; OUT/batch.json says how each ended, and the status is 1 if any failed.
+    """
+    from sat_intervals.batch import match_batch, read_batch
+    from sat_intervals.cli.console import Console
+
+    rows = read_batch(pairs)
+    with Console(quiet) as console:
+        given = overrides(None, tile_size, overlap, workers, cluster)
+        report = match_batch(
+            rows,
+            out,
+            config_file,
+            overrides=given,
+            overwrite=overwrite,
+            keep_tiles=keep_tiles,
+            progress=console.progress,
+        )
+    console.batch_summary(report)
+    failed = {name: end["error"] for name, end in report.items() if end["state"] == "failed"}
+    if failed:
+        from sat_intervals.errors import RunError
+
+        lines = "\n".join(f"  {name}: {error}" for name, error in failed.items())
+        raise RunError(
+            f"{len(failed)} of {len(report)} pairs failed; the same command does only what is missing:\n{lines}"
+        )

@@ -1,0 +1,123 @@
+"""``sat-intervals evaluate``: how often intervals hold the truth, and how wide they are for it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sat_intervals.cli.pairs import judging_options, overrides, say_json
+
+if TYPE_CHECKING:
+    from sat_intervals.pairs import Pair
+
+_FILE = click.Path(path_type=Path)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A run in a folder, or a pair to be matched first, and what it is judged by."""
+
+    name: str
+    pair: "Pair | None"
+    truth: Path | None
+    mask: Path | None
+
+
+@click.command(short_help="Judge intervals by a known truth.")
+@click.argument("folders", metavar="OUT...", nargs=-1, required=True, type=_FILE)
+@click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each OUT, in their order.")
+@click.option("--mask", type=_FILE, multiple=True, help="Pixels to judge: not 0; one for each OUT, in their order.")
+@click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
+@click.option("--group", metavar="LABEL", help="Count all as one group, whatever meta.json says.")
+@judging_options  # type: ignore[untyped-decorator]
+def evaluate(
+    folders: tuple[Path, ...],
+    truth: tuple[Path, ...],
+    mask: tuple[Path, ...],
+    remove_bias: bool,
+    group: str | None,
+    config_file: Path | None,
+    accurate: bool,
+    tolerance: float,
+    as_json: bool,
+) -> None:
+    """Judge the intervals of the runs in the folders OUT by the truth of their left images.
+
+    Printed are accuracy (the share of intervals that hold the truth), relative size (the median width over the width of
+    the search range) and, for low confidence, relative overestimation (the median of 1 - largest error of the area /
+    width), over valid pixels; where a run kept rejected pixels, over all with an interval as well. Of several OUT, the
+    means over the scenes of each group (the paper's table 1): `group` of the meta.json beside the left image.
+
+    The truth is truth.tif beside the left image where --truth is not given. Instead of a run OUT may be a
+    pair, which is matched first: a folder of left.tif, right.tif, truth.tif and meta.json (`disparity`:
+    [minimum, maximum], `group`), or a CSV file of the columns left, right, truth, minimum, maximum and, if
+    you like, name and group, its paths relative to it.
+    """
+    from sat_intervals.cli.tables import show_groups, show_missed, show_scene
+    from sat_intervals.evaluation import evaluate_run
+    from sat_intervals.tables import Scene, table_1
+
+    scenes = []
+    for source in _sources(folders, truth, mask):
+        judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
+        if source.pair is None:
+            report = judge(source.name, source.truth, source.mask)
+        else:
+            click.echo(f"matching {source.name}", err=True)
+            report = _judge_pair(judge, source, source.pair, config_file, accurate)
+        scenes.append(Scene(source.name, group or _group(source), report))
+    if as_json:
+        say_json(scenes)
+    elif len(scenes) == 1:
+        show_scene(scenes[0])
+    else:
+        show_groups(table_1(scenes), "means over scenes, valid pixels")
+        show_missed(scenes)
+
+
+def _sources(folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...]) -> list[_Source]:
+    """What the arguments name, in their order."""
+    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.pairs import find_pairs, is_pair
+
+    found: list[tuple[str, Pair | None]] = []
+    for folder in folders:
+        if is_pair(folder) and not (folder / "run.json").exists():
+            found += [(pair.name, pair) for pair in find_pairs([folder])]
+        else:
+            found.append((str(folder), None))
+    for option, given in (("--truth", truths), ("--mask", masks)):
+        if len(given) not in (0, len(found)):
+            raise SatIntervalsError(f"{option} is given {len(given)} times for {len(found)} OUT: give it once for each")
+    absent = (None,) * len(found)
+    return [
+        _Source(name, pair, truth, mask)
+        for (name, pair), truth, mask in zip(found, truths or absent, masks or absent, strict=True)
+    ]
+
+
+def _judge_pair(
+    judge: Callable[..., dict[str, Any]], source: _Source, pair: "Pair", config_file: Path | None, accurate: bool
+) -> dict[str, Any]:
+    """Match a pair to files, as anyone would, and judge them."""
+    from sat_intervals.config import load_config
+    from sat_intervals.run import match_pair
+
+    more = overrides(pair.minimum, pair.maximum, accurate) | {"products": {"keep_rejected": True}}
+    with TemporaryDirectory(prefix="sat-intervals-") as out:
+        match_pair(pair.left, pair.right, out, load_config(config_file, more))
+        return judge(out, source.truth or pair.truth, source.mask)
+
+
+def _group(source: _Source) -> str:
+    from sat_intervals.evaluation import read_run
+    from sat_intervals.pairs import group_beside
+
+    if source.pair is not None:
+        return source.pair.group
+    run, _ = read_run(Path(source.name))
+    return group_beside(run["inputs"]["left"]["path"])

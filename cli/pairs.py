@@ -1,0 +1,53 @@
+"""What the commands that judge pairs of known truth have in common."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from sat_intervals.tables import Scene
+
+
+def _debug(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    context.meta["sat_intervals.debug"] = value
+
+
+def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of every command that judges pairs of known truth."""
+    options = [
+        click.option(
+            "--config", "config_file", type=click.Path(path_type=Path), help="Settings to match pairs with (YAML)."
+        ),
+        click.option(
+            "--accurate",
+            is_flag=True,
+            help="Match pairs with cross-checking against a right view of its own, as the paper's implementation does.",
+        ),
+        click.option(
+            "--tolerance",
+            type=click.FloatRange(min=0),
+            default=0.0,
+            metavar="PX",
+            help="Truth so far outside an interval still counts as inside; for truth given in steps, half a step.",
+        ),
+        click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
+        click.option("--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def overrides(minimum: int, maximum: int, accurate: bool) -> dict[str, Any]:
+    """The settings that a pair and the command line give, as sections."""
+    sections: dict[str, Any] = {"disparity": {"minimum": minimum, "maximum": maximum}}
+    return sections | ({"cross_check": {"method": "accurate"}} if accurate else {})
+
+
+def say_json(scenes: "list[Scene]") -> None:
+    """Print the reports of scenes as JSON: of one, the report itself; of several, by name."""
+    reports = {scene.name: scene.report for scene in scenes}
+    click.echo(json.dumps(scenes[0].report if len(scenes) == 1 else reports, indent=1))

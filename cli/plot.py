@@ -1,0 +1,53 @@
+"""``sat-intervals plot``: pictures of a finished run."""
+
+from pathlib import Path
+
+import click
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
+@click.argument("out", type=_FILE)
+@click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if there is one.")
+@click.option("--row", type=int, metavar="R", help="Draw the profile of this row.")
+@click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
+@click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
+@click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots an inch: larger files.")
+def plot(
+    out: Path,
+    truth: Path | None,
+    row: int | None,
+    columns: tuple[int, int] | None,
+    pixel: tuple[int, int] | None,
+    dpi: int,
+) -> None:
+    r"""Draw pictures of the finished run in the folder OUT, next to its files.
+
+    \b
+    OUT/overview.png   always: left image, disparity, interval width, confidence, validity
+    OUT/errors.png     with a truth: where the interval misses it
+    OUT/profile.png    with --row: interval, disparity and truth along a row
+    OUT/curve.png      with --pixel: the cost curve of a pixel and how it became an interval
+
+    Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
+    'sat-intervals[plot]'.
+    """
+    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
+    from sat_intervals.results import open_results
+
+    if columns is not None and row is None:
+        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} are those of a profile: give its --row too")
+    results = open_results(out, truth)
+    draw_overview(results, out / "overview.png", dpi)
+    click.echo(out / "overview.png")
+    if results.truth is not None:
+        draw_errors(results, out / "errors.png", dpi)
+        click.echo(out / "errors.png")
+    if row is not None:
+        draw_profile(results, out / "profile.png", row, columns, dpi)
+        click.echo(out / "profile.png")
+    if pixel is not None:
+        draw_curve(results, out / "curve.png", *pixel, dpi)
+        click.echo(out / "curve.png")

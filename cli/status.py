@@ -1,0 +1,23 @@
+"""``sat-intervals status``: how far a run is, from its folder alone."""
+
+from pathlib import Path
+
+import click
+
+
+@click.command(short_help="Say how far a run is.")
+@click.argument("out", type=click.Path(path_type=Path))
+def status(out: Path) -> None:
+    """Say how many tiles of the run in OUT are done, failed and left, while it goes on anywhere or after it died."""
+    from sat_intervals.job import OUTPUTS
+    from sat_intervals.store import read_status
+
+    if all((out / name).exists() for name in OUTPUTS):
+        click.echo(f"{out}: complete")
+        return
+    now = read_status(out / "tiles")
+    left = now.total - now.done - len(now.failed)
+    state = "a run is at work" if now.running else "no run is at work: the same match command goes on from here"
+    click.echo(f"{out}: {now.done} of {now.total} tiles done, {len(now.failed)} failed, {left} left; {state}")
+    for name, reason in now.failed.items():
+        click.echo(f"  tile {name}: {reason}")

@@ -1,0 +1,97 @@
+"""Tables for people: drawn on a terminal, plain aligned text elsewhere."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from sat_intervals.tables import ACCURACY, OBJECTIVE, Row, Scene, look_up
+
+
+def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
+    """Print a table whose first column holds labels and whose others hold figures."""
+    terminal = Console(highlight=False)
+    if not terminal.is_terminal:
+        _show_plainly(header, rows, title)
+        return
+    table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column(header[0], overflow="fold")
+    for name in header[1:]:
+        table.add_column(name.replace(" ", "\n"), justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    terminal.print(table)
+
+
+def _show_plainly(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
+    lines = [header, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    click.echo(title)
+    for label, *cells in lines:
+        figures = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
+        click.echo("  ".join([label.ljust(widths[0]), *figures]))
+
+
+def show_groups(rows: Sequence[Row], title: str) -> None:
+    """Print one of the paper's tables: a row a group, and below it what others print for it."""
+    header = ["", "scenes", f">= {OBJECTIVE}", *rows[0].figures]
+    cells = []
+    for row in rows:
+        own = [row.label, str(row.scenes), str(row.at_objective)] if row.scenes else [f"  {row.label}", "", ""]
+        cells.append([*own, *map(_figure, row.figures.values())])
+    show(header, cells, title)
+    if any(row.scenes is None for row in rows):
+        click.echo(
+            "paper: Malinowski et al. 2024; reference: Pandora, their implementation, measured for this project, which "
+            "cross-checks as --accurate does"
+        )
+
+
+def show_missed(scenes: Sequence[Scene]) -> None:
+    """Name the scenes that miss the paper's objective."""
+    accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
+    missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
+    if missed:
+        click.echo(f"below {OBJECTIVE}: {', '.join(missed)}")
+
+
+def show_scene(scene: Scene) -> None:
+    """Print all figures of one scene."""
+    report = scene.report
+    rows = _areas(report, "")
+    if report["with_rejected"]:
+        rows += _areas(report["with_rejected"], ", with rejected")
+    show(["", "pixels", "accuracy", "relative size", "mean width (px)", "overestimation"], rows, scene.name)
+    bad = [_figure(report[name]) for name in ("bad1", "bad3")]
+    click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
+    if report["tolerance"]:
+        click.echo(f"truth up to {report['tolerance']:g} px outside an interval counts as inside")
+    if report["bias"] is not None:
+        click.echo(f"median of disparity - truth, added to the truth: {_figure(report['bias'])} px")
+    if report["truth_outside_range"]:
+        share = _figure(report["truth_outside_range"])
+        click.echo(f"truth outside the search range, always missed: {share} (its sign: x_right = x_left + disparity)")
+    deciles = [
+        ["{:.3f} to {:.3f}".format(*decile["confidence"]), *_measures(decile, "accuracy", "mean_width")]
+        for decile in report["deciles"]
+    ]
+    if deciles:
+        show(["confidence", "pixels", "accuracy", "mean width (px)"], deciles, "by decile of confidence")
+
+
+def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
+    """Rows of all pixels, and of those of high and of low confidence."""
+    columns = ("accuracy", "relative_size", "mean_width", "relative_overestimation")
+    names = {"all": "all pixels", "high": "high confidence", "low": "low confidence"}
+    return [[name + where, *_measures(report[key], *columns)] for key, name in names.items()]
+
+
+def _measures(area: dict[str, float | None], *columns: str) -> list[str]:
+    return [str(area["count"]), *(_figure(area.get(column)) for column in columns)]
+
+
+def _figure(value: float | None) -> str:
+    """A figure with three decimals, a dash for none."""
+    return "-" if value is None else f"{value:.3f}"

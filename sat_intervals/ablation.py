@@ -1,0 +1,142 @@
+"""What each part of the method is worth: the paper's ablation, in one matching pass a pair (paper, table 2)."""
+
+import os
+from decimal import Decimal
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.config import Config, Interval, load_config
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.evaluation import Rows as Judgeable
+from sat_intervals.evaluation import evaluate, rules_of
+from sat_intervals.finish import Final, Rows, Scale, confidence_scale, finish_rows
+from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.kernels.cost import census, padded_to_lanes
+from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
+from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.pairs import Pair
+from sat_intervals.patch import Reader, kernel_settings, match_patch
+from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY
+from sat_intervals.raster import check_pair, open_image, read_window
+from sat_intervals.tables import METHODS
+from sat_intervals.tiling import Window, facing
+
+# The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).
+_BASELINE = 1, 10
+
+
+def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> dict[str, Any]:
+    """Judge the paper's baseline, and the method at several levels with and without its regularisation, on one pair.
+
+    All of them are read off one aggregated volume, which must fit in memory, and judged on the same pixels: those that
+    pass cross-checking.
+
+    Parameters
+    ----------
+    pair
+        Images, truth and search range.
+    config
+        Settings, or what `load_config` makes them from; the pair's search range and the method's alpha win.
+    tolerance
+        Pixels by which the truth may lie outside an interval that still counts as right.
+
+    Returns
+    -------
+    For each of METHODS ``count``, ``accuracy``, ``relative_size`` and ``mean_width``, as `evaluate_run`; and ``cost``.
+
+    Raises
+    ------
+    SatIntervalsError
+        Images that are no pair, settings without the parts compared, or a volume larger than the memory.
+    """
+    config = load_config(config, {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}})
+    if config.regularization is None:
+        raise SatIntervalsError("regularization is null: the ablation compares with and without it, leave it on")
+    left, right, truth = (open_image(path) for path in (pair.left, pair.right, pair.truth))
+    check_pair(left, right, pair.minimum, pair.maximum)
+    if (truth.height, truth.width) != (left.height, left.width):
+        raise SatIntervalsError(
+            f"{truth.path} has {truth.height} x {truth.width} pixels, {left.path} {left.height} x {left.width}: "
+            "give the truth of the left image"
+        )
+    whole = Window(0, 0, left.height, left.width)
+    _check_memory(whole, config)
+    finals = _all_methods(partial(read_window, left), partial(read_window, right), whole, config)
+    pixels, state = read_window(truth, whole)
+    true = np.where(state == 0, pixels.astype(np.float64), np.nan)
+    report: dict[str, Any] = {"cost": config.cost.method}
+    rules = rules_of(config, tolerance)
+    for method, final in finals.items():
+        disparity, lower, upper, confidence = final.intervals
+        rows = Judgeable(disparity, lower, upper, confidence, final.validity, true)
+        report[method] = evaluate(partial(list, [rows]), rules)["all"]
+    return report
+
+
+def _check_memory(whole: Window, config: Config) -> None:
+    volume = 2 * whole.height * whole.width * padded_to_lanes(config.disparity.count)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if volume > memory:
+        raise SatIntervalsError(
+            f"{whole.height} x {whole.width} pixels x {config.disparity.count} disparities need {volume / 1e9:.1f} GB, "
+            f"the machine has {memory / 1e9:.1f} GB: cut the pair"
+        )
+
+
+def _all_methods(left: Reader, right: Reader, whole: Window, config: Config) -> dict[str, Final]:
+    """Final bands by every one of METHODS."""
+    search = config.disparity
+    volume = _volume(left, right, whole, config)
+    refine = config.refinement is not None
+    weights = np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights
+    winner, disparity, ambiguity = read_winners(volume, search.minimum, weights, refine)
+    bounds = {"baseline": read_baseline(volume, search.minimum, *_BASELINE)}
+    for method in METHODS[1:]:
+        level = config.model_copy(update={"interval": Interval(alpha=Decimal(method.split()[0]))}).cut_level
+        bounds[method] = read_alpha_cuts(volume, search.minimum, level, refine)
+    histogram = ambiguity_histogram(ambiguity, winner != NO_DISPARITY, config.largest_ambiguity)
+    assert config.ambiguity is not None  # regularisation needs it
+    scale = confidence_scale(config.ambiguity, histogram)
+    validity = np.where(winner == NO_DISPARITY, NO_CANDIDATE, 0).astype(np.uint16)
+    seen = _right_winners(left, right, whole, volume, config)
+    finals = {}
+    for method, (lower, upper) in bounds.items():
+        rows = Rows(winner, lower, upper, disparity, ambiguity, validity, seen)
+        finals[method] = _finished(rows, method, scale, config)
+    return finals
+
+
+def _finished(rows: Rows, method: str, scale: Scale, config: Config) -> Final:
+    """Final bands by one method: only the last has its intervals regularised, the baseline not even filtered."""
+    if method != METHODS[-1]:
+        config = config.model_copy(update={"regularization": None})
+    if method == "baseline":
+        config = config.model_copy(update={"median": None})
+        rows = rows._replace(disparity=rows.winner.astype(np.float32))  # no refinement that bounds had to follow
+    return finish_rows(rows, 0, rows.winner.shape[0], scale, config)
+
+
+def _volume(left: Reader, right: Reader, whole: Window, config: Config) -> np.ndarray:
+    """Aggregated costs of the whole pair, ``(rows, columns, count)`` uint16."""
+    window, search = config.cost.window, config.disparity
+    beyond = window // 2
+    facing_area = facing(whole, search.minimum, search.maximum)
+    left_codes = census(*left(whole.grown(beyond, beyond)), window)
+    right_codes = census(*right(facing_area.grown(beyond, beyond)), window)
+    return cost_volume(left_codes, right_codes, kernel_settings(config))
+
+
+def _right_winners(left: Reader, right: Reader, whole: Window, volume: np.ndarray, config: Config) -> np.ndarray:
+    """The right view's winners, as the run's way of cross-checking finds them."""
+    search = config.disparity
+    if config.cross_check is None or config.cross_check.method == "fast":
+        return np.asarray(read_right_winners(volume, search.minimum))
+    # The right view has a volume of its own: left and right change places, and disparities their sign.
+    mirrored = load_config(
+        config, {"disparity": {"minimum": -search.maximum, "maximum": -search.minimum}, "cross_check": None}
+    )
+    reach = facing(whole, search.minimum, search.maximum)
+    winner = match_patch(right, left, reach, reach, reach, mirrored).raw.winner
+    return np.where(winner == NO_DISPARITY, NO_DISPARITY, -winner).astype(np.int16)

@@ -1,0 +1,97 @@
+"""The cost curve of one pixel, matched again from the images, and how it becomes an interval (paper eq. 5 to 9)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
+from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.patch import kernel_settings
+from sat_intervals.products import FLAGS, IMPOSSIBLE_COST
+from sat_intervals.raster import Image, read_window
+from sat_intervals.results import Results
+from sat_intervals.tiling import Window, facing
+
+
+class Curve(NamedTuple):
+    """One pixel's curve and what is read off it, before medians and regularisation.
+
+    Attributes
+    ----------
+    disparities
+        Integers searched, in pixels.
+    costs
+        Float64, aggregated by SGM where the run did; NaN where a candidate is impossible.
+    possibilities
+        0 to 1, 1 at the lowest cost; NaN where a candidate is impossible.
+    cut
+        Whether a disparity belongs to the alpha-cut; none do where the run has no intervals.
+    disparity
+        The winner, refined where the run did, in pixels.
+    lower, upper
+        The interval in pixels, None where the run has none.
+    """
+
+    disparities: np.ndarray
+    costs: np.ndarray
+    possibilities: np.ndarray
+    cut: np.ndarray
+    disparity: float
+    lower: int | None
+    upper: int | None
+
+
+def read_curve(results: Results, row: int, column: int) -> Curve:
+    """Match a pixel again with the run's overlap around it.
+
+    The run itself saw further, the whole tile: beyond the overlap, what is left of SGM's memory differs a little.
+
+    Parameters
+    ----------
+    row, column
+        Counted from 0 at the first pixel of the results.
+
+    Raises
+    ------
+    SatIntervalsError
+        A pixel outside the results, or one that has no possible candidate.
+    """
+    results.check_pixel(row, column)
+    config = results.config
+    overlap = config.tiles.overlap
+    pixel = Window(results.region.row + row, results.region.column + column, 1, 1)
+    area = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
+    settings = kernel_settings(config)
+    left = _codes(results.left, area, settings.window)
+    right = _codes(results.right, facing(area, config.disparity.minimum, config.disparity.maximum), settings.window)
+    curve = np.ascontiguousarray(cost_volume(left, right, settings)[pixel.relative_to(area).slices])
+    possible = curve[0, 0] != IMPOSSIBLE_COST
+    if not possible.any():
+        raise SatIntervalsError(_explain(results, row, column))
+    costs = np.where(possible, curve[0, 0].astype(np.float64), np.nan)
+    above = costs - np.nanmin(costs)
+    _, disparity, _ = read_winners(curve, settings.minimum, settings.weights, settings.refine)
+    lower, upper = read_alpha_cuts(curve, settings.minimum, settings.cut_level, settings.refine)
+    return Curve(
+        disparities=np.arange(settings.minimum, settings.minimum + settings.count),
+        costs=costs,
+        possibilities=1 - above / config.cost_span,
+        cut=above <= (-1 if config.cut_level is None else config.cut_level),
+        disparity=float(disparity[0, 0]),
+        lower=int(lower[0, 0]) if config.interval else None,
+        upper=int(upper[0, 0]) if config.interval else None,
+    )
+
+
+def _codes(image: Image, area: Window, window: int) -> Codes:
+    radius = window // 2
+    return census(*read_window(image, area.grown(radius, radius)), window)
+
+
+def _explain(results: Results, row: int, column: int) -> str:
+    """Why a pixel has no curve, by its validity flags."""
+    validity = int(results.read(Window(row, column, 1, 1)).validity[0, 0])
+    reasons = [flag.meaning for flag in FLAGS if flag.invalid and validity & flag.value]
+    return f"row {row}, column {column} has no cost curve: {'; '.join(reasons)}: choose a pixel that was matched"

@@ -1,0 +1,52 @@
+"""The worst of a low-confidence area (method: section 10).
+
+Letters: r row, c column, s and t segments: runs of low-confidence pixels in a row.
+"""
+
+import numpy as np
+from numba import njit
+
+from sat_intervals.kernels.intervals import find_segments, find_touching
+
+
+@njit(nogil=True, cache=True)
+def area_maximum(values, low, depth):
+    """The largest value over the low-confidence area around each low-confidence pixel (paper eq. 16).
+
+    Parameters
+    ----------
+    values
+        ``(rows, columns)`` float64; NaN does not count.
+    low
+        bool of the same shape: low-confidence pixels.
+    depth
+        Steps between touching segments that make an area, as in `regularize`: a row's areas reach as many rows up and
+        down.
+
+    Returns
+    -------
+    ``(rows, columns)`` float64, NaN where not low and where the area has no value.
+    """
+    start, stop, row_start = find_segments(low)
+    above, below = np.zeros((start.size, 2), np.int64), np.zeros((start.size, 2), np.int64)
+    find_touching(start, stop, row_start, above, -1)
+    find_touching(start, stop, row_start, below, 1)
+    largest = np.full(start.size, -np.inf)
+    for r in range(values.shape[0]):
+        for s in range(row_start[r], row_start[r + 1]):
+            for c in range(start[s], stop[s]):
+                if values[r, c] > largest[s]:
+                    largest[s] = values[r, c]
+    for _ in range(depth):
+        reached = largest.copy()
+        for s in range(start.size):
+            for neighbours in (above[s], below[s]):
+                for t in range(neighbours[0], neighbours[1]):
+                    reached[s] = max(reached[s], largest[t])
+        largest = reached
+    result = np.full(values.shape, np.nan)
+    for r in range(values.shape[0]):
+        for s in range(row_start[r], row_start[r + 1]):
+            if largest[s] > -np.inf:
+                result[r, start[s] : stop[s]] = largest[s]
+    return result

@@ -1,0 +1,54 @@
+"""What all pictures share: the page, its style and colours, the range of a map, the words on an empty one."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sat_intervals.errors import SatIntervalsError
+
+DPI = 110  # dots an inch
+NOTHING = "#dedede"  # where there is no value
+INK = "#555555"
+
+_STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left"}
+
+
+@contextmanager
+def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterator[Figure]:
+    """A figure of ``size`` inches that becomes a PNG file at the end."""
+    with rc_context(_STYLE):
+        figure = Figure(size, layout="constrained")
+        figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
+        yield figure
+        try:
+            figure.savefig(path, dpi=dpi, metadata={"Software": "sat-intervals"})
+        except OSError as error:
+            reason = error.strerror or error
+            raise SatIntervalsError(f"{path} cannot be written: {reason}: make room or check its rights") from error
+
+
+def fitting(shape: tuple[int, int], longest: int) -> tuple[int, int]:
+    """The shape of a picture of so many pixels, its longer side at most ``longest``."""
+    scale = min(1.0, longest / max(shape))
+    return max(1, round(shape[0] * scale)), max(1, round(shape[1] * scale))
+
+
+def limits(values: np.ndarray, otherwise: tuple[float, float]) -> tuple[float, float]:
+    """The range of all but the outermost hundredths of the values."""
+    known = values[np.isfinite(values)]
+    if known.size == 0:
+        return otherwise
+    low, high = np.percentile(known, (1, 99), method="nearest")
+    return (float(low), float(high)) if low < high else (float(low) - 0.5, float(high) + 0.5)
+
+
+def say_empty(panel: Axes, values: np.ndarray, text: str) -> None:
+    """Tell in words why a panel is empty."""
+    if not np.isfinite(values).any():
+        panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", va="center", color=INK)

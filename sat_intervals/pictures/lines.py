@@ -1,0 +1,145 @@
+"""Lines: the interval along a row, and the cost curve of a pixel."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from sat_intervals.curve import Curve, read_curve
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kinds import BLUE, ORANGE, SKY, VERMILION
+from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.products import INVALID
+from sat_intervals.results import Bands, Results
+from sat_intervals.tiling import Window
+
+_WIDTH = 12.0  # inches
+_KEYS = 4  # entries in a row of a legend
+_LOW = "#d4d4d4"
+
+
+def draw_profile(
+    results: Results, path: Path, row: int, columns: tuple[int, int] | None = None, dpi: int = DPI
+) -> None:
+    """Draw interval, disparity and truth along a row, low-confidence sections in grey (the paper's figures 5, 7, 8).
+
+    Parameters
+    ----------
+    row
+        Counted from 0 at the first row of the results.
+    columns
+        First and last column drawn; by default all.
+    """
+    first, last = columns or (0, results.region.width - 1)
+    results.check_pixel(row, first)
+    results.check_pixel(row, last)
+    if first > last:
+        raise SatIntervalsError(f"columns {first} to {last} are the wrong way round: give the first one first")
+    bands = results.read(Window(row, 0, 1, results.region.width))
+    low = bands.low(results.config)[0, first : last + 1]
+    valid = bands.validity & INVALID == 0
+    lines = [np.where(valid, band, np.nan) for band in (bands.lower, bands.upper, bands.disparity)]
+    # A pixel is a step, seen even when its neighbours are not valid.
+    lower, upper, disparity, truth = (np.repeat(line[0, first : last + 1], 2) for line in (*lines, bands.truth))
+    edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
+    title = f"Row {row}, columns {first} to {last}; where there is no band, no pixel is valid"
+    with page(path, (_WIDTH, 5.4), dpi, title) as figure:
+        strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
+        _draw_strip(strip, results, row, first, last, round(_WIDTH * dpi))
+        for number, (start, stop) in enumerate(_sections(low)):
+            label = None if number else "low confidence"
+            chart.axvspan(first + start - 0.5, first + stop - 0.5, color=_LOW, lw=0, label=label)
+        chart.fill_between(edges, lower, upper, color=SKY, alpha=0.7, lw=0.8, label="interval")
+        if np.isfinite(truth).any():
+            chart.plot(edges, truth, color=VERMILION, lw=1.2, label="truth")
+        chart.plot(edges, disparity, color="black", lw=0.9, label="disparity")
+        _finish_chart(chart, "column", "disparity (px)", (first - 0.5, last + 0.5))
+        if not np.isfinite(disparity).any():
+            search = results.config.disparity
+            chart.set_ylim(search.minimum - 0.5, search.maximum + 0.5)
+        say_empty(chart, disparity, "no valid pixel here")
+
+
+def draw_curve(results: Results, path: Path, row: int, column: int, dpi: int = DPI) -> None:
+    """Draw a pixel's cost curve, its possibility distribution, the cut and the interval (the paper's figures 2 and 3).
+
+    Matched again from the images; below stands the interval that the run wrote, after medians and regularisation.
+    """
+    curve = read_curve(results, row, column)
+    pixel = results.read_pixel(row, column)
+    search = results.config.disparity
+    margin = max(1.0, 0.02 * search.count)
+    across = (search.minimum - margin, search.maximum + margin)
+    with page(path, (9.0, 7.5), dpi, _describe(row, column, pixel)) as figure:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
+        above.plot(curve.disparities, curve.costs, color="black", lw=1, marker="o", ms=3, label="cost curve")
+        below.plot(curve.disparities, curve.possibilities, color="black", lw=1, marker="o", ms=3, label="possibility")
+        if curve.lower is not None:
+            _draw_cut(below, curve, results)
+        if np.isfinite(pixel.lower):
+            text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"
+            bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "label": text}
+            below.plot([pixel.lower, pixel.upper], [-0.08, -0.08], **bar)
+        for chart, label in ((above, "{} {:.2f} px"), (below, None)):
+            lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
+            for name, place, colour, style in lines:
+                if np.isfinite(place):
+                    chart.axvline(place, color=colour, lw=1, ls=style, label=label and label.format(name, place))
+        below.set_ylim(-0.14, 1.06)
+        unit = "aggregated by SGM" if results.config.sgm else "not aggregated"
+        _finish_chart(above, "", f"cost, {unit}", across)
+        _finish_chart(below, "disparity (px)", "possibility", across)
+
+
+def _describe(row: int, column: int, pixel: Bands) -> str:
+    parts = [f"Row {row}, column {column}", "rejected" if pixel.validity & INVALID else "valid"]
+    parts += [f"confidence {pixel.confidence:.2f}"] if np.isfinite(pixel.confidence) else []
+    return ", ".join(parts)
+
+
+def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
+    """The alpha-cut of the possibilities and the interval between its ends."""
+    assert curve.lower is not None
+    assert curve.upper is not None
+    assert results.config.interval is not None
+    level = float(results.config.interval.alpha)
+    chart.axhline(level, color=INK, lw=0.8, ls="--", label=f"alpha = {level:g}")
+    cut = curve.cut
+    chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
+    text = f"its interval, {curve.lower} to {curve.upper} px"
+    chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)
+    arrow = {"arrowstyle": "<->", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
+    chart.annotate("", (curve.lower, 0.05), (curve.upper, 0.05), arrowprops=arrow)
+
+
+def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] | None) -> None:
+    """Names, limits and a quiet frame."""
+    chart.set(xlabel=across, ylabel=up)
+    if shown:
+        chart.set_xlim(shown)
+    chart.grid(axis="y", color="#e8e8e8", zorder=0)
+    chart.spines[["top", "right"]].set_visible(False)
+    if chart.get_legend_handles_labels()[0]:
+        chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_KEYS, frameon=False, borderaxespad=0.2)
+
+
+def _sections(low: np.ndarray) -> np.ndarray:
+    """First index and the one behind the last of every run of true values: ``(runs, 2)``."""
+    return np.flatnonzero(np.diff(low.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+
+
+def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, longest: int) -> None:
+    """The left image around a part of a row, which is a dashed line."""
+    columns = last - first + 1
+    reach = max(1, round(columns / 26))
+    top, bottom = max(0, row - reach), min(results.region.height, row + reach + 1)
+    window = Window(top, first, bottom - top, columns)
+    image = results.read_small_left(window, fitting((window.height, window.width), longest))
+    low, high = limits(image, (0, 1))
+    extent = (first - 0.5, last + 0.5, bottom - 0.5, top - 0.5)
+    panel.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, aspect="auto", interpolation="nearest")
+    panel.axhline(row, color=ORANGE, lw=1.2, ls="--")
+    panel.set_facecolor(NOTHING)
+    panel.set_ylabel("row")
+    panel.yaxis.set_major_locator(MaxNLocator(2, integer=True, min_n_ticks=1))

@@ -1,0 +1,158 @@
+"""Maps of the results: the overview, and where intervals miss the truth."""
+
+from pathlib import Path
+from textwrap import fill
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kinds import KINDS, SKY, VERMILION, classify
+from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.products import INVALID
+from sat_intervals.results import Results
+
+_PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map: more pixels than its dots are thinned out
+_STRETCHED = 5.0  # ratio of sides beyond which a map's pixels are no longer square
+_EDGE = "#888888"
+
+
+def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
+    """Draw left image, disparity, interval width, confidence and validity side by side, read through overviews."""
+    shape = fitting(results.shape, round(_PANEL * dpi))
+    bands = results.read_small(shape)
+    valid = bands.validity & INVALID == 0
+    disparity = np.where(valid, bands.disparity, np.nan)
+    widths = np.where(valid, bands.upper - bands.lower, np.nan)
+    search = results.config.disparity
+    rows, columns = _arrangement(results.shape)
+    width, height = _inches(results.shape, _PANEL)
+    thinned = shape if shape != results.shape else None
+    with page(path, (columns * (width + 1.0), rows * (height + 0.6) + 0.3), dpi, _caption(results, thinned)) as figure:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        _draw_grey(panels[0], results, bands.image, limits(bands.image, (0, 1)))
+        fitted = limits(disparity, (search.minimum, search.maximum))
+        _draw_map(panels[1], results, disparity, ("Disparity", "px"), "viridis", fitted)
+        _draw_map(panels[2], results, widths, ("Interval width", "px"), "magma", (0, limits(widths, (0, 1))[1]))
+        _draw_map(panels[3], results, bands.confidence, ("Confidence", "0 to 1"), "cividis", (0, 1))
+        _draw_validity(panels[4], panels[5], results, bands.validity)
+
+
+def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
+    """Draw the left image with the valid pixels whose interval misses the truth in colour (the paper's figure 7).
+
+    Every pixel is judged; of large results every n-th row and column is drawn.
+    """
+    if results.truth is None:
+        raise SatIntervalsError(f"{results.out}: errors need a truth: give --truth")
+    step = max(1, -(-max(results.shape) // round(_LARGE * dpi)))
+    judged, missed = 0, np.zeros(2, np.int64)
+    images, kinds = [], []
+    for row, bands in results.strips():
+        valid = bands.validity & INVALID == 0
+        above, below = valid & (bands.truth > bands.upper), valid & (bands.truth < bands.lower)
+        judged += int((valid & np.isfinite(bands.truth) & np.isfinite(bands.lower)).sum())
+        missed += above.sum(), below.sum()
+        chosen = np.s_[-row % step :: step, ::step]
+        images.append(bands.image[chosen])
+        kinds.append(np.where(above, 0.0, np.where(below, 1.0, np.nan))[chosen])
+    width, height = _inches(results.shape, _LARGE)
+    image, kind = np.concatenate(images), np.concatenate(kinds)
+    low, high = limits(image, (0, 1))
+    title = _caption(results, None) + (f", one row and column in {step} shown" if step > 1 else "")
+    with page(path, (width + 0.9, height + 1.4), dpi, title) as figure:
+        panel = figure.subplots()
+        # Paler than the overview's: the colours are to be seen, not the white roofs.
+        _draw_grey(panel, results, image, (low - 0.3 * (high - low), high + 0.3 * (high - low)))
+        _show(panel, results, kind, cmap=ListedColormap([VERMILION, SKY]), vmin=0, vmax=1)
+        panel.set_title(_share_text(int(missed.sum()), judged))
+        texts = (f"truth above the interval: {missed[0]:,} px", f"truth below it: {missed[1]:,} px")
+        key = [Patch(facecolor=color, label=text) for color, text in zip((VERMILION, SKY), texts, strict=True)]
+        figure.legend(handles=key, loc="outside lower left", ncols=2, frameon=False)
+
+
+def _share_text(missed: int, judged: int) -> str:
+    if judged == 0:
+        return "No valid pixel has a known truth"
+    return f"The interval misses the truth at {100 * missed / judged:.1f} % of {judged:,} valid pixels"
+
+
+def _arrangement(shape: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of six panels on a page of a screen's shape."""
+    width, height = _inches(shape, 1.0)
+    rows = min((1, 2, 3, 6), key=lambda rows: abs(np.log(1.5 * rows * height / (6 // rows * width))))
+    return rows, 6 // rows
+
+
+def _inches(shape: tuple[int, int], longest: float) -> tuple[float, float]:
+    """Width and height of a map."""
+    tall = float(np.clip(shape[0] / shape[1], 1 / _STRETCHED, _STRETCHED))
+    width = min(longest, longest / tall)
+    return width, width * tall
+
+
+def _show(panel: Axes, results: Results, pixels: np.ndarray, **options: Any) -> AxesImage:
+    """A layer of the results, its axes in rows and columns of the results."""
+    height, width = results.shape
+    panel.set_facecolor(NOTHING)
+    panel.xaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
+    panel.yaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
+    panel.tick_params(labelsize=8, colors=INK)
+    extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+    aspect: Literal["equal", "auto"] = "equal" if max(height / width, width / height) <= _STRETCHED else "auto"
+    return panel.imshow(pixels, extent=extent, aspect=aspect, interpolation="nearest", **options)
+
+
+def _draw_grey(panel: Axes, results: Results, image: np.ndarray, shown: tuple[float, float]) -> None:
+    _show(panel, results, image, cmap="gray", vmin=shown[0], vmax=shown[1])
+    panel.set_title("Left image")
+    say_empty(panel, image, "no data")
+
+
+def _draw_map(
+    panel: Axes, results: Results, values: np.ndarray, name: tuple[str, str], colours: str, shown: tuple[float, float]
+) -> None:
+    """A layer, its title and unit in ``name``, with a colour bar; pointed ends tell of values beyond those shown."""
+    drawn = _show(panel, results, values, cmap=colours, vmin=shown[0], vmax=shown[1])
+    panel.set_title(name[0])
+    known = values[np.isfinite(values)]
+    beyond = bool((known < shown[0]).any()), bool((known > shown[1]).any())
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+    assert panel.figure is not None
+    bar = panel.figure.colorbar(drawn, ax=panel, extend=extend, shrink=0.9, aspect=25, pad=0.02)
+    bar.set_label(name[1])
+    bar.ax.tick_params(labelsize=8)
+    say_empty(panel, values, "no valid pixel")
+
+
+def _draw_validity(panel: Axes, key: Axes, results: Results, validity: np.ndarray) -> None:
+    """Why pixels are invalid, a colour for the first reason of each, with the shares of the pixels shown."""
+    places = classify(validity)
+    colours = ListedColormap([kind.colour for kind in KINDS])
+    _show(panel, results, places, cmap=colours, vmin=-0.5, vmax=len(KINDS) - 0.5)
+    panel.set_title("Validity")
+    shares = np.bincount(places.ravel(), minlength=len(KINDS)) / places.size
+    entries = [
+        (kind.colour, f"{kind.meaning} ({100 * share:.1f} %)")
+        for kind, share in zip(KINDS, shares, strict=True)
+        if share or kind.flag == 0
+    ]
+    entries.append((NOTHING, "in the other maps: no value"))
+    handles = [Patch(facecolor=colour, edgecolor=_EDGE, label=fill(text, 46)) for colour, text in entries]
+    key.axis("off")
+    key.legend(handles=handles, loc="upper left", frameon=False, title="Validity", alignment="left", borderaxespad=0)
+
+
+def _caption(results: Results, thinned: tuple[int, int] | None) -> str:
+    """What the results are of, and how far they are thinned out."""
+    height, width = results.shape
+    search, interval = results.config.disparity, results.config.interval
+    parts = [f"{height} x {width} pixels", f"disparities {search.minimum} to {search.maximum} px searched"]
+    parts += [f"alpha {interval.alpha}"] if interval else []
+    parts += [f"one of {height * width / (thinned[0] * thinned[1]):.3g} pixels shown"] if thinned else []
+    return f"{Path(results.left.path).name}: {', '.join(parts)}"

@@ -1,0 +1,117 @@
+"""A run before it is run: tiles, work, memory, disk, and the time it will take by a sample of it."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sat_intervals.cluster import available_cores
+from sat_intervals.config import Config, load_config
+from sat_intervals.job import checked_pair
+from sat_intervals.memory import PROCESS_BYTES, fitted, tile_bytes
+from sat_intervals.raster import Image
+from sat_intervals.run import match_pair
+from sat_intervals.tiling import Grid, Window
+
+# Side of the window at the centre of the image that is matched to tell the time.
+SAMPLE = 512
+# Bytes a pixel on the disk while a run goes on: raw products (8 to 12 as compressed), strips of the final bands, files.
+_STORE_BYTES, _STRIP_BYTES, _FILE_BYTES = 12, 18, 10
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will take.
+
+    Attributes
+    ----------
+    tile_size, tiles
+        Side of a core in pixels, as the memory allows, and number of tiles.
+    workers
+        Tiles in work at once.
+    extra_work
+        Share of the matching that goes to overlaps.
+    worker_bytes, total_bytes
+        Memory of one tile in work with its process, and of all of them in one process.
+    disk_bytes
+        Scratch and files in the folder of the run.
+    seconds
+        Expected, by the sample.
+    """
+
+    tile_size: int
+    tiles: int
+    workers: int
+    extra_work: float
+    worker_bytes: int
+    total_bytes: int
+    disk_bytes: int
+    seconds: float
+
+
+def plan(
+    left: str | Path | Image,
+    right: str | Path | Image,
+    config: Any,
+    *,
+    memory: int | None = None,
+    workers: int | None = None,
+) -> Plan:
+    """Say what matching a pair will take, before anything is submitted.
+
+    Parameters
+    ----------
+    left, right, config
+        As of `match_pair`.
+    memory
+        Bytes that a worker may take; the tile gets smaller where it must, the search range never.
+    workers
+        Tiles in work at once; by default those of the settings, or one a core.
+
+    Raises
+    ------
+    SatIntervalsError
+        What cannot be matched, and memory in which no tile fits, with the figures.
+    """
+    config = load_config(config)
+    if memory is not None:
+        config = fitted(config, memory)
+    left, right = checked_pair(left, right, config)
+    workers = workers or config.cluster.workers or available_cores()
+    whole = Window(0, 0, left.height, left.width)
+    grid = Grid(whole, config.tiles.size)
+    work = _work(grid, whole, config)
+    pixels = whole.height * whole.width
+    return Plan(
+        tile_size=config.tiles.size,
+        tiles=len(grid),
+        workers=workers,
+        extra_work=work / pixels - 1,
+        worker_bytes=PROCESS_BYTES + tile_bytes(config),
+        total_bytes=PROCESS_BYTES + workers * tile_bytes(config),
+        disk_bytes=pixels * (_STORE_BYTES + _STRIP_BYTES + _FILE_BYTES),
+        seconds=_expected_seconds(left, right, config, workers, work, whole),
+    )
+
+
+def _work(grid: Grid, image: Window, config: Config) -> int:
+    """Pixels that the two sweeps visit, on average of both: all of the patch but the rows behind its core."""
+    overlap = config.tiles.overlap
+    total = 0
+    for tile in grid:
+        patch = tile.core.grown(overlap, overlap).clipped(image)
+        total += patch.width * (tile.core.height + patch.height) // 2
+    return total
+
+
+def _expected_seconds(left: Image, right: Image, config: Config, workers: int, work: int, whole: Window) -> float:
+    """Seconds of a run: those of a sample, tiles scaled by their work, the rest by pixels."""
+    height, width = min(SAMPLE, whole.height), min(SAMPLE, whole.width)
+    sample = Window((whole.height - height) // 2, (whole.width - width) // 2, height, width)
+    one = config.model_copy(update={"cluster": config.cluster.model_copy(update={"kind": "threads", "workers": 1})})
+    with tempfile.TemporaryDirectory() as folder:
+        seconds = match_pair(left, right, Path(folder) / "sample", one, window=sample)["seconds"]
+    sampled = _work(Grid(sample, config.tiles.size), whole, config)
+    tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / sampled / workers
+    files = (seconds["bands"] + seconds["files"]) * (whole.height * whole.width) / (height * width)
+    return float(seconds["start"] + seconds["kernels"] + tiles + files)

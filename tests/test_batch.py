@@ -1,0 +1,167 @@
+"""Batches, plans and states of runs, through the library and the command."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from sat_intervals.batch import match_batch, read_batch
+from sat_intervals.cli import main
+from sat_intervals.config import ConfigError, load_config
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.memory import fitted, parse_bytes, tile_bytes
+from sat_intervals.plan import plan
+from sat_intervals.raster import north_up, write_layer
+from sat_intervals.run import match_pair
+from sat_intervals.scene import make_scene
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    for seed in (1, 2):
+        scene = make_scene(150, 200, seed=seed)
+        for side in ("left", "right"):
+            write_layer(folder / f"{side}{seed}.tif", getattr(scene, side), 0, north_up(32631, 0, 0, 0.5))
+    return folder
+
+
+def rows(folder, *, broken=False):
+    lines = ["name,left,right,minimum,maximum,sgm.p2"]
+    lines += [f"pair{seed},left{seed}.tif,right{seed}.tif,-18,40,{24 + seed}" for seed in (1, 2)]
+    if broken:
+        lines.insert(1, "broken,left1.tif,nowhere.tif,-18,40,")
+    (folder / "pairs.csv").write_text("\n".join(lines) + "\n")
+    return folder / "pairs.csv"
+
+
+def bytes_of(folder):
+    return [(folder / name).read_bytes() for name in ("intervals.tif", "validity.tif")]
+
+
+def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
+    report = match_batch(read_batch(rows(images)), tmp_path / "batch", {"tiles": {"size": 64}})
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "done", "pair2": "done"}
+    for seed in (1, 2):
+        settings = {"disparity": {"minimum": -18, "maximum": 40}, "sgm": {"p2": 24 + seed}, "tiles": {"size": 64}}
+        match_pair(images / f"left{seed}.tif", images / f"right{seed}.tif", tmp_path / f"alone{seed}", settings)
+        assert bytes_of(tmp_path / "batch" / f"pair{seed}") == bytes_of(tmp_path / f"alone{seed}")
+        assert not (tmp_path / "batch" / f"pair{seed}" / "tiles").exists()
+
+
+def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(images, tmp_path):
+    arguments = ["batch", str(rows(images, broken=True)), str(tmp_path / "out"), "--tile-size", "64"]
+    first = CliRunner().invoke(main, arguments)
+    assert first.exit_code == 1
+    assert "1 of 3 pairs failed" in first.stderr
+    assert "nowhere.tif" in first.stderr
+    written = (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns
+    rows(images)
+    second = CliRunner().invoke(main, arguments)
+    assert second.exit_code == 0
+    assert (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns == written
+    report = json.loads((tmp_path / "out" / "batch.json").read_text())
+    assert {end["state"] for end in report.values()} == {"done before"}
+
+
+def test_match_batch__never_takes_another_run_for_its_own(images, tmp_path):
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path)
+    report = match_batch(pairs, tmp_path, {"median": None})
+    assert {end["state"] for end in report.values()} == {"failed"}
+    assert "already holds a run" in report["pair1"]["error"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "problem"),
+    [
+        ("a.csv", "name,left\nx,l.tif\n", "row 1 lacks right"),
+        ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "2 pairs are called x"),
+        ("a.csv", "name,left,right\nx,l,r,1\n", "more values than columns"),
+        ("a.csv", "name,left,right\n../x,l,r\n", "no name of a folder"),
+        ("a.yaml", "just: text\n", "holds no pairs"),
+        ("a.yaml", "- [", "cannot be read"),
+        ("a.json", "[]", "holds no pairs"),
+    ],
+)
+def test_read_batch__says_what_is_wrong(tmp_path, name, text, problem):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(SatIntervalsError, match=problem) as caught:
+        read_batch(tmp_path / name)
+    assert name in str(caught.value)
+
+
+def test_read_batch__reads_the_same_pairs_from_every_kind_of_file(tmp_path):
+    row = {"name": "a", "left": "l.tif", "right": "https://host/r.tif", "minimum": -3, "sgm": {"p1": 7}, "median": None}
+    (tmp_path / "b.json").write_text(json.dumps([row]))
+    (tmp_path / "b.yaml").write_text("- {name: a, left: l.tif, right: 'https://host/r.tif', minimum: -3, sgm.p1: 7}\n")
+    (tmp_path / "b.csv").write_text("name,left,right,minimum,sgm.p1\na,l.tif,https://host/r.tif,-3,7\n")
+    batches = [read_batch(tmp_path / f"b.{ending}") for ending in ("json", "yaml", "csv")]
+    assert batches[0] == batches[1] == batches[2]
+    pair = batches[0][0]
+    assert (pair.left, pair.right) == (str(tmp_path / "l.tif"), "https://host/r.tif")
+    assert pair.settings == {"disparity": {"minimum": -3}, "sgm": {"p1": 7}}
+
+
+SETTINGS = load_config({"disparity": {"minimum": -31, "maximum": 32}})
+
+
+def test_fitted__takes_the_largest_tile_that_fits():
+    for memory in (10**9, 5 * 10**8, 4 * 10**8):
+        size = fitted(SETTINGS, memory).tiles.size
+        base = fitted(SETTINGS, 10**10).tiles.size
+        assert size <= base == SETTINGS.tiles.size
+        assert tile_bytes(SETTINGS, size) < memory
+        assert size == base or tile_bytes(SETTINGS, size + 64) > memory - 3 * 10**8
+    with pytest.raises(ConfigError, match=r"need .* MB, given are 300 MB"):
+        fitted(SETTINGS, 3 * 10**8)
+
+
+@pytest.mark.parametrize(
+    ("text", "count"), [("4GB", 4 * 10**9), ("512 MiB", 2**29), ("3e9", 3 * 10**9), ("1.5g", 15 * 10**8)]
+)
+def test_parse_bytes__reads_figures_with_units(text, count):
+    assert parse_bytes(text) == count
+
+
+@pytest.mark.parametrize("text", ["much", "4 bananas", "", "GB"])
+def test_parse_bytes__refuses_what_is_none(text):
+    with pytest.raises(ConfigError, match="such as 4GB"):
+        parse_bytes(text)
+
+
+def test_plan__counts_tiles_and_the_work_of_overlaps(images):
+    config = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64, "overlap": 10}}
+    made = plan(images / "left1.tif", images / "right1.tif", config, workers=2)
+    # 150 x 200 px: 3 x 4 tiles; a patch is as wide as core and overlaps, its sweeps see half of the rows behind it
+    widths, heights = [74, 84, 82, 18], [64 + 5, 64 + 10, 22 + 5]
+    assert made.tiles == 12
+    assert made.extra_work == pytest.approx(sum(widths) * sum(heights) / (150 * 200) - 1)
+    assert made.seconds > 0
+
+
+def test_plan__prints_what_a_run_will_take(images):
+    pair = [str(images / "left1.tif"), str(images / "right1.tif"), "--disparity", "-18", "40"]
+    result = CliRunner().invoke(main, ["plan", *pair, "--memory", "400MB", "--workers", "3"])
+    assert result.exit_code == 0, result.stderr
+    assert "expected time with 3 workers" in result.stdout
+    assert "smaller than set, to fit" in result.stdout
+    refused = CliRunner().invoke(main, ["plan", *pair, "--memory", "100MB"])
+    assert refused.exit_code == 2
+    assert "given are 100 MB" in refused.stderr
+
+
+def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
+    out = tmp_path / "out"
+    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
+    assert CliRunner().invoke(main, ["status", str(out)]).exit_code == 2
+    match_pair(images / "left1.tif", images / "right1.tif", out, settings, keep_tiles=True)
+    assert CliRunner().invoke(main, ["status", str(out)]).stdout == f"{out}: complete\n"
+    (out / "run.json").unlink()
+    (out / "tiles" / "records" / "0_1.json").unlink()
+    (out / "tiles" / "records" / "1_1.json").unlink()
+    Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
+    result = CliRunner().invoke(main, ["status", str(out)])
+    assert "10 of 12 tiles done, 1 failed, 1 left; no run is at work" in result.stdout
+    assert "tile 0_1: no more disk" in result.stdout
