@@ -6,7 +6,7 @@ EXTRAS ?= test,lint,plot
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test lint pictures clean
+.PHONY: demo test lint bench pictures clean
 
 demo: $(READY)
 	$(BIN)/sat-intervals demo demo-out --overwrite
@@ -19,6 +19,11 @@ lint: $(READY)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m pytest --quiet tests/test_architecture.py
+
+# The table of README.md: this project beside its peers; about half an hour.
+bench: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	$(BIN)/python tests/benchmarks/table.py
 
 # Those of README.md; 256 colours keep them small.
 pictures: $(READY)

@@ -1,0 +1,145 @@
+"""The table of `make bench`: this project, Pandora with libSGM and OpenCV on the same pair, in one run, with ratios.
+
+Everything is measured in processes of their own, one after another, on one pinned core unless two workers are said;
+of five runs after one that is not counted the median is given. Figures of another machine mean little: ratios do.
+"""
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import rasterio
+from candidates import make_pair, search_range
+
+HERE = Path(__file__).parent
+CORES = sorted(os.sched_getaffinity(0))
+RUNS = 5
+
+
+def run(command, cores, environment=None):
+    """Seconds, and peak memory of the largest process in MB, of a command; and what it printed."""
+    started = time.perf_counter()
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | (environment or {}),
+        preexec_fn=lambda: os.sched_setaffinity(0, cores),
+    )
+    printed = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"failed with status {process.returncode}: {' '.join(map(str, command))}")
+    return time.perf_counter() - started, usage.ru_maxrss / 1024, printed
+
+
+def candidate(name, size, disparities, runs=RUNS):
+    """Median seconds and peak memory of one candidate on one core."""
+    command = [sys.executable, HERE / "candidates.py", name, size, size, disparities, runs]
+    _, _, printed = run([str(part) for part in command], CORES[:1])
+    result = json.loads(printed.splitlines()[-1])
+    return statistics.median(result["seconds"]), result["megabytes"]
+
+
+def write_pair(folder, size):
+    """A pair of ``size x size`` pixels as GeoTIFFs."""
+    paths = []
+    for side, image in zip(("left", "right"), make_pair(size, size), strict=True):
+        paths.append(folder / f"{side}{size}.tif")
+        kind = {"height": size, "width": size, "count": 1, "dtype": "uint16", "nodata": 0, "tiled": True}
+        with rasterio.open(paths[-1], "w", driver="GTiff", crs="EPSG:32631", **kind) as file:
+            file.write(image, 1)
+    return paths
+
+
+def match(pair, out, workers, disparities=64, environment=None):
+    """Seconds, peak memory in MB and run.json of a whole `sat-intervals match`."""
+    ends = map(str, search_range(disparities))
+    command = [Path(sys.executable).with_name("sat-intervals"), "match", *pair, out, "--disparity", *ends, "--quiet"]
+    command += ["--overwrite", "--workers", workers]
+    seconds, memory, _ = run([str(part) for part in command], CORES[:workers], environment)
+    return seconds, memory, json.loads((out / "run.json").read_text())
+
+
+def row(*cells):
+    """Print a row of the table."""
+    print("| " + " | ".join(str(cell) for cell in cells) + " |", flush=True)
+
+
+def in_memory():
+    """The chain in memory beside its peers, and its growth with size and disparities."""
+    row("in memory, one core", "this project", "Pandora + libSGM", "OpenCV MODE_HH", "ratio to Pandora", "to OpenCV")
+    row(*["---"] * 6)
+    for size, disparities in ((1000, 64), (1000, 32), (1000, 128), (1000, 256), (2000, 64), (4000, 64)):
+        # Pandora's volume of 4000 x 4000 x 64 does not fit in 24 GB, and its chain takes minutes at 256 disparities
+        names = ["ours", "opencv"] + (["pandora"] if size * size * disparities <= 3e8 and disparities <= 128 else [])
+        small = size * disparities <= 64000
+        runs = {"ours": RUNS, "opencv": RUNS, "pandora": RUNS if small else 1}
+        seconds, memory = {}, {}
+        for name in names:
+            seconds[name], memory[name] = candidate(name, size, disparities, runs[name])
+        shown = {name: f"{seconds[name]:.2f} s, {memory[name]:.0f} MB" for name in names}
+        times = f"{seconds['pandora'] / seconds['ours']:.0f}x faster" if "pandora" in seconds else "-"
+        if "pandora" in memory:
+            times += f", memory 1/{memory['pandora'] / memory['ours']:.1f}"
+        row(
+            f"{size} x {size} x {disparities}",
+            shown["ours"],
+            shown.get("pandora", "-"),
+            shown["opencv"],
+            times,
+            f"{seconds['opencv'] / seconds['ours']:.2f}x",
+        )
+
+
+def file_to_file(folder):
+    """Whole runs of the command: workers, growth, what tiling and files add, starting up."""
+    print()
+    row("files to files, 64 disparities", "figure")
+    row("---", "---")
+    pairs = {size: write_pair(folder, size) for size in (400, 2000, 4000, 8000)}
+    cold = {"NUMBA_CACHE_DIR": str(folder / "cache")}
+    first = match(pairs[400], folder / "out", 1, environment=cold)[0]
+    row("first run ever (kernels compiled), 400 x 400", f"{first:.1f} s")
+    row("the same again", f"{statistics.median(match(pairs[400], folder / 'out', 1)[0] for _ in range(RUNS)):.1f} s")
+    helps = [run([str(Path(sys.executable).with_name("sat-intervals")), "--help"], CORES[:1])[0] for _ in range(RUNS)]
+    row("`sat-intervals --help`", f"{statistics.median(helps):.2f} s")
+    one = [match(pairs[4000], folder / "out", 1) for _ in range(3)]
+    two = [match(pairs[4000], folder / "out", 2) for _ in range(3)] if len(CORES) > 1 else []
+    seconds = statistics.median(run[0] for run in one)
+    row("4000 x 4000, one worker on one core", f"{seconds:.1f} s, {one[0][1]:.0f} MB")
+    if two:
+        faster = seconds / statistics.median(run[0] for run in two)
+        row("two workers on two cores against one", f"{faster:.2f} times faster, {two[0][1]:.0f} MB")
+    stages = one[0][2]["seconds"]
+    row("its stages", ", ".join(f"{stage} {stages[stage]:.1f} s" for stage in stages if stage != "total"))
+    kernels = stages["tiles.match"]
+    row("what reading, store, strips and files add to matching", f"{100 * (seconds / kernels - 1):.0f} %")
+    row("finishing rows", f"{16 / stages['bands']:.0f} Mpx/s")
+    small, large = match(pairs[2000], folder / "out", 1), match(pairs[8000], folder / "out", 1)
+    row("cost a pixel, 8000 x 8000 against 2000 x 2000", f"{large[0] / small[0] / 16:.2f}")
+    row("peak memory, the same", f"{large[1] / small[1]:.2f} ({small[1]:.0f} and {large[1]:.0f} MB)")
+
+
+def main():
+    """Print the table."""
+    cpu = next(
+        (line.split(":")[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")),
+        platform.processor(),
+    )
+    print(f"{cpu}, {len(CORES)} cores, {datetime.now(UTC):%Y-%m-%d}, Python {platform.python_version()}\n")
+    in_memory()
+    with tempfile.TemporaryDirectory() as folder:
+        file_to_file(Path(folder))
+
+
+if __name__ == "__main__":
+    main()
