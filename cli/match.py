@@ -72,6 +72,7 @@ def overrides(
 @click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image.")
 @click.option("--band", type=int, metavar="N", help="Band to match, where an image has several.")
 @click.option("--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match.")
+@click.option("--dry-run", is_flag=True, help="Print the job script of the cluster, submit and match nothing.")
 @run_options
 def match(
     left: str,
@@ -85,6 +86,7 @@ def match(
     right_nodata: float | None,
     band: int | None,
     window: tuple[int, int, int, int] | None,
+    dry_run: bool,
     config_file: Path | None,
     tile_size: int | None,
     overlap: int | None,
@@ -108,6 +110,11 @@ def match(
     from sat_intervals.tiling import Window
 
     config = load_config(config_file, overrides(disparity, tile_size, overlap, workers, cluster))
+    if dry_run:
+        from sat_intervals.cluster import job_script
+
+        click.echo(job_script(config.cluster))
+        return
     with Console(quiet) as console:
         from sat_intervals.raster import open_image
         from sat_intervals.run import match_pair

@@ -132,7 +132,7 @@ def file_to_file(folder):
 def main():
     """Print the table."""
     cpu = next(
-        (line.split(":")[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")),
+        (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")),
         platform.processor(),
     )
     print(f"{cpu}, {len(CORES)} cores, {datetime.now(UTC):%Y-%m-%d}, Python {platform.python_version()}\n")
