@@ -159,15 +159,15 @@ class CrossCheck(Section):
 class Median(Section):
     """Median filter on disparity and bounds, over kept pixels (paper, eq. 10 and 11)."""
 
-    size: Odd = Field(3, ge=3, description="side of the square window, in pixels")
+    size: Odd = Field(3, ge=3, le=11, description="side of the square window, in pixels")
 
 
 class Regularization(Section):
     """Intervals of low-confidence pixels from quantiles of the bounds around them."""
 
     threshold: float = Field(0.6, ge=0, le=1, description="confidence up to this is low")
-    kernel: Odd = Field(5, ge=1, description="pixels along the row whose least confidence counts")
-    depth: int = Field(2, ge=0, description="rows reached up and down through touching segments")
+    kernel: Odd = Field(5, ge=1, le=101, description="pixels along the row whose least confidence counts")
+    depth: int = Field(2, ge=0, le=16, description="rows reached up and down through touching segments")
     quantile: float = Field(0.9, ge=0.5, le=1, description="quantile of upper bounds, 1 - quantile of lower ones")
 
 

@@ -230,10 +230,10 @@ REFUSED = [
     ("refinement", {"method": "quadratic"}, "refinement.method is 'quadratic', allowed: vfit"),
     ("cross_check", {"method": "slow"}, "cross_check.method is 'slow', allowed: fast or accurate"),
     ("cross_check", {"tolerance": -1}, "cross_check.tolerance is -1, allowed: integer >= 0"),
-    ("median", {"size": 2}, "median.size is 2, allowed: integer >= 3, odd"),
-    ("median", {"size": 1}, "median.size is 1, allowed: integer >= 3, odd"),
+    ("median", {"size": 2}, "median.size is 2, allowed: integer >= 3, <= 11, odd"),
+    ("median", {"size": 1}, "median.size is 1, allowed: integer >= 3, <= 11, odd"),
     ("regularization", {"threshold": 1.5}, "regularization.threshold is 1.5, allowed: number >= 0, <= 1"),
-    ("regularization", {"kernel": 4}, "regularization.kernel is 4, allowed: integer >= 1, odd"),
+    ("regularization", {"kernel": 4}, "regularization.kernel is 4, allowed: integer >= 1, <= 101, odd"),
     ("regularization", {"depth": -1}, "regularization.depth is -1, allowed: integer >= 0"),
     ("regularization", {"quantile": 0.4}, "regularization.quantile is 0.4, allowed: number >= 0.5, <= 1"),
     ("tiles", {"size": 100}, "tiles.size is 100, allowed: integer >= 64, multiple of 64"),
@@ -276,7 +276,7 @@ def test_load_config__missing_search_range_is_named() -> None:
 
 def test_load_config__tells_several_errors_in_one_line() -> None:
     assert message(RANGE | {"tiles": {"size": 1}, "median": {"size": 2}}) == (
-        "median.size is 2, allowed: integer >= 3, odd; tiles.size is 1, allowed: integer >= 64, multiple of 64"
+        "median.size is 2, allowed: integer >= 3, <= 11, odd; tiles.size is 1, allowed: integer >= 64, multiple of 64"
     )
 
 
