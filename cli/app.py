@@ -31,8 +31,11 @@ class _Commands(click.Group):
         try:
             with armed():
                 return super().invoke(context)
-        except (click.ClickException, click.exceptions.Exit):
+        except click.exceptions.Exit:
             raise
+        except click.UsageError as error:
+            where = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
+            return _end(USER_ERROR, f"{error.format_message()}{where}")
         except Ended as ended:
             resumed = context.invoked_subcommand in RESUMED
             again = "; the same command goes on from the tiles that are done" if resumed else ""
@@ -50,6 +53,8 @@ def _explained(error: Exception) -> tuple[int, str]:
         return FAILED, str(error)
     if isinstance(error, SatIntervalsError):
         return USER_ERROR, str(error)
+    if "no locator available" in str(error):  # numba, of a read-only installation without a home
+        return USER_ERROR, "no folder for compiled kernels can be written: name one in NUMBA_CACHE_DIR"
     if isinstance(error, OSError) and error.strerror:
         return FAILED, f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, MemoryError):

@@ -5,11 +5,11 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.match import overrides, run_options
+from sat_intervals.cli.match import overrides, path, run_options
 
 
 @click.command(short_help="Make a scene of known truth, match it, compare.")
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", callback=path)
 @click.option("--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True)
 @click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another scene.")
 @run_options  # type: ignore[untyped-decorator]

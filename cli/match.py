@@ -6,7 +6,21 @@ from typing import Any
 
 import click
 
-_FILE = click.Path(path_type=Path)
+
+def named(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+    """Refuse names that the shell makes of a variable that is not set, and those that GDAL cannot be told."""
+    if value == "":
+        raise click.BadParameter("it is empty: name a file or folder")
+    try:
+        (value or "").encode()
+    except UnicodeEncodeError as error:
+        raise click.BadParameter(f"{value!r} is no UTF-8: rename it") from error
+    return value
+
+
+def path(context: click.Context, parameter: click.Parameter, value: str | None) -> Path | None:
+    """Make a path of a name: one of an empty name would be the current folder."""
+    return None if value is None else Path(str(named(context, parameter, value)))
 
 
 def _debug(context: click.Context, parameter: click.Parameter, value: bool) -> None:
@@ -16,7 +30,9 @@ def _debug(context: click.Context, parameter: click.Parameter, value: bool) -> N
 def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of every command that matches a pair."""
     options = [
-        click.option("--config", "config_file", type=_FILE, help="Settings (YAML); the command line wins."),
+        click.option(
+            "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
+        ),
         click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
         click.option("--overlap", type=int, help="Pixels read around a core."),
         click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
@@ -61,12 +77,12 @@ def overrides(
 
 
 @click.command(short_help="Match a pair: disparity, interval, confidence, validity.")
-@click.argument("left", type=str)
-@click.argument("right", type=str)
-@click.argument("out", type=_FILE)
+@click.argument("left", callback=named)
+@click.argument("right", callback=named)
+@click.argument("out", callback=path)
 @click.option("--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched.")
-@click.option("--left-mask", type=str, metavar="FILE", help="Left pixels to leave out: non-zero = masked.")
-@click.option("--right-mask", type=str, metavar="FILE", help="Right pixels to leave out.")
+@click.option("--left-mask", callback=named, metavar="FILE", help="Left pixels to leave out: non-zero = masked.")
+@click.option("--right-mask", callback=named, metavar="FILE", help="Right pixels to leave out.")
 @click.option("--nodata", type=float, metavar="V", help="No-data value of both images, in place of their own.")
 @click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image.")
 @click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image.")
@@ -109,6 +125,8 @@ def match(
     from sat_intervals.config import load_config
     from sat_intervals.tiling import Window
 
+    if disparity is None and config_file is None:
+        raise click.UsageError("Missing search range: give --disparity MIN MAX, or a --config with it.")
     config = load_config(config_file, overrides(disparity, tile_size, overlap, workers, cluster))
     if dry_run:
         from sat_intervals.cluster import job_script

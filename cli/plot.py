@@ -22,7 +22,7 @@ def plot(
     pixel: tuple[int, int] | None,
     dpi: int,
 ) -> None:
-    r"""Draw pictures of the finished run in the folder OUT, next to its files.
+    """Draw pictures of the finished run in the folder OUT, next to its files.
 
     \b
     OUT/overview.png   always: left image, disparity, interval width, confidence, validity
@@ -32,7 +32,7 @@ def plot(
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
-    """
+    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
     from sat_intervals.results import open_results

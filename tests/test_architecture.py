@@ -17,13 +17,13 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"cli"},
     {"batch", "plan"},
-    {"run", "in_memory", "ablation"},
+    {"run", "in_memory", "ablation", "pictures", "report"},
     {"conclude"},
     {"tile"},
     {"job"},
-    {"finish", "patch", "demo", "evaluation"},
+    {"finish", "patch", "demo", "evaluation", "results"},
     {"store", "raster", "cluster", "memory", "seams", "summary"},
-    {"config", "kernels", "scene", "inputs", "figures", "pairs", "tables"},
+    {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
     {"tiling", "products", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -35,6 +35,7 @@ HOMES = {
     "dask_jobqueue": {"cluster"},
     "distributed": {"cluster", "run"},
     "llvmlite": {"kernels"},
+    "matplotlib": {"pictures"},
     "numba": {"kernels"},
     "pyproj": {"raster"},
     "rasterio": {"raster"},

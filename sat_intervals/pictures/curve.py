@@ -44,9 +44,7 @@ class Curve(NamedTuple):
 
 
 def read_curve(results: Results, row: int, column: int) -> Curve:
-    """Match a pixel again with the run's overlap around it.
-
-    The run itself saw further, the whole tile: beyond the overlap, what is left of SGM's memory differs a little.
+    """Match a pixel again with the run's overlap around it: SGM's memory beyond that makes a little difference.
 
     Parameters
     ----------

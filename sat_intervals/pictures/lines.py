@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from sat_intervals.curve import Curve, read_curve
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kinds import BLUE, ORANGE, SKY, VERMILION
 from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.pictures.curve import Curve, read_curve
 from sat_intervals.products import INVALID
 from sat_intervals.results import Bands, Results
 from sat_intervals.tiling import Window
@@ -37,24 +37,25 @@ def draw_profile(
     if first > last:
         raise SatIntervalsError(f"columns {first} to {last} are the wrong way round: give the first one first")
     bands = results.read(Window(row, 0, 1, results.region.width))
-    low = bands.low(results.config)[0, first : last + 1]
     valid = bands.validity & INVALID == 0
     lines = [np.where(valid, band, np.nan) for band in (bands.lower, bands.upper, bands.disparity)]
     # A pixel is a step, seen even when its neighbours are not valid.
-    lower, upper, disparity, truth = (np.repeat(line[0, first : last + 1], 2) for line in (*lines, bands.truth))
+    lines += [bands.truth, bands.low(results.config)]
+    lower, upper, disparity, truth, low = (np.repeat(line[0, first : last + 1], 2) for line in lines)
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
     title = f"Row {row}, columns {first} to {last}; where there is no band, no pixel is valid"
     with page(path, (_WIDTH, 5.4), dpi, title) as figure:
         strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
         _draw_strip(strip, results, row, first, last, round(_WIDTH * dpi))
-        for number, (start, stop) in enumerate(_sections(low)):
-            label = None if number else "low confidence"
-            chart.axvspan(first + start - 0.5, first + stop - 0.5, color=_LOW, lw=0, label=label)
+        if low.any():
+            over = chart.get_xaxis_transform()
+            chart.fill_between(edges, 0, 1, where=low, transform=over, color=_LOW, lw=0, label="low confidence")
         chart.fill_between(edges, lower, upper, color=SKY, alpha=0.7, lw=0.8, label="interval")
         if np.isfinite(truth).any():
             chart.plot(edges, truth, color=VERMILION, lw=1.2, label="truth")
         chart.plot(edges, disparity, color="black", lw=0.9, label="disparity")
         _finish_chart(chart, "column", "disparity (px)", (first - 0.5, last + 0.5))
+        chart.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         if not np.isfinite(disparity).any():
             search = results.config.disparity
             chart.set_ylim(search.minimum - 0.5, search.maximum + 0.5)
@@ -122,11 +123,6 @@ def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] 
     chart.spines[["top", "right"]].set_visible(False)
     if chart.get_legend_handles_labels()[0]:
         chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_KEYS, frameon=False, borderaxespad=0.2)
-
-
-def _sections(low: np.ndarray) -> np.ndarray:
-    """First index and the one behind the last of every run of true values: ``(runs, 2)``."""
-    return np.flatnonzero(np.diff(low.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
 
 
 def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, longest: int) -> None:

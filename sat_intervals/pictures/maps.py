@@ -18,22 +18,25 @@ from sat_intervals.products import INVALID
 from sat_intervals.results import Results
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map: more pixels than its dots are thinned out
+_TEXT = 7.5  # inches that the words over a map take
 _STRETCHED = 5.0  # ratio of sides beyond which a map's pixels are no longer square
 _EDGE = "#888888"
 
 
 def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
     """Draw left image, disparity, interval width, confidence and validity side by side, read through overviews."""
-    shape = fitting(results.shape, round(_PANEL * dpi))
+    rows, columns = _arrangement(results.shape)
+    longest = _PANEL if columns > 1 else _LARGE
+    shape = fitting(results.shape, round(longest * dpi))
     bands = results.read_small(shape)
     valid = bands.validity & INVALID == 0
     disparity = np.where(valid, bands.disparity, np.nan)
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
     search = results.config.disparity
-    rows, columns = _arrangement(results.shape)
-    width, height = _inches(results.shape, _PANEL)
+    width, height = _inches(results.shape, longest)
     thinned = shape if shape != results.shape else None
-    with page(path, (columns * (width + 1.0), rows * (height + 0.6) + 0.3), dpi, _caption(results, thinned)) as figure:
+    size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
+    with page(path, size, dpi, _caption(results, thinned)) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         _draw_grey(panels[0], results, bands.image, limits(bands.image, (0, 1)))
         fitted = limits(disparity, (search.minimum, search.maximum))
@@ -65,7 +68,7 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
     image, kind = np.concatenate(images), np.concatenate(kinds)
     low, high = limits(image, (0, 1))
     title = _caption(results, None) + (f", one row and column in {step} shown" if step > 1 else "")
-    with page(path, (width + 0.9, height + 1.4), dpi, title) as figure:
+    with page(path, (max(_TEXT, width + 0.9), height + 1.4), dpi, title) as figure:
         panel = figure.subplots()
         # Paler than the overview's: the colours are to be seen, not the white roofs.
         _draw_grey(panel, results, image, (low - 0.3 * (high - low), high + 0.3 * (high - low)))
@@ -127,7 +130,7 @@ def _draw_map(
     bar = panel.figure.colorbar(drawn, ax=panel, extend=extend, shrink=0.9, aspect=25, pad=0.02)
     bar.set_label(name[1])
     bar.ax.tick_params(labelsize=8)
-    say_empty(panel, values, "no valid pixel")
+    say_empty(panel, values, "no value")
 
 
 def _draw_validity(panel: Axes, key: Axes, results: Results, validity: np.ndarray) -> None:
@@ -138,7 +141,7 @@ def _draw_validity(panel: Axes, key: Axes, results: Results, validity: np.ndarra
     panel.set_title("Validity")
     shares = np.bincount(places.ravel(), minlength=len(KINDS)) / places.size
     entries = [
-        (kind.colour, f"{kind.meaning} ({100 * share:.1f} %)")
+        (kind.colour, f"{kind.meaning} ({100 * share:.1f}\u00a0%)")
         for kind, share in zip(KINDS, shares, strict=True)
         if share or kind.flag == 0
     ]
@@ -154,5 +157,7 @@ def _caption(results: Results, thinned: tuple[int, int] | None) -> str:
     search, interval = results.config.disparity, results.config.interval
     parts = [f"{height} x {width} pixels", f"disparities {search.minimum} to {search.maximum} px searched"]
     parts += [f"alpha {interval.alpha}"] if interval else []
-    parts += [f"one of {height * width / (thinned[0] * thinned[1]):.3g} pixels shown"] if thinned else []
+    if thinned:
+        ratio = height * width / (thinned[0] * thinned[1])
+        parts.append(f"one pixel in {ratio:,.{0 if ratio >= 10 else 1}f} shown")
     return f"{Path(results.left.path).name}: {', '.join(parts)}"

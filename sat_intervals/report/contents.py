@@ -1,0 +1,112 @@
+"""What the page shows of the pixels: counts of all of them, and some rows and columns themselves."""
+
+import base64
+import gzip
+import math
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.kinds import FIRST_INVALID, KINDS, classify
+from sat_intervals.results import Bands, Results
+
+_PIXELS = 500_000  # on the page, at 5 to 8 bytes each once compressed and written as text
+_WIDTH_BARS, _CONFIDENCE_BARS = 60, 25
+_STEPS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # pixels of disparity that a bar of widths may stand for
+_FINEST = 1 / 64  # pixels of disparity
+
+
+class Counts:
+    """Histograms of interval width and of confidence over all pixels, gathered strip by strip."""
+
+    def __init__(self, count: int) -> None:
+        """``count``: number of disparities searched."""
+        self._step = next(step for step in _STEPS if count / step <= _WIDTH_BARS or step == _STEPS[-1])
+        bars = math.ceil(count / self._step)
+        self._widths = {name: np.zeros(bars, np.int64) for name in ("high", "low")}
+        self._confidences = {name: np.zeros(_CONFIDENCE_BARS, np.int64) for name in ("valid", "rejected")}
+
+    def add(self, bands: Bands, low: np.ndarray) -> None:
+        """Count the pixels of some rows; ``low`` are those of low confidence."""
+        valid = classify(bands.validity) < FIRST_INVALID
+        width = bands.upper - bands.lower
+        measured = valid & np.isfinite(width)
+        for name, chosen in (("high", measured & ~low), ("low", measured & low)):
+            _count(width[chosen] / self._step, self._widths[name])
+        known = np.isfinite(bands.confidence)
+        for name, chosen in (("valid", known & valid), ("rejected", known & ~valid)):
+            _count(bands.confidence[chosen] * _CONFIDENCE_BARS, self._confidences[name])
+
+    def report(self) -> dict[str, Any]:
+        """Counts in bars of ``step``, the first of which begins at 0; the last has whatever lies beyond, too."""
+        widths = {name: bars.tolist() for name, bars in self._widths.items()}
+        confidences = {name: bars.tolist() for name, bars in self._confidences.items()}
+        return {
+            "width": {"step": self._step, "bars": widths},
+            "confidence": {"step": 1 / _CONFIDENCE_BARS, "bars": confidences},
+        }
+
+
+def _count(places: np.ndarray, bars: np.ndarray) -> None:
+    bars += np.bincount(np.clip(places, 0, bars.size - 1).astype(np.int64), minlength=bars.size)
+
+
+class Pixels:
+    """Every n-th row and column of a run, as the page draws them."""
+
+    def __init__(self, results: Results) -> None:
+        height, width = results.shape
+        self._step = max(1, math.ceil(math.sqrt(height * width / _PIXELS)))
+        self._search = results.config.disparity
+        self._strips: list[list[np.ndarray]] = []
+
+    def add(self, row: int, bands: Bands, low: np.ndarray) -> None:
+        """Keep some pixels of the rows from ``row`` on; ``low`` are those of low confidence."""
+        chosen = np.s_[-row % self._step :: self._step, :: self._step]
+        self._strips.append([band[chosen].copy() for band in (*bands, low)])
+
+    def report(self) -> dict[str, Any]:
+        """Layers of codes: the value of a code is ``first + code * step``, and the largest code stands for none."""
+        *layers, low = (np.concatenate(strips) for strips in zip(*self._strips, strict=True))
+        bands = Bands(*layers)
+        kind = classify(bands.validity)
+        valid = kind < FIRST_INVALID
+        missed = np.where(bands.truth > bands.upper, 1, np.where(bands.truth < bands.lower, 2, 0))
+        disparities = {name: np.where(valid, getattr(bands, name), np.nan) for name in ("disparity", "lower", "upper")}
+        if np.isfinite(bands.truth).any():
+            disparities["truth"] = bands.truth
+        # Room for a truth outside the search range, by as much again on either side.
+        first = self._search.minimum - self._search.count
+        step = max(_FINEST, 3 * self._search.count / 65534)
+        black, white = _ends(bands.image)
+        return {
+            "step": self._step,
+            "rows": kind.shape[0],
+            "columns": kind.shape[1],
+            "layers": {
+                **{name: _coded(values, first, step, "<u2") for name, values in disparities.items()},
+                "image": _coded(bands.image, black, (white - black) / 254, "u1"),
+                "confidence": _coded(bands.confidence, 0, 1 / 250, "u1"),
+                "kind": _coded(kind, 0, 1, "u1"),
+                "low": _coded(low, 0, 1, "u1"),
+                "missed": _coded(np.where(valid, missed, 0), 0, 1, "u1"),
+            },
+            "kinds": [{"colour": each.colour, "meaning": each.meaning} for each in KINDS],
+        }
+
+
+def _ends(image: np.ndarray) -> tuple[float, float]:
+    """Grey values that become black and white: all but the outermost hundredths lie between them."""
+    known = image[np.isfinite(image)]
+    if known.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(known, (1, 99))
+    return float(low), float(high) if high > low else float(low) + 1.0
+
+
+def _coded(values: np.ndarray, first: float, step: float, dtype: str) -> dict[str, Any]:
+    unknown = np.iinfo(dtype).max
+    codes = np.clip(np.rint((values - first) / step), 0, unknown - 1)
+    packed = gzip.compress(np.where(np.isnan(codes), unknown, codes).astype(dtype).tobytes(), 9, mtime=0)
+    text = base64.b64encode(packed).decode()
+    return {"first": first, "step": step, "bits": 8 * np.dtype(dtype).itemsize, "codes": text}

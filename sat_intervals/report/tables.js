@@ -1,0 +1,180 @@
+// Headline, histograms, evaluation, validity, tiles, and what the run says of itself.
+
+const run = contents.run;
+
+function showHeadline() {
+  const { height, width } = run.tiles.region;
+  document.title = `${contents.name}: disparity intervals`;
+  find("about").textContent =
+    `${contents.name}, ${grouped(height)} rows by ${grouped(width)} columns, ` +
+    `disparities ${short(search.minimum)} to ${short(search.maximum)} px, matched ${run.finished.slice(0, 10)}.`;
+  const { pixels: all, valid, low_confidence: low, median_interval_width: median } = run.counts;
+  const figures = [
+    ["valid pixels", percent(valid / all)],
+    ["median interval width", median === null ? "none" : `${median} px`],
+    ["low confidence, of valid", percent(low / valid)],
+    ["time", `${fixed(run.seconds.total, 1)} s`],
+  ];
+  const judged = contents.evaluation?.all;
+  if (judged?.count) figures.unshift(["intervals that hold the truth", percent(judged.accuracy)]);
+  find("headline").append(
+    ...figures.map(([name, value]) => element("div", {}, element("dt", {}, name), element("dd", {}, value))),
+  );
+}
+
+/** A histogram of two kinds of pixels as outlines over a logarithmic axis, and its numbers. */
+function showHistogram(place, { step, bars }, kinds, names) {
+  const total = kinds.reduce((sum, [name]) => sum + bars[name].reduce((all, count) => all + count, 0), 0);
+  const floor = 1e-4;
+  const share = (count) => Math.log10(Math.max(count / Math.max(total, 1), floor));
+  const length = bars[kinds[0][0]].length;
+  const draw = (width) => {
+    const axis = { across: names.across, up: "share of pixels", up_ticks: [-4, -3, -2, -1, 0], up_text: (power) => `${short(100 * 10 ** power)} %` };
+    const { x, y, box, parts } = chart(width, 260, [0, length * step], [Math.log10(floor), 0], axis);
+    for (const [name, , colour] of kinds) {
+      const points = bars[name].flatMap((count, bar) => [bar, bar + 1].map((edge) => `${x(edge * step).toFixed(1)},${y(share(count)).toFixed(1)}`));
+      const outline = `M${x(0)},${box.bottom}L${points.join("L")}L${x(length * step)},${box.bottom}Z`;
+      parts.push(svg("path", { d: outline, fill: colour, "fill-opacity": 0.35, stroke: colour, "stroke-width": 1.2 }));
+    }
+    if (!total) parts.push(svg("text", { x: width / 2, y: 110, "text-anchor": "middle" }, "no pixel"));
+    return parts;
+  };
+  const rows = bars[kinds[0][0]]
+    .map((_, bar) => [`${short(bar * step)} to ${short((bar + 1) * step)}`, ...kinds.map(([name]) => bars[name][bar])])
+    .filter(([, ...counts]) => counts.some(Boolean));
+  place.append(element("h3", { class: "first" }, names.title));
+  drawing(place, 260, `${names.title}: ${grouped(total)} pixels`, draw);
+  place.append(
+    element("figcaption", { class: "legend" }, ...legend(kinds.map(([, text, colour]) => [text, colour]))),
+    element("details", {}, element("summary", {}, "Numbers"), table([names.across, ...kinds.map(([, text]) => `${text} (pixels)`)], rows)),
+  );
+}
+
+function showHistograms() {
+  const { width, confidence } = contents.histograms;
+  showHistogram(find("widths"), width, [["high", "high confidence", "var(--band)"], ["low", "low confidence", "var(--truth)"]], {
+    title: "Interval width of all valid pixels", across: "width (px)",
+  });
+  showHistogram(find("confidences"), confidence, [["valid", "valid", "var(--band)"], ["rejected", "not valid", "var(--truth)"]], {
+    title: "Confidence of all pixels that were searched", across: "confidence",
+  });
+}
+
+function showEvaluation() {
+  const judged = contents.evaluation;
+  if (!judged) return;
+  const size = (share) => (share === null ? "none" : fixed(share, 3));
+  const row = (name, figures) => [
+    name, figures.count, percent(figures.accuracy), size(figures.relative_size),
+    figures.mean_width === null ? "none" : `${fixed(figures.mean_width, 2)} px`, size(figures.relative_overestimation ?? null),
+  ];
+  const rows = [row("all", judged.all), row("high confidence", judged.high), row("low confidence", judged.low)];
+  const head = ["valid pixels", "count", "accuracy: hold the truth", "relative size", "mean width", "relative overestimation"];
+  find("evaluation").hidden = false;
+  find("evaluation").append(
+    element("p", {}, "Truth: ", element("code", {}, contents.truth), ". Disparities wrong by more than 1 px: ",
+      `${percent(judged.bad1)}, by more than 3 px: ${percent(judged.bad3)}; truths outside the search range: ${percent(judged.truth_outside_range)}.`),
+    table(head, rows),
+    element("p", { class: "quiet" }, "Relative size is the median width over the width of the search range. The level alpha is one of possibility, not a probability that is promised."),
+  );
+  if (judged.deciles.length) showDeciles(judged.deciles);
+}
+
+/** How often intervals hold the truth, from the tenth of the pixels of least confidence up. */
+function showDeciles(deciles) {
+  const text = (group) => group.confidence.map((value) => fixed(value, 2)).join(" to ");
+  find("evaluation").append(
+    element("h3", {}, "By confidence, in tenths of the pixels"),
+    table(["confidence", "count", "accuracy", "mean width"], deciles.map((group) => [
+      text(group), group.count, shareCell(group.accuracy, 120), `${fixed(group.mean_width, 2)} px`,
+    ])),
+  );
+}
+
+function shareCell(share, longest) {
+  return element("span", {}, percent(share), element("i", { class: "share", style: `width: ${Math.round(longest * (share ?? 0))}px` }));
+}
+
+function showValidity() {
+  const rows = Object.entries(run.validity_bits).map(([name, flag]) => {
+    const count = run.counts.flags[name];
+    return [String(flag.bit), name.replaceAll("_", " "), flag.meaning, flag.invalid ? "yes" : "", count, shareCell(count / run.counts.pixels, 120)];
+  });
+  find("validity").append(
+    element("p", {}, `${percent(run.counts.valid / run.counts.pixels)} of ${grouped(run.counts.pixels)} pixels are valid. A pixel may have several flags.`),
+    table(["bit", "flag", "meaning", "pixel invalid", "pixels", "share"], rows),
+  );
+}
+
+function showTiles() {
+  const { rows, columns, size, overlap } = run.tiles;
+  const seams = run.overlap_left;
+  const place = find("tiles");
+  if (rows * columns === 1) {
+    place.append(element("p", {}, `One tile of at most ${size} x ${size} pixels: there are no seams.`));
+    return;
+  }
+  place.append(element("p", {},
+    `${grouped(rows * columns)} tiles of ${size} x ${size} pixels, read with ${overlap} px around them. Neighbours match the ` +
+    `pixels along their ${grouped(seams.borders)} common borders twice: of ${grouped(seams.pixels)}, ${percent(seams.winner_share)} ` +
+    `have another disparity and ${percent(seams.bounds_share)} another bound, before filters. More overlap leaves less.`));
+  const differs = seams.winner_share > 0 || seams.bounds_share > 0;
+  const figure = element("figure", { style: "max-width: 420px" });
+  place.append(figure);
+  drawing(figure, tilesHeight(420), "Grid of tiles", (width) => drawTiles(width, differs ? seams.worst.between : null));
+  if (!differs) return;
+  const worst = `the border where most differs: ${percent(seams.worst.winner_share)} of the disparities, ` +
+    `${percent(seams.worst.bounds_share)} of the bounds of ${grouped(seams.worst.pixels)} pixels`;
+  place.append(
+    element("p", { class: "legend" }, ...legend([[worst, "var(--truth)", true]])),
+    element("p", { class: "quiet" }, "A run keeps the sums and this border, not the figures of every border."),
+  );
+}
+
+const tilesHeight = (width) => Math.min(420, Math.max(60, Math.round((width * run.tiles.region.height) / run.tiles.region.width)));
+
+/** The borders of the tiles; the one between two tiles, named row_column, in colour. */
+function drawTiles(wide, worst) {
+  const { rows, columns, size, region: { height, width } } = run.tiles;
+  const tall = tilesHeight(420);
+  const x = (column) => (wide * Math.min(column * size, width)) / width;
+  const y = (row) => (tall * Math.min(row * size, height)) / height;
+  const line = (x1, y1, x2, y2, more) => svg("line", { x1, y1, x2, y2, class: "axis", ...more });
+  const parts = [svg("rect", { width: wide, height: tall, fill: "var(--soft)" })];
+  for (let column = 0; column <= columns; column++) parts.push(line(x(column), 0, x(column), tall));
+  for (let row = 0; row <= rows; row++) parts.push(line(0, y(row), wide, y(row)));
+  if (worst) {
+    const [[above, ], [row, column]] = worst.map((name) => name.split("_").map(Number));
+    const end = above === row ? [x(column), y(row + 1)] : [x(column + 1), y(row)];
+    parts.push(line(x(column), y(row), ...end, { style: "stroke: var(--truth); stroke-width: 4" }));
+  }
+  return parts;
+}
+
+function showRun() {
+  const place = find("run");
+  const words = (value) => (value === null ? "none" : typeof value === "object" ? JSON.stringify(value) : String(value));
+  const section = ([name, values]) => (values === null
+    ? [[name, "off", ""]]
+    : Object.entries(values).map(([key, value], i) => [i ? "" : name, key, words(value)]));
+  const seconds = Object.entries(run.seconds).map(([stage, value]) => [
+    stage.includes(".") ? `${stage.replace(".", ", ")} (sum over workers)` : stage, `${fixed(value, 2)} s`,
+  ]);
+  const inputs = Object.entries(run.inputs).flatMap(([side, input]) =>
+    Object.entries(input).map(([key, value], i) => [i ? "" : side, key, key === "mask" && value ? value.path : words(value)]));
+  const columns = element("div", { class: "pair" },
+    element("div", {}, element("h3", {}, "Settings"), table([], Object.entries(run.settings).flatMap(section))),
+    element("div", {}, element("h3", {}, "Times"), table([], seconds), element("h3", {}, "Versions"), table([], Object.entries(run.versions))));
+  place.append(columns, element("h3", {}, "Inputs"), table([], inputs));
+}
+
+explore().catch((error) => {
+  find("thinned").textContent = `The map cannot be drawn: ${error.message}. Open the page in a browser of 2023 or later.`;
+  throw error;
+});
+showHeadline();
+showHistograms();
+showEvaluation();
+showValidity();
+showTiles();
+showRun();

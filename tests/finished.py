@@ -1,0 +1,85 @@
+"""Folders of finished runs whose bands a test makes up, for what only looks at results."""
+
+import json
+
+import numpy as np
+
+from sat_intervals.config import load_config
+from sat_intervals.kinds import KINDS
+from sat_intervals.products import FLAGS, INVALID, OCCLUSION
+from sat_intervals.raster import OutputWriter, north_up, write_layer
+from sat_intervals.summary import Tally
+
+PLACE = north_up(32631, x=370_000, y=4_830_000, pixel=0.5)
+MINIMUM, MAXIMUM = -20, 10
+
+
+def write_run(folder, bands, validity, truth=None, image=None):
+    """Write a run of ``bands`` ``(4, rows, columns)``, with its images and, where given, the truth beside them.
+
+    Returns the folder of the run, inside ``folder``.
+    """
+    height, width = validity.shape
+    if image is None:
+        image = np.random.default_rng(0).integers(100, 1000, validity.shape)
+    inputs = {"left": folder / "left.tif", "right": folder / "right.tif"}
+    for path in inputs.values():
+        write_layer(path, image.astype(np.uint16), 0, PLACE)
+    if truth is not None:
+        write_layer(folder / "truth.tif", truth.astype(np.float32), float("nan"), PLACE)
+    out = folder / "out"
+    with OutputWriter(out, height, width, PLACE, {}) as writer:
+        writer.write(0, bands, validity)
+        writer.publish({"run.json": json.dumps(_report(inputs, bands, validity))})
+    return out
+
+
+def _report(inputs, bands, validity):
+    height, width = validity.shape
+    tally = Tally(MAXIMUM - MINIMUM + 1)
+    tally.add(bands, validity)
+    described = {"height": height, "width": width, "band": 1, "nodata": "0.0", "mask": None, "dtype": "uint16"}
+    config = load_config({"disparity": {"minimum": MINIMUM, "maximum": MAXIMUM}})
+    return {
+        "finished": "2026-11-21T12:00:00+00:00",
+        "settings": config.model_dump(mode="json"),
+        "inputs": {side: {"path": str(path), **described} for side, path in inputs.items()},
+        "tiles": {
+            "region": {"row": 0, "column": 0, "height": height, "width": width},
+            "rows": 2,
+            "columns": 3,
+            "size": max(1, -(-max(height, width) // 3)),
+            "overlap": 100,
+        },
+        "counts": tally.report(),
+        "validity_bits": {
+            flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
+        },
+        "overlap_left": {
+            "borders": 7,
+            "pixels": 1000,
+            "winner_share": 0.01,
+            "bounds_share": 0.02,
+            "worst": {"between": ["0_1", "1_1"], "pixels": 100, "winner_share": 0.05, "bounds_share": 0.1},
+        },
+        "seconds": {"tiles": 1.0, "tiles.read": 0.5, "total": 1.0},
+        "versions": {"python": "3.11"},
+    }
+
+
+def random_bands(height, width, seed=0):
+    """Bands of all kinds of pixels that obey the law of intervals, validity, and a truth that some intervals miss."""
+    random = np.random.default_rng(seed)
+    disparity = random.uniform(MINIMUM + 4, MAXIMUM - 4, (height, width))
+    lower, upper = np.floor(disparity - random.integers(0, 4, disparity.shape)), np.ceil(disparity + 1)
+    validity = random.choice([0, *(kind.flag for kind in KINDS)], disparity.shape).astype(np.uint16)
+    bands = np.stack([disparity, lower, upper, random.random(disparity.shape)]).astype(np.float32)
+    bands[:3, validity & INVALID != 0] = np.nan
+    truth = disparity + random.normal(0, 1.5, disparity.shape)
+    truth[random.random(truth.shape) < 0.1] = np.nan
+    return bands, validity, truth.astype(np.float32)
+
+
+def no_bands(height, width):
+    """Bands and validity of a run in which cross-checking rejected every pixel."""
+    return np.full((4, height, width), np.nan, np.float32), np.full((height, width), OCCLUSION, np.uint16)

@@ -1,0 +1,257 @@
+"""Pictures: made, of the right size, not blank, showing what they claim, whatever the results."""
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from finished import PLACE, no_bands, random_bands, write_run
+from PIL import Image
+
+from sat_intervals import match_pair
+from sat_intervals.cli import main
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kinds import KINDS, SKY, VERMILION, classify
+from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
+from sat_intervals.pictures.curve import read_curve
+from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
+from sat_intervals.raster import write_layer
+from sat_intervals.results import open_results
+from sat_intervals.scene import make_scene
+from sat_intervals.tiling import Window
+
+WHITE, GREY = (255, 255, 255), (222, 222, 222)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A matched procedural pair of 130 x 170 pixels, with its truth; settings without whole-image steps."""
+    folder = tmp_path_factory.mktemp("run")
+    return matched(folder, {"cross_check": None, "median": None, "regularization": None})
+
+
+def matched(folder, settings, window=None):
+    scene = make_scene(130, 170, seed=2)
+    for name, layer, nodata in (("left", scene.left, 0), ("right", scene.right, 0), ("truth", scene.truth, np.nan)):
+        write_layer(folder / f"{name}.tif", layer, nodata, PLACE)
+    settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}} | settings
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, window=window)
+    return folder / "out"
+
+
+def pixels_of(path):
+    """A PNG file as ``(rows, columns, 3)``."""
+    with Image.open(path) as image:
+        assert image.format == "PNG"
+        return np.asarray(image.convert("RGB"))
+
+
+def share_of(picture, colour):
+    """Share of the pixels of a picture that have a colour, ``#rrggbb`` or three numbers."""
+    if isinstance(colour, str):
+        colour = tuple(bytes.fromhex(colour[1:]))
+    return (picture == colour).all(axis=-1).mean()
+
+
+def test_plot__makes_every_picture_and_names_it(run):
+    arguments = ["plot", str(run), "--row", "60", "--columns", "20", "150", "--pixel", "60", "90", "--dpi", "50"]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0, done.output
+    names = ["overview.png", "errors.png", "profile.png", "curve.png"]
+    assert done.output.split() == [str(run / name) for name in names]
+    for name in names:
+        picture = pixels_of(run / name)
+        assert picture.shape[0] > 200
+        assert share_of(picture, WHITE) < 0.95
+        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_plot__without_truth_or_options_makes_the_overview_alone(tmp_path):
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    done = CliRunner().invoke(main, ["plot", str(out)])
+    assert done.exit_code == 0, done.output
+    assert sorted(path.name for path in out.glob("*.png")) == ["overview.png"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--columns", "1", "5"], "give its --row too"),
+        (["--row", "99"], "row 99, column 0 is outside the results in .*: rows are 0 to 39, columns 0 to 49"),
+        (["--row", "3", "--columns", "7", "4"], "columns 7 to 4 are the wrong way round"),
+        (["--row", "3", "--columns", "7", "50"], "column 50 is outside"),
+        (["--pixel", "0", "-1"], "column -1 is outside"),
+        (["--truth", "nowhere.tif"], "nowhere.tif cannot be read"),
+    ],
+)
+def test_plot__says_in_one_line_what_is_wrong(tmp_path, arguments, message):
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    done = CliRunner().invoke(main, ["plot", str(out), *arguments])
+    assert done.exit_code == 2
+    assert re.fullmatch(f"sat-intervals: .*{message}.*", done.output.strip().splitlines()[-1])
+
+
+def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    for name in [name for name in sys.modules if name.startswith("sat_intervals.pictures")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    done = CliRunner().invoke(main, ["plot", str(out)])
+    assert done.exit_code == 2
+    assert done.output == "sat-intervals: pictures need matplotlib: pip install 'sat-intervals[plot]'\n"
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 300), (300, 2), (7, 9), (90, 40), (1100, 1300)])
+@pytest.mark.parametrize("bands", [random_bands, no_bands])
+def test_pictures__of_any_size_and_of_no_valid_pixel(tmp_path, shape, bands):
+    made = bands(*shape)
+    results = open_results(write_run(tmp_path, *made[:2], truth=np.full(shape, -3.0)))
+    draw_overview(results, tmp_path / "overview.png", dpi=60)
+    draw_errors(results, tmp_path / "errors.png", dpi=60)
+    draw_profile(results, tmp_path / "profile.png", shape[0] // 2, dpi=60)
+    for name in ("overview.png", "errors.png", "profile.png"):
+        picture = pixels_of(tmp_path / name)
+        assert min(picture.shape[:2]) >= 60 * 3
+        assert max(picture.shape[:2]) <= 60 * 30
+        assert 0.1 < share_of(picture, WHITE) < 0.97
+    if bands is no_bands:
+        assert share_of(pixels_of(tmp_path / "overview.png"), GREY) > 0.1
+        assert share_of(pixels_of(tmp_path / "overview.png"), KINDS[6].colour) > 0.03
+
+
+def test_draw_overview__reads_no_more_than_it_draws(tmp_path, monkeypatch):
+    results = open_results(write_run(tmp_path, *random_bands(1500, 900)[:2]))
+    read, shapes = type(results).read_small, []
+
+    def noting(self, shape):
+        shapes.append(shape)
+        return read(self, shape)
+
+    monkeypatch.setattr(type(results), "read_small", noting)
+    monkeypatch.setattr(type(results), "read", None)
+    draw_overview(results, tmp_path / "overview.png", dpi=100)
+    assert shapes == [(420, 252)]
+
+
+def test_draw_overview__shows_every_kind_in_its_colour(tmp_path):
+    validity = np.array([[kind.flag for kind in KINDS]], np.uint16).repeat(40, axis=0).repeat(5, axis=1)
+    bands = no_bands(*validity.shape)[0]
+    draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
+    picture = pixels_of(tmp_path / "overview.png")
+    shares = [share_of(picture, kind.colour) for kind in KINDS if kind.colour != "#000000"]
+    assert min(shares) > 0.005
+
+
+def test_draw_errors__colours_the_misses(tmp_path):
+    bands, validity = no_bands(100, 100)
+    bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
+    truth = np.zeros((100, 100))
+    truth[10:20, 10:30] = 5  # 2 % above the interval
+    truth[50:60, 50:60] = -5  # 1 % below it
+    truth[80:, 80:] = np.nan
+    results = open_results(write_run(tmp_path, bands, validity, truth))
+    draw_errors(results, tmp_path / "errors.png")
+    picture = pixels_of(tmp_path / "errors.png")[:-60]  # without its legend
+    above, below = share_of(picture, VERMILION), share_of(picture, SKY)
+    assert above / below == pytest.approx(2, rel=0.05)
+    assert 0.015 < above < 0.02  # of a picture that is mostly map
+
+
+def test_draw_errors__judges_every_pixel_of_a_thinned_map(tmp_path, monkeypatch):
+    bands, validity, truth = random_bands(1300, 700)
+    results = open_results(write_run(tmp_path, bands, validity, truth))
+    titles = []
+    monkeypatch.setattr("matplotlib.axes.Axes.set_title", lambda self, title: titles.append(title))
+    draw_errors(results, tmp_path / "errors.png", dpi=50)
+    valid = (classify(validity) < 2) & np.isfinite(truth)
+    missed = valid & ((truth < bands[1]) | (truth > bands[2]))
+    share = 100 * missed.sum() / valid.sum()
+    assert titles[-1] == f"The interval misses the truth at {share:.1f} % of {valid.sum():,} valid pixels"
+
+
+def test_draw_errors__without_truth_asks_for_it(tmp_path):
+    results = open_results(write_run(tmp_path, *random_bands(40, 50)[:2]))
+    with pytest.raises(SatIntervalsError, match="give --truth"):
+        draw_errors(results, tmp_path / "errors.png")
+
+
+def test_draw_profile__shows_a_pixel_that_stands_alone(tmp_path):
+    bands, validity = no_bands(9, 60)
+    bands[:, 4, 30], validity[4, 30] = (0, -4, 4, 1), 0
+    results = open_results(write_run(tmp_path, bands, validity))
+    pictures = []
+    for row in (4, 5):
+        draw_profile(results, tmp_path / "profile.png", row, (20, 40))
+        pictures.append(pixels_of(tmp_path / "profile.png"))
+    difference = (pictures[0] != pictures[1]).any(axis=-1).mean()
+    assert 1 / 21 / 3 < difference < 0.4
+
+
+def test_read_curve__is_the_curve_of_the_run(run):
+    results = open_results(run)
+    bands = results.read(Window(0, 0, *results.shape))
+    # the overlap of 100 pixels around these holds the whole image, as the run's one tile did
+    for row, column in [(60, 90), (30, 80), (99, 71), (64, 100)]:
+        curve = read_curve(results, row, column)
+        assert curve.lower == bands.lower[row, column]
+        assert curve.upper == bands.upper[row, column]
+        assert np.float32(curve.disparity) == bands.disparity[row, column]
+        assert np.nanmax(curve.possibilities) == 1
+        inside = (curve.disparities >= curve.lower) & (curve.disparities <= curve.upper)
+        assert curve.cut.any()
+        assert inside[curve.cut].all()
+
+
+def test_read_curve__of_a_window_of_the_images(tmp_path, run):
+    window = Window(20, 30, 100, 120)
+    part = open_results(matched(tmp_path, {"median": None, "regularization": None}, window))
+    whole = read_curve(open_results(run), 64, 90)
+    curve = read_curve(part, 64 - window.row, 90 - window.column)
+    np.testing.assert_array_equal(curve.costs, whole.costs)
+    pixel, same = part.read_pixel(44, 60), open_results(run).read_pixel(64, 90)
+    assert (pixel.image, pixel.truth) == (same.image, same.truth)
+
+
+def test_draw_curve__without_sgm_interval_and_truth(tmp_path):
+    settings = {"sgm": None, "interval": None, "regularization": None, "ambiguity": None}
+    out = matched(tmp_path, settings)
+    (tmp_path / "truth.tif").unlink()
+    draw_curve(open_results(out), tmp_path / "curve.png", 60, 90, dpi=50)
+    assert share_of(pixels_of(tmp_path / "curve.png"), WHITE) < 0.99
+
+
+def test_draw_curve__of_a_pixel_without_candidate_says_why(run, tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"row 0, column 0 has no cost curve: .*border.*: choose a pixel"):
+        draw_curve(open_results(run), tmp_path / "curve.png", 0, 0)
+
+
+def test_pictures__that_cannot_be_written_say_so(run, tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"nowhere/overview.png cannot be written: No such file"):
+        draw_overview(open_results(run), tmp_path / "nowhere" / "overview.png", dpi=50)
+
+
+def test_open_results__says_what_is_not_a_finished_run(tmp_path):
+    with pytest.raises(SatIntervalsError, match="No such file or directory: give the folder of a finished run"):
+        open_results(tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(SatIntervalsError, match="is not the report of a run"):
+        open_results(tmp_path)
+
+
+def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
+    bands, validity, truth = random_bands(40, 50)
+    out = write_run(tmp_path, bands, validity)
+    write_layer(tmp_path / "truth.tif", truth[1:], np.nan, PLACE)
+    with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 40 x 50 and the run 40 x 50"):
+        open_results(out)
+    write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
+    with pytest.raises(SatIntervalsError, match="41 x 50 pixels, when it was matched it had 40 x 50"):
+        open_results(out)
+
+
+def test_classify__takes_the_first_reason():
+    validity = np.array([0, NOT_REFINED, REGULARIZED, MISMATCH | REGULARIZED, LEFT_WINDOW | OCCLUSION], np.uint16)
+    meanings = [KINDS[place].meaning for place in classify(validity)]
+    assert meanings[:2] == ["valid", "valid"]
+    assert meanings[2:] == ["valid, interval regularised", FLAGS[7].meaning, FLAGS[0].meaning]
