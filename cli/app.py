@@ -53,8 +53,6 @@ def _explained(error: Exception) -> tuple[int, str]:
         return FAILED, str(error)
     if isinstance(error, SatIntervalsError):
         return USER_ERROR, str(error)
-    if "no locator available" in str(error):  # numba, of a read-only installation without a home
-        return USER_ERROR, "no folder for compiled kernels can be written: name one in NUMBA_CACHE_DIR"
     if isinstance(error, OSError) and error.strerror:
         return FAILED, f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, MemoryError):

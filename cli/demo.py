@@ -36,7 +36,7 @@ def demo(
     from sat_intervals.config import load_config
     from sat_intervals.evaluation import evaluate_run
     from sat_intervals.job import check_output
-    from sat_intervals.raster import north_up, write_layer
+    from sat_intervals.raster import north_up, write_once
     from sat_intervals.run import match_pair
     from sat_intervals.scene import PIXEL, make_scene
 
@@ -50,7 +50,7 @@ def demo(
             ("right", scene.right, 0),
             ("truth", scene.truth, float("nan")),
         ):
-            write_layer(out / f"{name}.tif", layer, nodata, somewhere)
+            write_once(out / f"{name}.tif", layer, nodata, somewhere, overwrite=run["overwrite"])
         console.progress("scene", 1, 1)
         config = load_config(
             config_file, overrides((scene.minimum, scene.maximum), tile_size, overlap, workers, cluster)

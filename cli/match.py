@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
+
+Number = TypeVar("Number", int, float)
 
 
 def named(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
@@ -86,7 +88,9 @@ def overrides(
 @click.option("--nodata", type=float, metavar="V", help="No-data value of both images, in place of their own.")
 @click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image.")
 @click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image.")
-@click.option("--band", type=int, metavar="N", help="Band to match, where an image has several.")
+@click.option("--band", type=int, metavar="N", help="Band to match of both images, needed where they have several.")
+@click.option("--left-band", type=int, metavar="N", help="Band of the left image.")
+@click.option("--right-band", type=int, metavar="N", help="Band of the right image.")
 @click.option("--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match.")
 @click.option("--dry-run", is_flag=True, help="Print the job script of the cluster, submit and match nothing.")
 @run_options
@@ -101,6 +105,8 @@ def match(
     left_nodata: float | None,
     right_nodata: float | None,
     band: int | None,
+    left_band: int | None,
+    right_band: int | None,
     window: tuple[int, int, int, int] | None,
     dry_run: bool,
     config_file: Path | None,
@@ -138,8 +144,8 @@ def match(
         from sat_intervals.run import match_pair
 
         report = match_pair(
-            open_image(left, band=band, nodata=_either(left_nodata, nodata), mask=left_mask),
-            open_image(right, band=band, nodata=_either(right_nodata, nodata), mask=right_mask),
+            open_image(left, band=_either(left_band, band), nodata=_either(left_nodata, nodata), mask=left_mask),
+            open_image(right, band=_either(right_band, band), nodata=_either(right_nodata, nodata), mask=right_mask),
             out,
             config,
             window=Window(*window) if window else None,
@@ -150,5 +156,5 @@ def match(
     console.summary(report, out)
 
 
-def _either(first: float | None, second: float | None) -> float | None:
+def _either(first: Number | None, second: Number | None) -> Number | None:
     return second if first is None else first

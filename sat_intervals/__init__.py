@@ -10,20 +10,35 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config, load_config
-    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.errors import RunError, SatIntervalsError
     from sat_intervals.in_memory import match_arrays
+    from sat_intervals.raster import open_image
     from sat_intervals.run import match_pair
+    from sat_intervals.tiling import Window
 
     __version__: str
 
-__all__ = ["Config", "SatIntervalsError", "__version__", "load_config", "match_arrays", "match_pair"]
+__all__ = [
+    "Config",
+    "RunError",
+    "SatIntervalsError",
+    "Window",
+    "__version__",
+    "load_config",
+    "match_arrays",
+    "match_pair",
+    "open_image",
+]
 
 _HOMES = {
     "Config": "config",
+    "RunError": "errors",
     "SatIntervalsError": "errors",
+    "Window": "tiling",
     "load_config": "config",
     "match_arrays": "in_memory",
     "match_pair": "run",
+    "open_image": "raster",
 }
 
 

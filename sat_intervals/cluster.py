@@ -8,12 +8,23 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
 from typing import Any
 
+import dask
 from distributed import Client, LocalCluster
+from distributed.utils import silence_logging_cmgr
 
 from sat_intervals.config import Cluster
 from sat_intervals.errors import SatIntervalsError
 
 _LOOPBACK = "127.0.0.1"
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """A wait that distributed forgets when it closes is none, and asyncio tells it on stderr."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not (isinstance(error, TimeoutError) and "never retrieved" in record.getMessage())
+
+
+logging.getLogger("asyncio").addFilter(_is_news)
 
 
 @contextmanager
@@ -25,25 +36,21 @@ def connected(settings: Cluster) -> Iterator[Client]:
     SatIntervalsError
         When a scheduler does not answer, or the extra for batch systems is not installed.
     """
-    with ExitStack() as stack:
-        if settings.kind == "address":
-            yield stack.enter_context(_client_of(settings.address))
-            return
-        if settings.kind in ("threads", "processes"):
+    if settings.kind == "address":
+        with silence_logging_cmgr(logging.CRITICAL), _client_of(settings.address) as client:
+            yield client
+    elif settings.kind in ("threads", "processes"):
+        with ExitStack() as stack:
             with _undisturbed():
                 client = stack.enter_context(Client(stack.enter_context(_local(settings))))
             yield client
             with _undisturbed():
                 stack.close()
-            return
-        else:
-            cluster = _batch_system(settings)
-            if settings.maximum_jobs:
-                cluster.adapt(minimum_jobs=settings.jobs, maximum_jobs=settings.maximum_jobs)
-            else:
-                cluster.scale(jobs=settings.jobs)
-        stack.enter_context(cluster)
-        yield stack.enter_context(Client(cluster))
+    else:
+        with _batch_system(settings) as cluster, Client(cluster) as client:
+            # Adapting, even between equal bounds, submits a job again that ended before the run did; scaling does not.
+            cluster.adapt(minimum_jobs=settings.jobs, maximum_jobs=settings.maximum_jobs or settings.jobs)
+            yield client
 
 
 def _client_of(address: str | None) -> Client:
@@ -104,8 +111,13 @@ def _batch_system(settings: Cluster) -> Any:
         "walltime": settings.walltime,
         "job_extra_directives": settings.directives,
     }
-    given = {name: value for name, value in options.items() if value not in (None, [])}
-    return getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")(**given, silence_logs=logging.CRITICAL)
+    given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
+    if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
+        given["scheduler_options"] = {"dashboard_address": f"{_LOOPBACK}:0"}
+    try:
+        return getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")(**given, silence_logs=logging.CRITICAL)
+    except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
+        raise SatIntervalsError(f"cluster {settings.kind}: {' '.join(str(error).split())}") from error
 
 
 def job_script(settings: Cluster) -> str:

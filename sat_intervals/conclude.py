@@ -4,6 +4,7 @@ import json
 import platform
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -16,7 +17,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.job import Job
 from sat_intervals.products import FLAGS
-from sat_intervals.raster import OutputWriter
+from sat_intervals.raster import OutputError, OutputWriter
 from sat_intervals.seams import seam_report
 from sat_intervals.summary import Tally
 from sat_intervals.tile import timed
@@ -44,9 +45,9 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
     Raises
     ------
     RunError
-        Tiles are missing.
+        Tiles are missing, or a file cannot be written.
     SatIntervalsError
-        No pixel could be matched, or a file cannot be written.
+        No pixel could be matched.
     """
     config, store, region = job.config, job.store, job.store.grid.region
     histogram = store.histogram()
@@ -55,7 +56,7 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else Scale(np.nan, np.nan)
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
-    with OutputWriter(job.out, region.height, region.width, where, _tags(config)) as writer:
+    with _going_on(), OutputWriter(job.out, region.height, region.width, where, _tags(config)) as writer:
         with timed(seconds, "bands"):
             strips = (Rows(**strip) for strip in store.strips(STRIP_ROWS))
             row = 0
@@ -74,6 +75,15 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
         writer.publish({"run.json": json.dumps(report, indent=1) + "\n"})
         progress("files", 1, 1)
     return report
+
+
+@contextmanager
+def _going_on() -> Iterator[None]:
+    """What cannot be written any more, with all tiles done, is a failure of the run, which the next try makes good."""
+    try:
+        yield
+    except OutputError as error:
+        raise RunError(f"{error}; the same command goes on from the tiles, all of which are done") from error
 
 
 def _ahead(items: Iterable[Item]) -> Iterator[Item]:
@@ -95,11 +105,15 @@ def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) 
         return
     usable = {side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")}
     empty = [image.path for image, side in ((job.left, "left"), (job.right, "right")) if not usable[side]]
-    reason = f"{' and '.join(empty)} hold no data" if empty else "their data do not meet over the search range"
-    search = job.config.disparity
+    search, window = job.config.disparity, job.config.cost.window
+    reason = (
+        f"all pixels of {' and '.join(empty)} hold no data or are masked"
+        if empty
+        else f"nowhere do {window} x {window} usable pixels of both face each other"
+    )
     raise SatIntervalsError(
-        f"{job.left.path}, {job.right.path}: no pixel can be matched in [{search.minimum}, {search.maximum}], "
-        f"{reason}: check no-data values, masks, window and search range"
+        f"no pixel of {job.left.path} can be matched in {job.right.path} over disparities {search.minimum} to "
+        f"{search.maximum}, {reason}: check no-data values, masks, window and search range"
     )
 
 
@@ -110,7 +124,7 @@ def _tags(config: Config) -> dict[str, str]:
         "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
     }
     if config.interval:
-        tags["ALPHA"] = f"{config.interval.alpha} (level of possibility; coverage on reference scenes .91 to .99)"
+        tags["ALPHA"] = f"{config.interval.alpha} (level of possibility, not a probability)"
     return tags
 
 

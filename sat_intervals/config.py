@@ -176,9 +176,9 @@ class Tiles(Section):
 
     # Multiples of 64 keep cores aligned with the blocks of the images read and written.
     size: int = Field(
-        1024, ge=64, multiple_of=64, description="side of what a tile keeps, in pixels; memory follows it"
+        1024, ge=64, le=16384, multiple_of=64, description="side of what a tile keeps, in pixels; memory follows it"
     )
-    overlap: int = Field(100, ge=1, description="pixels read around it and dropped; more leave fewer seams")
+    overlap: int = Field(100, ge=1, le=4096, description="pixels read around it and dropped; more leave fewer seams")
 
 
 class Cluster(Section):

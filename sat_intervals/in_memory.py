@@ -1,6 +1,5 @@
 """A pair of arrays in memory, matched as one tile: no files, no store, no scheduler."""
 
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +10,7 @@ from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.finish import Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.kernels.cost import padded_to_lanes
+from sat_intervals.memory import machine_bytes, volume_bytes
 from sat_intervals.patch import Reader, match_patch
 from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
@@ -42,8 +41,9 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         For arrays that do not fit each other or the search range, and for a volume larger than the memory.
     """
     config = load_config(config)
-    left_image, right_image = _image(left, "left"), _image(right, "right")
-    _check_fit(left_image, right_image, config)
+    left_pixels, right_pixels = _pixels(left, "left"), _pixels(right, "right")
+    _check_fit(left_pixels, right_pixels, config)
+    left_image, right_image = _image(left_pixels), _image(right_pixels)
     whole = Window(0, 0, *left_image.shape)
     patch = match_patch(_reader(left_image), _reader(right_image), whole, whole, whole, config)
     raw = patch.raw
@@ -66,35 +66,48 @@ def flag_attributes() -> dict[str, object]:
     """The validity flags as CF conventions write them."""
     return {
         "long_name": "validity flags",
-        "flag_masks": [flag.value for flag in FLAGS],
+        "flag_masks": np.array([flag.value for flag in FLAGS], np.uint16),
         "flag_meanings": " ".join(flag.name for flag in FLAGS),
     }
 
 
-def _image(array: Array, side: str) -> np.ma.MaskedArray:
-    """The pixels as float, masked where they are no data."""
+def _pixels(array: Array, side: str) -> np.ma.MaskedArray:
+    """What was given, as it is, if it is an image."""
     values = np.ma.asanyarray(array.data if isinstance(array, xr.DataArray) else array)
     if values.ndim != 2 or values.dtype.kind not in "uif":
         raise SatIntervalsError(
-            f"{side} array: {values.ndim} dimensions of {values.dtype}, needed: 2 dimensions of real numbers"
+            f"the {side} array has {values.ndim} dimensions of {values.dtype}: "
+            "give 2, rows and columns, of real numbers"
         )
-    dtype = np.float32 if np.can_cast(values.dtype, np.float32) else np.float64
-    return np.ma.masked_invalid(values.astype(dtype))
+    return values
+
+
+def _image(pixels: np.ma.MaskedArray) -> np.ma.MaskedArray:
+    """The pixels as float, masked where they are no data."""
+    dtype = np.float32 if np.can_cast(pixels.dtype, np.float32) else np.float64
+    return np.ma.masked_invalid(pixels.astype(dtype))
 
 
 def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
+    search = config.disparity
     if left.shape[0] != right.shape[0]:
         raise SatIntervalsError(
-            f"the left array has {left.shape[0]} rows, the right {right.shape[0]}: rows must correspond"
+            f"the left array has {left.shape[0]} rows, the right {right.shape[0]}, but rows must correspond: "
+            "resample the pair together"
         )
     if 0 in left.shape or 0 in right.shape:
         raise SatIntervalsError(f"nothing to match: shapes {left.shape} and {right.shape}")
-    volume = 2 * left.size * padded_to_lanes(config.disparity.count)
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if volume > memory:
+    if left.shape[1] - 1 + search.maximum < 0 or search.minimum > right.shape[1] - 1:
         raise SatIntervalsError(
-            f"{left.shape[0]} x {left.shape[1]} pixels x {config.disparity.count} disparities "
-            f"need {volume / 1e9:.1f} GB, the machine has {memory / 1e9:.1f} GB: "
+            f"disparities {search.minimum} to {search.maximum} lead every pixel of the left array, {left.shape[1]} "
+            f"columns, out of the right, {right.shape[1]}: check their sign, x_right = x_left + disparity"
+        )
+    rows, columns = left.shape
+    needed, there = volume_bytes(rows, columns, search.count), machine_bytes()
+    if needed > there:
+        raise SatIntervalsError(
+            f"{rows} x {columns} pixels x {search.count} disparities "
+            f"need {needed / 1e9:.1f} GB, the machine has {there / 1e9:.1f} GB: "
             "write the arrays to files and use match_pair, which works in tiles"
         )
 

@@ -1,6 +1,7 @@
 """A pair made ready to be matched: images opened and checked, its folder, its tiles, its store."""
 
 import os
+import tempfile
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -8,16 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.cluster import available_cores
 from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.finish import Rows, Scale, finish_strips
-from sat_intervals.inputs import identity
-from sat_intervals.memory import fitted, parse_bytes
+from sat_intervals.inputs import identity, pixels_digest
+from sat_intervals.kernels import FINGERPRINT
+from sat_intervals.memory import fitted, machine_bytes, parse_bytes, volume_bytes
 from sat_intervals.patch import match_patch
-from sat_intervals.raster import Image, check_pair, check_space, open_image
+from sat_intervals.raster import Image, check_pair, check_space, open_image, other_files, read_window
 from sat_intervals.store import Store
 from sat_intervals.tiling import Grid, Window
 
+# Sections of the settings that no tile knows of.
+_AFTER_THE_TILES = {"median", "regularization", "products", "cluster"}
 OUTPUTS = ("intervals.tif", "validity.tif", "run.json")
 
 
@@ -47,14 +52,30 @@ class Job:
     inputs: dict[str, Any]
 
     def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store for what decides the bytes of a tile; to be called while it is locked."""
+        """Open the store for what decides the bytes of a tile; to be called while it is locked.
+
+        With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
+        """
         manifest = {
             "version": version("sat-intervals"),
-            "settings": self.config.model_dump(mode="json", exclude={"cluster"}),
+            "kernels": FINGERPRINT,
+            "settings": self.config.model_dump(mode="json", exclude=_AFTER_THE_TILES),
             "inputs": self.inputs,
             "region": asdict(self.store.grid.region),
         }
-        self.store.open(manifest, overwrite=overwrite)
+        if overwrite:
+            for name in OUTPUTS:
+                (self.out / name).unlink(missing_ok=True)
+        self.store.open(manifest, overwrite=overwrite, is_mended=self._reads_what_was_read)
+
+    def _reads_what_was_read(self) -> bool:
+        """Whether every tile that is done would read today the pixels that it was made of."""
+        images = {"left": self.left, "right": self.right}
+        reads = (read for record in self.store.records().values() for read in record["pixels_read"])
+        return all(
+            pixels_digest(*read_window(images[read["side"]], Window(**read["window"]))) == read["digest"]
+            for read in reads
+        )
 
     @property
     def waiting(self) -> int:
@@ -74,9 +95,11 @@ def prepare(
     """Check all that can be checked before a pixel is read; parameters as of `match_pair`."""
     config, out = load_config(config), Path(out)
     if config.cluster.memory is not None:
-        config = fitted(config, parse_bytes(config.cluster.memory), config.cluster.cores)
+        # dask kills a worker that takes 95 % of its memory
+        config = fitted(config, 9 * parse_bytes(config.cluster.memory) // 10, config.cluster.cores)
     left, right = checked_pair(left, right, config)
     region = _region(left, window)
+    _check_memory(config, region)
     check_output(out, overwrite)
     check_space(out, region.height, region.width)
     store = Store(out / "tiles", Grid(region, config.tiles.size), config.disparity.count, config.largest_ambiguity)
@@ -93,14 +116,18 @@ def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Co
 
 def check_output(out: Path, overwrite: bool) -> None:
     """Make the folder of a run, or tell why it cannot be used."""
-    there = [name for name in OUTPUTS if (out / name).exists()]
-    if there and not overwrite:
-        raise SatIntervalsError(f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite")
     try:
+        there = [name for name in OUTPUTS if (out / name).exists()]
+        if there and not overwrite:
+            raise SatIntervalsError(
+                f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite"
+            )
+        if os.path.lexists(out) and not out.is_dir():
+            raise SatIntervalsError(f"{out} is no folder: choose another")
         out.mkdir(parents=True, exist_ok=True)
-        os.utime(out)
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
-        raise SatIntervalsError(f"{out} cannot be written: {error.strerror}") from error
+        raise SatIntervalsError(f"{out} cannot be written: {error.strerror}: choose another folder") from error
 
 
 def compile_kernels(config: Config) -> None:
@@ -130,16 +157,34 @@ def _region(left: Image, window: Window | None) -> Window:
     return window
 
 
+def _check_memory(config: Config, region: Window) -> None:
+    """Refuse tiles that this machine cannot hold; what jobs and the workers of a scheduler have is theirs to know."""
+    if config.cluster.kind not in ("threads", "processes"):
+        return
+    height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
+    workers = min(config.cluster.workers or available_cores(), len(Grid(region, config.tiles.size)))
+    needed, there = workers * volume_bytes(height, width, config.disparity.count), machine_bytes()
+    if needed > there:
+        raise SatIntervalsError(
+            f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {workers} at once, need "
+            f"{needed / 1e9:.1f} GB, the machine has {there / 1e9:.1f} GB: "
+            "choose a smaller --tile-size or fewer --workers"
+        )
+
+
 def _described(image: Image) -> dict[str, Any]:
     """What run.json and the manifest say of an input."""
     crs = image.georeferencing.crs
     return {
         **identity(image.path),
+        "files": [identity(file) for file in other_files(image)],
         "height": image.height,
         "width": image.width,
         "band": image.band,
         "dtype": image.dtype,
         "nodata": None if image.nodata is None else repr(image.nodata),
         "crs": crs.to_string() if crs else None,
+        "use_mask": image.use_mask,
+        "alpha": image.alpha,
         "mask": identity(image.mask) if image.mask else None,
     }

@@ -1,5 +1,6 @@
 """Memory of a worker, from the sizes of what it holds; and the tile that fits in a given one."""
 
+import os
 import re
 
 from sat_intervals.config import Config, ConfigError
@@ -24,6 +25,16 @@ def parse_bytes(text: str) -> int:
     if not found or found[2] not in _UNITS:
         raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
     return int(float(found[1]) * _UNITS[found[2]])
+
+
+def machine_bytes() -> int:
+    """Memory of this machine."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def volume_bytes(height: int, width: int, count: int) -> int:
+    """The volume of so many pixels and disparities, the most of what matching takes."""
+    return 2 * height * width * (-(-count // 32) * 32)
 
 
 def tile_bytes(config: Config, size: int | None = None) -> int:

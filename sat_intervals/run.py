@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, as_completed
+from distributed import Client, Future, KilledWorker, as_completed
+from distributed.client import ClosedClientError
 
 from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
@@ -17,6 +19,8 @@ from sat_intervals.tiling import Tile, Window
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
 _LOOK_AGAIN = 2.0
+# Ends the key of a tile that is tried with no other in flight.
+_ALONE = "-alone"
 
 
 def match_pair(
@@ -83,15 +87,23 @@ def match_pair(
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
-    """Remember every tile that failed and raise a RunError that names them, if there are any."""
-    for name, error in failures.items():
-        job.store.write_failure(name, str(error))
+    """Raise a RunError that names every tile that failed, if there are any."""
     if failures:
-        lines = "\n".join(f"  tile {name}: {error}" for name, error in sorted(failures.items()))
+        lines = "\n".join(f"  tile {name}: {_reason(error)}" for name, error in sorted(failures.items()))
         raise RunError(
             f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept; mend the cause and run the "
             f"same command again:\n{lines}"
         )
+
+
+def _reason(error: BaseException) -> str:
+    """Why a tile failed, in one line."""
+    if isinstance(error, KilledWorker):
+        return (
+            f"every worker that matched it died, the last at {error.last_worker.address}, as they do out of memory: "
+            "give workers more, or choose smaller tiles"
+        )
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[tuple[Job, dict[str, BaseException]]]:
@@ -110,6 +122,7 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
     for i, tile, error in flight:
         if error is not None:
             failures[i][tile.name] = error
+            jobs[i].store.write_failure(tile.name, _reason(error))
         left[i] -= 1
         done += 1
         progress("tiles", done, total)
@@ -118,36 +131,66 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
 
 
 class _Flight:
-    """Tiles on their way through a cluster; iterates over those that land: job number, tile, error or None."""
+    """Tiles on their way through a cluster; iterates over those that land: job number, tile, error or None.
+
+    dask blames a worker's death on every tile that it held. Those blamed too often are tried again at the end, one at a
+    time, so that no tile fails for another.
+    """
 
     def __init__(self, client: Client, jobs: Sequence[Job], waiting: Iterator[tuple[int, Tile]]) -> None:
         self._client, self._jobs, self._waiting = client, jobs, waiting
         self._landing = as_completed()
         self._tiles: dict[str, tuple[int, Tile]] = {}
+        self._suspects: list[tuple[int, Tile]] = []
         self._width, self._looked = 2, float("-inf")
 
     def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None]]:
         self._fill()
         for future in self._landing:
-            error = future.exception()
-            i, tile = self._tiles.pop(str(future.key))
+            error, key = _landed(future), str(future.key)
+            i, tile = self._tiles.pop(key)
             future.release()
+            blamed = isinstance(error, KilledWorker) and not key.endswith(_ALONE)
+            if blamed:
+                self._suspects.append((i, tile))
             self._fill()
-            yield i, tile, error
+            if not self._tiles and self._suspects:
+                self._submit(*self._suspects.pop(), _ALONE)
+            if not blamed:
+                yield i, tile, error
 
     def _fill(self) -> None:
         """Submit tiles until two are in flight for every core that there is now."""
         if time.monotonic() - self._looked > _LOOK_AGAIN:
-            self._width = 2 * max(1, sum(self._client.nthreads().values()))
+            with _scheduler_needed():
+                self._width = 2 * max(1, sum(self._client.nthreads().values()))
             self._looked = time.monotonic()
         while len(self._tiles) < self._width:
             following = next(self._waiting, None)
             if following is None:
                 return
-            i, tile = following
-            job = self._jobs[i]
-            future = self._client.submit(
-                match_tile, job, tile, key=f"match-{i}-{tile.name}", retries=job.config.cluster.retries, pure=False
-            )
-            self._tiles[str(future.key)] = following
-            self._landing.add(future)
+            self._submit(*following)
+
+    def _submit(self, i: int, tile: Tile, suffix: str = "") -> None:
+        job, key = self._jobs[i], f"match-{i}-{tile.name}{suffix}"
+        with _scheduler_needed():
+            future = self._client.submit(match_tile, job, tile, key=key, retries=job.config.cluster.retries, pure=False)
+        self._tiles[key] = i, tile
+        self._landing.add(future)
+
+
+def _landed(future: Future[None]) -> BaseException | None:
+    """What a future ended with."""
+    with _scheduler_needed():
+        error: BaseException | None = future.exception()
+        if future.cancelled():
+            raise ClosedClientError(f"{future.key} is lost")
+    return error
+
+
+@contextmanager
+def _scheduler_needed() -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ClosedClientError) as error:
+        raise RunError("the dask scheduler is gone; the same command goes on from the tiles that are done") from error

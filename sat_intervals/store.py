@@ -5,14 +5,15 @@ when its record is there. Writing a tile again writes the same bytes. The manife
 bytes; a store with another manifest is never mixed in.
 """
 
+import errno
 import fcntl
 import json
 import math
 import os
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -95,7 +96,9 @@ class Store:
                 ) from error
             yield
 
-    def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
+    def open(
+        self, manifest: Mapping[str, Any], *, overwrite: bool = False, is_mended: Callable[[], bool] = lambda: False
+    ) -> None:
         """Create the store, or go on with the one that is there; to be called while it is `locked`.
 
         Parameters
@@ -104,6 +107,9 @@ class Store:
             All that decides the bytes of a tile; ``region`` and ``settings`` tell the tiles.
         overwrite
             Whether what is there is dropped.
+        is_mended
+            Asked where tiles failed and nothing but the content of the inputs changed since: whether what is done would
+            be the same with these inputs. If so, the run goes on with them.
 
         Raises
         ------
@@ -113,8 +119,12 @@ class Store:
         file = self.path / _MANIFEST
         wanted = json.loads(json.dumps(manifest))
         if file.exists() and not overwrite:
-            changed = list(_differences(json.loads(file.read_text()), wanted))
-            if changed:
+            there = json.loads(file.read_text())
+            changed = list(_differences(there, wanted))
+            mendable = bool(self.failures()) and _without_content(there) == _without_content(wanted)
+            if changed and mendable and is_mended():
+                _write_whole(file, json.dumps(manifest, indent=1))
+            elif changed:
                 raise StoreError(
                     f"{self.path} holds the tiles of another run: {'; '.join(changed)} "
                     "(use the same settings and inputs to go on, --overwrite to start afresh)"
@@ -183,7 +193,22 @@ class Store:
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
-        _write_whole(self.path / _FAILURES / f"{tile}.json", json.dumps(reason))
+        with suppress(OSError):  # a full disk is reason enough for a tile to fail, but not for the run to end at once
+            _write_whole(self.path / _FAILURES / f"{tile}.json", json.dumps(reason))
+
+    def failures(self) -> dict[str, str]:
+        """Why tiles failed that are not done since, by name."""
+        files = sorted((self.path / _FAILURES).glob("[0-9]*.json"))
+        return {
+            file.stem: json.loads(file.read_text()) for file in files if not (self.path / _RECORDS / file.name).exists()
+        }
+
+    def check_space(self, tile: Tile) -> None:
+        """Raise an OSError where the disk has no room for what a tile leaves behind, before work is put in."""
+        pixel = sum(np.dtype(dtype).itemsize for dtype in PIXEL_ARRAYS.values())
+        needed = tile.core.height * (tile.core.width * pixel + (tile.core.width + self.count - 1) * 4)
+        if shutil.disk_usage(self.path).free < needed:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
 
     def records(self) -> dict[str, dict[str, Any]]:
         """The records of the tiles that are done, by name."""
@@ -229,8 +254,13 @@ class Store:
         return merged
 
     def remove(self) -> None:
-        """Delete the store."""
-        shutil.rmtree(self.path, ignore_errors=True)
+        """Delete the store, and nothing else that may be in its folder."""
+        (self.path / _MANIFEST).unlink(missing_ok=True)  # first: without it nothing of the rest counts
+        for folder in (self._arrays, self.path / _RECORDS, self.path / _FAILURES):
+            shutil.rmtree(folder, ignore_errors=True)
+        (self.path / _LOCK).unlink(missing_ok=True)
+        with suppress(OSError):
+            self.path.rmdir()
 
 
 @dataclass(frozen=True)
@@ -266,15 +296,13 @@ def read_status(path: Path) -> Status:
     manifest = json.loads((path / _MANIFEST).read_text())
     grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
     done = {file.stem for file in (path / _RECORDS).glob("[0-9]*.json")}
-    failures = {file.stem: json.loads(file.read_text()) for file in (path / _FAILURES).glob("[0-9]*.json")}
-    failed = {name: reason for name, reason in sorted(failures.items()) if name not in done}
     store = Store(path, grid, 1, 0)
     try:
         with store.locked():
             running = False
     except StoreError:
         running = True
-    return Status(len(grid), len(done), failed, running)
+    return Status(len(grid), len(done), store.failures(), running)
 
 
 def _create(
@@ -307,5 +335,21 @@ def _differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
     if isinstance(there, dict) and isinstance(wanted, dict):
         for key in sorted(there.keys() | wanted.keys()):
             yield from _differences(there.get(key), wanted.get(key), f"{path}.{key}".lstrip("."))
-    elif there != wanted:
+    elif isinstance(there, list) and isinstance(wanted, list) and len(there) == len(wanted):
+        for place, pair in enumerate(zip(there, wanted, strict=True)):
+            yield from _differences(*pair, f"{path}.{place}")
+    elif there != wanted and not path.endswith(".modified"):  # when does not matter where SHA-256 agrees
         yield f"{path} was {json.dumps(there)}, now {json.dumps(wanted)}"
+
+
+def _without_content(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """A manifest without what tells the content of its inputs."""
+
+    def without(there: Any) -> Any:
+        if isinstance(there, list):
+            return [without(value) for value in there]
+        if not isinstance(there, dict):
+            return there
+        return {key: without(value) for key, value in there.items() if key not in ("bytes", "modified", "sha256")}
+
+    return {**manifest, "inputs": without(manifest["inputs"])}

@@ -3,10 +3,13 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.inputs import pixels_digest
 from sat_intervals.job import Job
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.patch import Patch, match_patch
@@ -26,14 +29,25 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 def match_tile(job: Job, tile: Tile) -> None:
     """Match one tile and write what it leaves behind; runs on a worker."""
+    try:
+        _match_tile(job, tile)
+    except SatIntervalsError as error:
+        error.__cause__ = error.__context__ = None  # GDAL's, which do not survive the way back from the worker
+        raise
+
+
+def _match_tile(job: Job, tile: Tile) -> None:
+    job.store.check_space(tile)
     seconds: dict[str, float] = {}
     usable = {"left": 0, "right": 0}
+    pixels_read: list[dict[str, Any]] = []
 
     def reader(image: Image, side: str) -> Any:
         def read(window: Window) -> tuple[np.ndarray, np.ndarray]:
             with timed(seconds, "read"):
                 pixels, state = read_window(image, window)
             usable[side] += int((state == 0).sum())
+            pixels_read.append({"side": side, "window": asdict(window), "digest": pixels_digest(pixels, state)})
             return pixels, state
 
         return read
@@ -45,7 +59,7 @@ def match_tile(job: Job, tile: Tile) -> None:
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with timed(seconds, "write"):
         job.store.write_arrays(tile, _left_behind(patch, tile, job))
-    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds})
+    job.store.write_record(tile, {"usable_pixels": usable, "pixels_read": pixels_read, "seconds": seconds})
 
 
 def _left_behind(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:

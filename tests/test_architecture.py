@@ -100,7 +100,7 @@ def imported_rooms(source: str, module: str) -> set[str]:
         ("from ..run import match_pair", {"run"}),
         ("from . import cost", {"kernels"}),
         ("def late():\n    from sat_intervals.store import Store", {"store"}),
-        ("import sat_intervals", {"config", "errors", "in_memory", "run"}),
+        ("import sat_intervals", {"config", "errors", "in_memory", "raster", "run", "tiling"}),
     ],
 )
 def test_imported_rooms__sees_every_way_to_import(source: str, expected: set[str]) -> None:

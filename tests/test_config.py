@@ -236,8 +236,8 @@ REFUSED = [
     ("regularization", {"kernel": 4}, "regularization.kernel is 4, allowed: integer >= 1, <= 101, odd"),
     ("regularization", {"depth": -1}, "regularization.depth is -1, allowed: integer >= 0"),
     ("regularization", {"quantile": 0.4}, "regularization.quantile is 0.4, allowed: number >= 0.5, <= 1"),
-    ("tiles", {"size": 100}, "tiles.size is 100, allowed: integer >= 64, multiple of 64"),
-    ("tiles", {"size": 0}, "tiles.size is 0, allowed: integer >= 64, multiple of 64"),
+    ("tiles", {"size": 100}, "tiles.size is 100, allowed: integer >= 64, <= 16384, multiple of 64"),
+    ("tiles", {"size": 0}, "tiles.size is 0, allowed: integer >= 64, <= 16384, multiple of 64"),
     ("tiles", {"overlap": 0}, "tiles.overlap is 0, allowed: integer >= 1"),
     ("tiles", {"overlap": 2}, "tiles.overlap is 2, allowed: >= 3 with cost.window 5"),
     ("tiles", None, "tiles is null, allowed: section of size, overlap"),
@@ -276,7 +276,8 @@ def test_load_config__missing_search_range_is_named() -> None:
 
 def test_load_config__tells_several_errors_in_one_line() -> None:
     assert message(RANGE | {"tiles": {"size": 1}, "median": {"size": 2}}) == (
-        "median.size is 2, allowed: integer >= 3, <= 11, odd; tiles.size is 1, allowed: integer >= 64, multiple of 64"
+        "median.size is 2, allowed: integer >= 3, <= 11, odd; "
+        "tiles.size is 1, allowed: integer >= 64, <= 16384, multiple of 64"
     )
 
 

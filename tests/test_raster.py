@@ -226,7 +226,12 @@ def test_check_pair__accepts_other_widths_and_origins(tmp_path):
     check_pair(*pair(tmp_path, RAMP, RAMP[:, :3], UTM, moved), -1, 1)
 
 
-@pytest.mark.parametrize("kind", ["none", "crs", "transform", "gcps", "rpcs"])
+def test_check_pair__refuses_control_points_in_another_crs(tmp_path):
+    with pytest.raises(InputError, match="EPSG:4326 and EPSG:32631"):
+        check_pair(*pair(tmp_path, RAMP, RAMP, KINDS["gcps"], UTM), -1, 1)
+
+
+@pytest.mark.parametrize("kind", ["none", "crs", "transform", "rpcs"])
 def test_check_pair__compares_what_both_images_have(tmp_path, kind):
     check_pair(*pair(tmp_path, left_options=KINDS[kind]), -1, 1)
 

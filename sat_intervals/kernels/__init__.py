@@ -1,1 +1,41 @@
-"""The method's inner loops: arrays in, arrays out. The only home of numba."""
+"""The method's inner loops: arrays in, arrays out. The only home of numba.
+
+Compiled once a machine and kept in a folder that is named after the kernels' sources: numba itself looks at the file of
+a kernel alone, and not at those of the kernels that it calls.
+"""
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+from numba import config
+
+
+def _fingerprint() -> str:
+    digest = hashlib.sha256()
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    """Where numba's own setting says, else in the user's cache, else in a temporary folder of the user's."""
+    places = [
+        Path(os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser(),
+        Path(tempfile.gettempdir()) / f"cache-{os.getuid()}",
+    ]
+    for place in places:
+        folder = place / "sat-intervals" / FINGERPRINT
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except (OSError, RuntimeError):
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return Path(tempfile.mkdtemp())
+
+
+# Tells these kernels from those of any other version.
+FINGERPRINT = _fingerprint()
+config.CACHE_DIR = str(_cache_folder())

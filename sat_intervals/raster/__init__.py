@@ -1,8 +1,8 @@
 """GeoTIFF in and out: images, their georeferencing, and the files of a run. The only home of rasterio and pyproj."""
 
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
-from sat_intervals.raster.images import Image, InputError, check_pair, open_image
-from sat_intervals.raster.layers import north_up, read_layers, write_layer
+from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
+from sat_intervals.raster.layers import north_up, read_layers, write_layer, write_once
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.windows import read_window
 from sat_intervals.raster.writer import OutputError, OutputWriter, check_space
@@ -18,9 +18,11 @@ __all__ = [
     "check_space",
     "north_up",
     "open_image",
+    "other_files",
     "read_layers",
     "read_small_image",
     "read_small_layers",
     "read_window",
     "write_layer",
+    "write_once",
 ]

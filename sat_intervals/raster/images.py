@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
@@ -127,8 +128,9 @@ def check_pair(left: Image, right: Image, minimum: int, maximum: int) -> None:
             f"{pair} have {left.height} and {right.height} rows, but rows must correspond: resample the pair together"
         )
     here, there = left.georeferencing, right.georeferencing
-    if here.crs and there.crs and here.crs != there.crs:
-        names = f"{here.crs.to_string()} and {there.crs.to_string()}"
+    here_crs, there_crs = here.crs or here.gcps_crs, there.crs or there.gcps_crs
+    if here_crs and there_crs and here_crs != there_crs:
+        names = f"{here_crs.to_string()} and {there_crs.to_string()}"
         raise InputError(f"{pair} have different CRS, {names}: resample the pair together")
     sizes = here.pixel_size, there.pixel_size
     if sizes[0] and sizes[1] and not np.allclose(sizes[0], sizes[1], rtol=_SAME_SIZE, atol=0):
@@ -199,3 +201,20 @@ def _check_range(left: Image, right: Image, minimum: int, maximum: int) -> None:
         raise InputError(
             f"{search} are {maximum - minimum + 1}, more than the {right.width} columns of {right.path}: search fewer"
         )
+
+
+def other_files(image: Image) -> list[str]:
+    """The other files that an image is read from: a mask beside it, the sources of a virtual raster."""
+    seen: list[str] = []
+    waiting = [image.path]
+    while waiting:
+        path = waiting.pop()
+        try:
+            with gdal.reading(path) as dataset:
+                files = dataset.files
+        except gdal.GDAL_ERRORS:  # a file beside it that is no raster
+            continue
+        new = [file for file in files if file not in seen and Path(file).resolve() != Path(image.path).resolve()]
+        seen += new
+        waiting += [file for file in new if file.endswith((".vrt", ".VRT"))]
+    return sorted(seen)

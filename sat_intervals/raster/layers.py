@@ -1,6 +1,8 @@
 """Single layers that fit in memory: those of the demo, and the truth that results are held against."""
 
 import os
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 from rasterio import Env
@@ -8,6 +10,7 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from rasterio.windows import Window as Area
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
@@ -30,6 +33,24 @@ def write_layer(
         gdal.create(str(path), height=height, width=width, **kind, **georeferencing.creation_options()) as dataset,
     ):
         dataset.write(pixels, 1)
+
+
+def write_once(
+    path: Path, pixels: np.ndarray, nodata: float, georeferencing: Georeferencing, *, overwrite: bool
+) -> None:
+    """Write a layer as `write_layer` does, unless the file holds it already.
+
+    Raises
+    ------
+    SatIntervalsError
+        When the file holds something else, and is not to be overwritten.
+    """
+    if path.exists() and not overwrite:
+        with suppress(*gdal.GDAL_ERRORS):
+            if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
+                return
+        raise SatIntervalsError(f"{path} holds something else: choose another folder or --overwrite")
+    write_layer(path, pixels, nodata, georeferencing)
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> np.ndarray:

@@ -216,9 +216,7 @@ def check_space(folder: Path, height: int, width: int) -> None:
     """
     needed, free = _bytes(height, width), shutil.disk_usage(folder).free
     if needed > free:
-        raise OutputError(
-            f"{folder} has {_size(free)} left, the bands need {_size(needed)} to begin with: {_WAY_OUT}"
-        )
+        raise OutputError(f"{folder} has {_size(free)} left, the bands need {_size(needed)} to begin with: {_WAY_OUT}")
 
 
 def _bytes(height: int, width: int) -> int:

@@ -131,10 +131,8 @@ def file_to_file(folder):
 
 def main():
     """Print the table."""
-    cpu = next(
-        (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")),
-        platform.processor(),
-    )
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     print(f"{cpu}, {len(CORES)} cores, {datetime.now(UTC):%Y-%m-%d}, Python {platform.python_version()}\n")
     in_memory()
     with tempfile.TemporaryDirectory() as folder:
