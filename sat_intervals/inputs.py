@@ -26,7 +26,7 @@ def identity(path: str) -> dict[str, Any]:
 
 def pixels_digest(pixels: np.ndarray, state: np.ndarray) -> str:
     """Tells the pixels that a tile was made of from any others."""
-    digest = hashlib.blake2b(digest_size=16)
+    digest = hashlib.sha256()
     for array in (pixels, state):
-        digest.update(array.tobytes())
+        digest.update(np.ascontiguousarray(array))
     return digest.hexdigest()
