@@ -28,5 +28,5 @@ def pixels_digest(pixels: np.ndarray, state: np.ndarray) -> str:
     """Tells the pixels that a tile was made of from any others."""
     digest = hashlib.sha256()
     for array in (pixels, state):
-        digest.update(np.ascontiguousarray(array))
+        digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

@@ -1,0 +1,145 @@
+"""A real SLURM of one node on loopback: jobs that are cancelled, and jobs whose time is up."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sysconfig
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import psutil
+import pytest
+import rasterio
+import yaml
+
+from sat_intervals import match_pair
+from sat_intervals.scene import make_scene
+
+SCRIPTS = Path(sysconfig.get_path("scripts"))
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def slurm(tmp_path_factory):
+    """SLURM at work; where none can be started: skip, or fail as root with SAT_INTERVALS_REQUIRE_SHARED=1."""
+    scripts = Path(os.environ.get("SAT_INTERVALS_SHARED", ROOT.parent / "shared")) / "slurm"
+    missing = "SLURM is started by root" if os.geteuid() else None
+    if missing is None and not (scripts / "up.sh").exists():
+        missing = f"no up.sh in {scripts}: SAT_INTERVALS_SHARED names the folder that holds slurm/"
+    required = os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1" and not os.geteuid()
+    if missing is None and not required and shutil.which("slurmctld") is None:
+        missing = "slurm-wlm is not installed"
+    folder = tmp_path_factory.mktemp("slurm")
+    if missing is None:
+        done = subprocess.run(["bash", scripts / "up.sh", folder], capture_output=True, text=True, timeout=300)
+        missing = None if done.returncode == 0 and "idle" in done.stdout else f"{done.stdout}{done.stderr}"
+    if missing:
+        (pytest.fail if required else pytest.skip)(missing)
+    yield
+    subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
+    subprocess.run(["bash", scripts / "down.sh", folder], check=True, timeout=30)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A folder with left.tif, right.tif and the run in threads that nothing disturbed; its settings."""
+    folder = tmp_path_factory.mktemp("pair")
+    scene = make_scene(400, 500, seed=3)
+    for name, image in (("left", scene.left), ("right", scene.right)):
+        profile = {"driver": "GTiff", "height": 400, "width": 500, "count": 1, "dtype": "uint16", "nodata": 0}
+        transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
+        with rasterio.open(folder / f"{name}.tif", "w", crs="EPSG:32631", transform=transform, **profile) as file:
+            file.write(image, 1)
+    settings = {
+        "disparity": {"minimum": scene.minimum, "maximum": scene.maximum},
+        "tiles": {"size": 64, "overlap": 20},
+    }
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    return folder, settings
+
+
+@contextmanager
+def submitted(pair, folder: Path, **cluster: object) -> Iterator[subprocess.Popen]:
+    """``match --cluster slurm`` with one job, under a user's own dask configuration."""
+    images, settings = pair
+    job = {"jobs": 1, "cores": 1, "memory": "2GB", "walltime": "00:05:00"} | cluster
+    (folder / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": job}))
+    own = {
+        "JOBQUEUE__SLURM__INTERFACE": "lo",
+        "JOBQUEUE__SLURM__LOG_DIRECTORY": str(folder),
+        "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
+        "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
+    }
+    command = [SCRIPTS / "sat-intervals", "match", images / "left.tif", images / "right.tif", folder / "out"]
+    command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
+    with tempfile.TemporaryFile("w+") as log:
+        environment = os.environ | {f"DASK_{name}": value for name, value in own.items()}
+        process = subprocess.Popen(list(map(str, command)), stdout=log, stderr=subprocess.STDOUT, env=environment)
+        try:
+            yield process
+            status = process.wait(60)
+            log.seek(0)
+            assert (status, log.read()) == (0, "")
+        finally:
+            process.kill()
+            process.wait()
+            subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
+
+
+def wait_until(holds, what: str, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, f"{what}: not within {seconds:.0f} s"
+        time.sleep(0.05)
+
+
+def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
+    records = folder / "out" / "tiles" / "records"
+    wait_until(lambda: len(list(records.glob("[0-9]*.json"))) >= count or process.poll() is not None, "tiles", 60)
+    assert process.poll() is None, "ended before it was disturbed"
+
+
+def jobs() -> set[str]:
+    """The jobs that run."""
+    command = ["squeue", "--noheader", "--states", "RUNNING", "--format", "%A"]
+    return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.split())
+
+
+def workers(folder: Path) -> list[psutil.Process]:
+    """The processes of the jobs of a run."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.NoSuchProcess):
+            if "dask_worker" in " ".join(process.cmdline()) and str(folder) in process.cmdline():
+                found += [process, *process.children(recursive=True)]
+    return found
+
+
+def assert_complete(pair, out: Path) -> None:
+    for name in ("intervals.tif", "validity.tif"):
+        assert (out / name).read_bytes() == (pair[0] / "undisturbed" / name).read_bytes(), name
+    assert sorted(path.name for path in out.iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+
+
+def test_match__goes_on_in_a_new_job_after_scancel(slurm, pair, tmp_path):
+    with submitted(pair, tmp_path) as process:
+        wait_for_tiles(process, tmp_path, 5)
+        (job,) = jobs()
+        subprocess.run(["scancel", job], check=True, timeout=30)
+    assert_complete(pair, tmp_path / "out")
+    wait_until(lambda: not jobs(), "end of the jobs", 40)
+
+
+def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_path):
+    with submitted(pair, tmp_path, walltime="00:01:00") as process:
+        wait_for_tiles(process, tmp_path, 5)
+        (job,) = jobs()
+        for worker in workers(tmp_path):  # a pair that takes a minute would do as well
+            worker.send_signal(signal.SIGSTOP)
+        wait_until(lambda: job not in jobs(), "end of the job's time", 130)
+        assert process.poll() is None
+    assert_complete(pair, tmp_path / "out")

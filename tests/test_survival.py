@@ -1,0 +1,428 @@
+"""What dies in the middle of a run costs time and nothing else: real processes, killed for real."""
+
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import rasterio
+import yaml
+from distributed import Client, LocalCluster
+
+from sat_intervals import match_pair, run
+from sat_intervals.job import prepare
+from sat_intervals.scene import make_scene
+
+SCRIPTS = Path(sysconfig.get_path("scripts"))
+OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
+TILES = 56
+PATIENCE = 60.0
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A folder with left.tif, right.tif, settings.yaml of 7 x 8 tiles, and the run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("pair")
+    scene = make_scene(400, 500, seed=3)
+    for name, image in (("left", scene.left), ("right", scene.right)):
+        write_image(folder / f"{name}.tif", image)
+    settings = {
+        "disparity": {"minimum": scene.minimum, "maximum": scene.maximum},
+        "tiles": {"size": 64, "overlap": 20},
+    }
+    (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    return folder
+
+
+def write_image(path, image):
+    height, width = image.shape
+    profile = {"driver": "GTiff", "height": height, "width": width, "count": 1, "dtype": "uint16", "nodata": 0}
+    transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
+    with rasterio.open(path, "w", crs="EPSG:32631", transform=transform, blockysize=16, **profile) as file:
+        file.write(image, 1)
+
+
+def wait_until(holds: Callable[[], object], what: str, seconds: float = PATIENCE) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, f"{what}: not within {seconds:.0f} s"
+        time.sleep(0.002)
+
+
+def done_tiles(out: Path) -> set[str]:
+    return {file.stem for file in (out / "tiles" / "records").glob("[0-9]*.json")}
+
+
+class Command:
+    """``sat-intervals match`` as a process of its own."""
+
+    def __init__(self, pair: Path, out: Path, *options: str, left: Path | None = None) -> None:
+        self.out = out
+        self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by `started`)
+        command = [SCRIPTS / "sat-intervals", "match", left or pair / "left.tif", pair / "right.tif", out]
+        command += ["--config", pair / "settings.yaml", "--quiet", *options]
+        self.process = subprocess.Popen(list(map(str, command)), stdout=self.log, stderr=subprocess.STDOUT)
+
+    def wait_for_tiles(self, count: int) -> None:
+        wait_until(lambda: len(done_tiles(self.out)) >= count or self.ended, f"{count} tiles")
+        assert not self.ended, self.output
+
+    def end(self, seconds: float = PATIENCE) -> int:
+        return self.process.wait(seconds)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    @property
+    def ended(self) -> bool:
+        return self.process.poll() is not None
+
+    @property
+    def output(self) -> str:
+        self.log.seek(0)
+        return self.log.read()
+
+    def workers(self) -> list[psutil.Process]:
+        """The processes of a local cluster."""
+        return [child for child in psutil.Process(self.process.pid).children() if is_worker(child)]
+
+
+def is_worker(process: psutil.Process) -> bool:
+    with suppress(psutil.NoSuchProcess):
+        return process.status() != psutil.STATUS_ZOMBIE and "spawn_main" in " ".join(process.cmdline())
+    return False
+
+
+@contextmanager
+def started(*args: object, **options) -> Iterator[Command]:
+    """A command that does not outlive the test."""
+    command = Command(*args, **options)
+    workers: list[psutil.Process] = []
+    try:
+        yield command
+        workers = [] if command.ended else command.workers()
+    finally:
+        command.kill()
+        command.log.close()
+        psutil.wait_procs(workers, 10)
+
+
+def kill(process: psutil.Process) -> None:
+    with suppress(psutil.NoSuchProcess):
+        process.kill()
+        process.wait(10)
+
+
+def assert_complete(pair: Path, out: Path) -> None:
+    """The same bytes, band by band, as the run that nothing disturbed, and nothing else left behind."""
+    for name in ("intervals.tif", "validity.tif"):
+        with rasterio.open(pair / "undisturbed" / name) as expected, rasterio.open(out / name) as found:
+            for band in range(1, expected.count + 1):
+                np.testing.assert_array_equal(found.read(band), expected.read(band), err_msg=f"{name}, band {band}")
+        assert (out / name).read_bytes() == (pair / "undisturbed" / name).read_bytes(), name
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+def assert_nothing_final(out: Path) -> None:
+    assert not {path.name for path in out.iterdir()} & set(OUTPUTS)
+
+
+def half_written(out: Path) -> bool:
+    """Whether a tile's first array lies in the store and its record does not."""
+    first = {f"{file.parent.name}_{file.name}" for file in (out / "tiles/arrays.zarr/winner/c").glob("*/[0-9]*")}
+    return bool({name for name in first if name.replace("_", "").isdigit()} - done_tiles(out))
+
+
+def test_match__survives_kill_9_of_workers_at_random_moments(pair, tmp_path):
+    chance = random.Random(1)
+    with started(pair, tmp_path / "out", "--cluster", "processes", "--workers", "2") as command:
+        for count in sorted(chance.sample(range(1, 40), 4)):
+            command.wait_for_tiles(count)
+            kill(chance.choice(command.workers()))
+        command.wait_for_tiles(40)
+        kill_while_writing(command)
+        assert command.end() == 0, command.output
+        assert (
+            re.sub(r".*resource_tracker.*\n.*\n", "", command.output) == ""
+        )  # Python's word on what a killed one held
+    assert_complete(pair, tmp_path / "out")
+
+
+def kill_while_writing(command: Command) -> None:
+    """Kill the workers in the middle of what a tile writes."""
+    while True:
+        wait_until(lambda: half_written(command.out) or command.ended, "a tile half written")
+        assert not command.ended, command.output
+        workers = command.workers()
+        for worker in workers:
+            worker.suspend()
+        if half_written(command.out):
+            break
+        for worker in workers:
+            worker.resume()
+    for worker in workers:
+        kill(worker)
+
+
+def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):
+    chance, out = random.Random(2), tmp_path / "out"
+    for count, cluster in zip(sorted(chance.sample(range(2, 45), 2)), ("processes", "threads"), strict=True):
+        with started(pair, out, "--cluster", cluster, "--workers", "2") as command:
+            command.wait_for_tiles(count)
+            workers = command.workers()
+            command.kill()
+            _, alive = psutil.wait_procs(workers, 10)
+            assert not alive, "workers outlive the command"
+        assert_nothing_final(out)
+    before = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done_tiles(out)}
+    with started(pair, out, "--keep-tiles") as command:  # while it writes the files
+        wait_until(lambda: list(out.glob(".*/strips-*")) or command.ended, "strips")
+        command.kill()
+    assert_nothing_final(out)
+    after = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in before}
+    assert after == before, "tiles done twice"
+    assert len(done_tiles(out)) == TILES
+    with started(pair, out) as command:
+        assert command.end() == 0, command.output
+    assert_complete(pair, out)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_match__asked_to_end_leaves_no_worker_and_says_how_to_go_on(pair, tmp_path, number, status):
+    with started(pair, tmp_path / "out", "--cluster", "processes", "--workers", "2") as command:
+        command.wait_for_tiles(3)
+        workers = command.workers()
+        command.process.send_signal(number)
+        assert command.end(20) == status
+        assert "the same command goes on" in command.output
+        assert len(command.output.splitlines()) == 1, command.output
+        _, alive = psutil.wait_procs(workers, 10)
+        assert not alive
+    assert len(done_tiles(tmp_path / "out")) >= 3
+
+
+@contextmanager
+def dask_process(*args: object) -> Iterator[psutil.Popen]:
+    """``dask scheduler`` or ``dask worker``; killed with its children at the end."""
+    process = psutil.Popen(
+        [sys.executable, "-m", "dask", *map(str, args)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        # deaths of workers that dask has a tile survive, by default 3
+        env=os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"},
+    )
+    try:
+        yield process
+    finally:
+        kill_tree(process)
+
+
+def kill_tree(process: psutil.Popen) -> None:
+    with suppress(psutil.NoSuchProcess):
+        family = [process, *process.children(recursive=True)]  # the parent first: it starts its children again
+        for member in family:
+            with suppress(psutil.NoSuchProcess):
+                member.kill()
+        psutil.wait_procs(family, 10)
+
+
+@contextmanager
+def scheduler(folder: Path) -> Iterator[tuple[str, psutil.Popen]]:
+    """A scheduler on loopback: its address, its process."""
+    file = folder / "scheduler.json"
+    options = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--no-show", "--scheduler-file", file)
+    with dask_process("scheduler", *options) as process:
+        wait_until(lambda: file.exists() and file.read_text().endswith("}"), "scheduler")
+        yield yaml.safe_load(file.read_text())["address"], process
+
+
+def worker(address: str, folder: Path, *options: object):
+    fixed = ("--host", "127.0.0.1", "--nthreads", 1, "--no-dashboard", "--local-directory", folder)
+    return dask_process("worker", address, *fixed, *options)
+
+
+def test_match__goes_on_while_workers_join_and_leave(pair, tmp_path):
+    out = tmp_path / "out"
+    with scheduler(tmp_path) as (address, process):
+        with worker(address, tmp_path) as first, worker(address, tmp_path), Client(address) as client:
+            client.wait_for_workers(2, PATIENCE)
+            with started(pair, out, "--cluster", address) as command:
+                command.wait_for_tiles(5)
+                with worker(address, tmp_path):
+                    client.wait_for_workers(3, PATIENCE)
+                    kill_tree(first)
+                    assert command.end() == 0, command.output
+        assert process.is_running()
+        assert_complete(pair, out)
+
+
+def test_match__ends_when_the_scheduler_dies_and_goes_on_elsewhere(pair, tmp_path):
+    out = tmp_path / "out"
+    with (
+        scheduler(tmp_path) as (address, process),
+        worker(address, tmp_path),
+        started(pair, out, "--cluster", address) as command,
+    ):
+        command.wait_for_tiles(3)
+        kill_tree(process)
+        assert command.end() == 1, command.output
+        assert "the dask scheduler is gone; the same command goes on" in command.output
+        assert len(command.output.splitlines()) == 1, command.output
+    assert_nothing_final(out)
+    with started(pair, out) as command:
+        assert command.end() == 0, command.output
+    assert_complete(pair, out)
+
+
+def test_match__does_only_what_is_missing_after_a_truncated_input_is_mended(pair, tmp_path):
+    out, left = tmp_path / "out", tmp_path / "left.tif"
+    shutil.copy(pair / "left.tif", left)
+    whole = left.read_bytes()
+    with left.open("r+b") as file:
+        file.truncate(len(whole) * 17 // 20)
+    with started(pair, out, left=left) as command:
+        assert command.end() == 1, command.output
+        failed = set(re.findall(r"tile (\d+_\d+): .*left\.tif cannot be read at rows", command.output))
+        assert f"{len(failed)} of {TILES} tiles failed" in command.output
+        assert len(command.output.splitlines()) == 1 + len(failed)
+    done = done_tiles(out)
+    assert failed
+    assert not failed & done
+    assert len(failed | done) == TILES
+    assert_nothing_final(out)
+    status = subprocess.run([SCRIPTS / "sat-intervals", "status", out], capture_output=True, text=True, check=True)
+    assert f"{len(done)} of {TILES} tiles done, {len(failed)} failed, 0 left" in status.stdout
+
+    other = bytearray(whole)
+    other[len(whole) // 4] ^= 1  # not mended but changed, where tiles are done
+    left.write_bytes(other)
+    with started(pair, out, left=left) as command:
+        assert command.end() == 2
+        assert "inputs.left.sha256 was" in command.output
+
+    left.write_bytes(whole)
+    before = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done}
+    with started(pair, out, "--keep-tiles", left=left) as command:
+        assert command.end() == 0, command.output
+    assert {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done} == before
+    shutil.rmtree(out / "tiles")
+    assert_complete(pair, out)
+
+
+# Four tiles: one of 384 x 384 pixels that takes 150 MB for its volume of costs, three that take less than 50 MB.
+WIDE = ("--disparity", "-240", "240", "--tile-size", "384", "--overlap", "3")
+
+
+def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(pair, tmp_path):
+    out = tmp_path / "out"
+    with scheduler(tmp_path) as (address, _):
+        # of which dask leaves 95 %, and a worker takes 230 MiB before its first tile
+        with (
+            worker(address, tmp_path, "--memory-limit", "350MiB"),
+            started(pair, out, "--cluster", address, *WIDE) as command,
+        ):
+            assert command.end() == 1, command.output
+            assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
+            assert "give workers more, or choose smaller tiles" in command.output
+        assert_nothing_final(out)
+        assert done_tiles(out) == {"0_1", "1_0", "1_1"}
+        with worker(address, tmp_path), started(pair, out, "--cluster", address, *WIDE) as command:
+            assert command.end() == 0, command.output
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+def test_match__is_not_stalled_by_a_tile_at_which_dask_pauses_its_worker(pair, tmp_path):
+    out = tmp_path / "out"
+    # above 80 % of the memory while the large tile is matched
+    with (
+        scheduler(tmp_path) as (address, _),
+        worker(address, tmp_path, "--memory-limit", "440MiB"),
+        started(pair, out, "--cluster", address, *WIDE) as command,
+    ):
+        assert command.end() == 0, command.output
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of a few MB; where none can be mounted: skip, or fail with SAT_INTERVALS_REQUIRE_SHARED=1."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", folder], capture_output=True)
+    if mounted.returncode:
+        if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1" and os.geteuid() == 0:
+            pytest.fail(f"no tmpfs: {mounted.stderr!r}")
+        pytest.skip("mounting a tmpfs takes root")
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, small_disk):
+    out, ballast = small_disk / "out", small_disk / "ballast"
+    with started(pair, out) as command:
+        command.wait_for_tiles(5)
+        free = shutil.disk_usage(small_disk).free
+        with suppress(OSError):
+            ballast.write_bytes(bytes(free))
+        assert command.end() == 1, command.output
+        assert "No space left on device" in command.output
+        assert "Traceback" not in command.output
+    assert_nothing_final(out)
+    assert len(done_tiles(out)) >= 5
+    ballast.unlink()
+    subprocess.run(["mount", "-o", "remount,size=100m", small_disk], check=True)
+    with started(pair, out) as command:
+        assert command.end() == 0, command.output
+    assert_complete(pair, out)
+
+
+def test_match__refuses_a_folder_where_another_run_is_at_work(pair, tmp_path):
+    with started(pair, tmp_path / "out") as first:
+        first.wait_for_tiles(1)
+        first.process.send_signal(signal.SIGSTOP)
+        with started(pair, tmp_path / "out", "--overwrite") as second:
+            assert second.end() == 2
+            assert "another run is at work in" in second.output
+        first.process.send_signal(signal.SIGCONT)
+        assert first.end() == 0, first.output
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_matched__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_path, monkeypatch):
+    def record_only(job, tile):
+        job.store.write_record(tile, {})
+
+    monkeypatch.setattr(run, "match_tile", record_only)
+    futures, known = [], []
+    image = tmp_path / "wide.tif"
+    write_image(image, np.ones((64 * 20, 64 * 25), np.uint16))
+    job = prepare(image, image, tmp_path / "out", yaml.safe_load((pair / "settings.yaml").read_text()))
+    with job.store.locked():
+        job.begin()
+        with (
+            LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
+            Client(cluster) as client,
+        ):
+
+            def progress(stage, done, total):
+                futures.append(len(client.futures))
+                known.append(len(cluster.scheduler.tasks))
+
+            for _, failures in run.matched(client, [job], progress):
+                assert not failures
+    assert len(futures) == 500
+    assert max(futures) <= 6  # two a core, and those that are just being released
+    assert max(known) <= 12
