@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import warnings
 
 import numpy as np
 import pytest
@@ -175,3 +176,17 @@ def test_read_window__of_an_opened_image_gives_states(pair):
     pixels, state = read_window(image, Window(-2, -2, 4, 4))
     assert pixels.shape == state.shape == (4, 4)
     assert (state[:2] == NO_DATA).all()
+
+
+def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
+    left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
+    settings = {"disparity": {"minimum": -13, "maximum": 33}}
+    match_pair(left, right, tmp_path / "whole", in_tiles(settings, 1216))
+    match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 256))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
+    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
+    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
+    assert differs[0].sum() / judged.sum() <= 0.001
+    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.0025
