@@ -28,7 +28,7 @@ def demo(
     """Make a procedural satellite scene, match it and say how often the interval holds the truth.
 
     \b
-    OUT/left.tif, OUT/right.tif   the epipolar pair, georeferenced, with no data in a corner
+    OUT/left.tif, OUT/right.tif   the pair, georeferenced, no data in a corner
     OUT/truth.tif                 the exact disparity
     and what `match` writes.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)

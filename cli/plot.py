@@ -25,10 +25,10 @@ def plot(
     """Draw pictures of the finished run in the folder OUT, next to its files.
 
     \b
-    OUT/overview.png   always: left image, disparity, interval width, confidence, validity
+    OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth: where the interval misses it
     OUT/profile.png    with --row: interval, disparity and truth along a row
-    OUT/curve.png      with --pixel: the cost curve of a pixel and how it became an interval
+    OUT/curve.png      with --pixel: cost curve of a pixel and its interval
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.

@@ -24,7 +24,8 @@ from sat_intervals.tile import timed
 
 Item = TypeVar("Item")
 
-STRIP_ROWS = 256
+# Pixels of a strip, in whole rows: what is held of one takes about 100 bytes a pixel, several times.
+STRIP_PIXELS = 1 << 20
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage ("kernels", "tiles", "bands", "files"), how much of it is done, and how much there is."""
@@ -58,7 +59,7 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
     where = job.left.georeferencing.shifted(region)
     with _going_on(), OutputWriter(job.out, region.height, region.width, where, _tags(config)) as writer:
         with timed(seconds, "bands"):
-            strips = (Rows(**strip) for strip in store.strips(STRIP_ROWS))
+            strips = (Rows(**strip) for strip in store.strips(STRIP_PIXELS // region.width))
             row = 0
             for final in _ahead(finish_strips(_ahead(strips), scale, config)):
                 writer.write(row, final.intervals, final.validity)

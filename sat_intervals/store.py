@@ -43,7 +43,7 @@ SEAM_PRODUCTS = ("winner", "lower", "upper")
 _MANIFEST, _LOCK, _RECORDS, _FAILURES = "manifest.json", ".lock", "records", "failures"
 
 # Rows of a shard that are compressed together, so that strips read no more than they need.
-_ROWS_TOGETHER = 256
+_ROWS_TOGETHER = 128
 _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 
 

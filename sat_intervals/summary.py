@@ -15,32 +15,31 @@ class Tally:
 
     def __init__(self, count: int) -> None:
         """``count``: number of disparities, so one more than the widest interval."""
-        self.pixels = 0
-        self.valid = 0
-        self.low = 0
-        self.flags = dict.fromkeys((flag.name for flag in FLAGS), 0)
-        self.widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
+        # How often each sum of flags occurs tells all that is asked of them.
+        self._sums = np.zeros(1 << (max(flag.bit for flag in FLAGS) + 1), np.int64)
+        self._widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
 
     def add(self, intervals: np.ndarray, validity: np.ndarray) -> None:
         """Count some rows: ``intervals`` ``(4, rows, columns)`` in the order of BANDS, and their ``validity``."""
-        valid = validity & INVALID == 0
-        self.pixels += validity.size
-        self.valid += int(valid.sum())
-        self.low += int((valid & (validity & REGULARIZED != 0)).sum())
-        for flag in FLAGS:
-            self.flags[flag.name] += int(np.count_nonzero(validity & flag.value))
-        width = (intervals[2] - intervals[1])[valid]
-        width = np.rint(width[np.isfinite(width)] / _WIDTH_STEP).astype(np.int64)
-        self.widths += np.bincount(width, minlength=self.widths.size)
+        self._sums += np.bincount(validity.ravel(), minlength=self._sums.size)
+        width = (intervals[2] - intervals[1])[validity & INVALID == 0]
+        width = np.rint(width[np.isfinite(width)] / np.float32(_WIDTH_STEP)).astype(np.int32)
+        self._widths += np.bincount(width, minlength=self._widths.size)
+
+    def _count(self, wanted: np.ndarray) -> int:
+        """Pixels whose sum of flags is wanted."""
+        return int(self._sums[wanted].sum())
 
     def report(self) -> dict[str, Any]:
         """Counts and shares; the median width in pixels, to 0.01, is None where there is no interval."""
-        upto = np.cumsum(self.widths)
+        upto = np.cumsum(self._widths)
         median = float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP) if upto[-1] else None
+        sums = np.arange(self._sums.size)
+        valid = sums & INVALID == 0
         return {
-            "pixels": self.pixels,
-            "valid": self.valid,
-            "low_confidence": self.low,
-            "flags": self.flags,
+            "pixels": int(self._sums.sum()),
+            "valid": self._count(valid),
+            "low_confidence": self._count(valid & (sums & REGULARIZED != 0)),
+            "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
             "median_interval_width": None if median is None else round(median, 2),
         }

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 import time
+import warnings
 from pathlib import Path
 
 import click
@@ -18,6 +19,7 @@ import rasterio
 import xarray as xr
 import yaml
 from click.testing import CliRunner
+from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals import load_config, match_arrays
@@ -74,8 +76,10 @@ def write(path, bands, **options):
     bands = bands if bands.ndim == 3 else bands[np.newaxis]
     kind = {"count": len(bands), "height": bands.shape[1], "width": bands.shape[2], "dtype": bands.dtype}
     place = {"crs": "EPSG:32631", "transform": HALF_METRE, "nodata": 0} | options
-    with rasterio.open(path, "w", driver="GTiff", **kind, **place) as file:
-        file.write(bands)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", driver="GTiff", **kind, **place) as file:
+            file.write(bands)
 
 
 def search(scene):
@@ -161,7 +165,7 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
         (["--window", 150, 0, 100, 100], ["row 150, column 0, 100 x 100 pixels: must lie inside", "200 x 260 pixels"]),
         (["--window", -1, 0, 100, 100], ["row -1, column 0, 100 x 100 pixels: must lie inside", "left.tif"]),
         (["--window", 0, 0, 0, 9], ["0 x 9 pixels: must lie inside"]),
-        (["--tile-size", 100], ["tiles.size is 100, allowed: integer >= 64, multiple of 64"]),
+        (["--tile-size", 100], ["tiles.size is 100, allowed: integer >= 64, ", "multiple of 64"]),
         (["--overlap", 2], ["tiles.overlap is 2, allowed: >= 3 with cost.window 5"]),
         (["--workers", 0], ["'--workers': 0 is not in the range x>=1"]),
         (["--workers", -2], ["'--workers': -2 is not in the range x>=1"]),
@@ -184,7 +188,7 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
     ("text", "says"),
     [
         ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: disparity, cost, sgm, "),
-        ("sgm: {p3: 8}", "unknown key 'sgm.p3', did you mean p1? (known: p1, p2)"),
+        ("sgm: {p3: 8}", "unknown key 'sgm.p3' (known: p1, p2)"),
         ("sgm: {p1: eight}", "sgm.p1 is 'eight', allowed: integer >= 1"),
         ("sgm: {p1: 40}", "sgm: p1 40 is above p2 32"),
         ("interval: {alpha: 1.5}", "interval.alpha is 1.5, allowed: number > 0, <= 1"),
@@ -259,11 +263,9 @@ def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):
         pass  # no block is written
     result = invoke(
         *matching(folder, tmp_path / "out", left=tmp_path / "huge.tif", right=tmp_path / "huge.tif"),
-        *("--tile-size", 149_952, "--disparity", -1023, 0, "--workers", 1),
+        *("--tile-size", 16384, "--disparity", -8191, 0, "--workers", 1),
     )
-    assert_refused(
-        result, "tiles of 149952 x 149952 pixels x 1024 disparities, 1 at once, need 46050.5 GB, the machine"
-    )
+    assert_refused(result, "16384 x 16384 pixels x 8192 disparities, 1 at once, need 4398.0 GB, the machine has")
     assert not (tmp_path / "out").exists()
 
 
@@ -441,8 +443,8 @@ def test_match__on_a_disk_that_the_files_fill_fails_and_goes_on_once_there_is_ro
     assert (full.returncode, full.stdout) == (1, "")
     assert re.fullmatch(
         rf"sat-intervals: {out}/(intervals|validity)\.tif cannot be written: No space left on device.*: make room .*; "
-        r"the same command goes on from the tiles, all of which are done\n",
-        full.stderr,
+        r"the same command goes on from the tiles, all of which are done",
+        full.stderr.splitlines()[-1],  # GDAL's TIFF library has a word of its own before that, and no way to stop it
     )
     assert [path.name for path in out.iterdir()] == ["tiles"]
     ballast.unlink()
@@ -505,7 +507,7 @@ def read_terminal(terminal):
 def test_match__takes_names_as_they_are(folder, tmp_path):
     """What square brackets, colons, blanks and accents mean to a shell, to rich or to GDAL is nobody's business."""
     place = tmp_path / "[bold]é ü[/nothing]"
-    place.mkdir()
+    place.mkdir(parents=True)
     for name in ("left", "right"):
         (place / f":smile: {name} [1].tif").symlink_to(folder / f"{name}.tif")
     out = place / "out [red] :tada:"
@@ -668,7 +670,7 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "left.tif", "right.tif", "truth.tif"])
     last = result.stdout.splitlines()[-1]
     found = re.fullmatch(
-        r"The interval holds the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d\.\d\d) px\.", last
+        r"The interval holds the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", last
     )
     scene = make_scene(150, 180, seed=4)
     with rasterio.open(out / "truth.tif") as file:
@@ -729,5 +731,8 @@ def test_help__waits_for_no_library():
 def test_version__is_that_of_the_package():
     from sat_intervals import __version__
 
-    assert invoke("--version").stdout == f"sat-intervals, version {__version__}\n"
-    assert_refused(invoke("mach"), "No such command 'mach'", "match", "sat-intervals --help", status=2)
+    assert command("--version").stdout == f"sat-intervals, version {__version__}\n"
+
+
+def test_commands__are_guessed_at():
+    assert_refused(invoke("mach"), "No such command 'mach'", "'match'", "--help")

@@ -29,6 +29,7 @@ def run(command, cores, environment=None):
     process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,  # what peers say of themselves
         text=True,
         env=os.environ | (environment or {}),
         preexec_fn=lambda: os.sched_setaffinity(0, cores),
