@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM: the first asks the command to end, the second kills it."""
 
+import logging
 import signal
 import sys
 from collections.abc import Iterator
@@ -39,18 +40,20 @@ def armed() -> Iterator[None]:
     try:
         yield
     finally:
-        sys.unraisablehook = hook
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        _asked.clear()
+        if not _asked:  # else what is left to do may still take a while: the second kills, and nothing is complained of
+            sys.unraisablehook = hook
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 def _end(number: int, frame: Any) -> None:
-    signal.signal(number, signal.SIG_DFL)
+    for other in _WORDS:
+        signal.signal(other, signal.SIG_DFL)
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # of what zarr and dask do not bring to an end
     _asked.append(Ended(number))
     raise _asked[0]
 
 
 def _report(unraisable: "sys.UnraisableHookArgs") -> None:
-    if not isinstance(unraisable.exc_value, Ended):
+    if not _asked:
         sys.__unraisablehook__(unraisable)

@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing import resource_tracker
@@ -86,12 +87,21 @@ def _undisturbed() -> Iterator[None]:
     A terminal sends Ctrl-C to all processes: workers must not answer by themselves. And half a cluster cannot be
     closed in good order.
     """
+    came: list[int] = []
+    signals = (signal.SIGINT, signal.SIGTERM)
     resource_tracker.ensure_running()  # else begun with the first process, when it lets signals pass again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():  # which answers those that other threads are given
+        handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in signals}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in handlers.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+        for late in came:
+            signal.raise_signal(late)
 
 
 def _batch_system(settings: Cluster) -> Any:
