@@ -413,7 +413,9 @@ def test_matched__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_pat
     with job.store.locked():
         job.begin()
         with (
-            LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
+            LocalCluster(
+                n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
+            ) as cluster,
             Client(cluster) as client,
         ):
 
