@@ -119,7 +119,10 @@ class Store:
         file = self.path / _MANIFEST
         wanted = json.loads(json.dumps(manifest))
         if file.exists() and not overwrite:
-            there = json.loads(file.read_text())
+            try:
+                there = json.loads(file.read_text())
+            except ValueError as error:
+                raise StoreError(f"{file} cannot be read, {error}: --overwrite starts afresh") from error
             changed = list(_differences(there, wanted))
             mendable = bool(self.failures()) and _without_content(there) == _without_content(wanted)
             if changed and mendable and is_mended():

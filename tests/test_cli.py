@@ -257,6 +257,13 @@ def test_match__refuses_a_folder_that_holds_a_run(folder, done):
     assert bytes_of(out) == before
 
 
+def test_match__refuses_tiles_of_which_it_cannot_tell_the_run(folder, tmp_path):
+    (tmp_path / "out" / "tiles").mkdir(parents=True)
+    (tmp_path / "out" / "tiles" / "manifest.json").write_text("{")
+    result = invoke(*matching(folder, tmp_path / "out"))
+    assert_refused(result, "tiles/manifest.json cannot be read, ", "--overwrite starts afresh")
+
+
 def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):
     place = {"count": 1, "height": 150_000, "width": 150_000, "dtype": "uint8", "tiled": True, "sparse_ok": True}
     with rasterio.open(tmp_path / "huge.tif", "w", driver="GTiff", transform=HALF_METRE, **place):

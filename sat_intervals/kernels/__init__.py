@@ -20,20 +20,17 @@ def _fingerprint() -> str:
 
 
 def _cache_folder() -> Path:
-    """Where numba's own setting says, else in the user's cache, else in a temporary folder of the user's."""
-    places = [
-        Path(os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser(),
-        Path(tempfile.gettempdir()) / f"cache-{os.getuid()}",
-    ]
-    for place in places:
-        folder = place / "sat-intervals" / FINGERPRINT
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except (OSError, RuntimeError):
-            continue
-        if os.access(folder, os.W_OK):
-            return folder
-    return Path(tempfile.mkdtemp())
+    """Where numba's own setting says, else in the user's cache, else in a temporary folder of this process alone.
+
+    Never in a place that others can foresee: numba loads what it finds there.
+    """
+    place = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    try:
+        folder = Path(place).expanduser() / "sat-intervals" / FINGERPRINT
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):
+        return Path(tempfile.mkdtemp())
+    return folder if os.access(folder, os.W_OK) else Path(tempfile.mkdtemp())
 
 
 # Tells these kernels from those of any other version.
