@@ -149,22 +149,6 @@ def test_match__any_part_equals_the_whole(scene, data):
 
 @few
 @given(scene=reference.scenes())
-def test_match__a_used_buffer_changes_nothing(scene):
-    left, right = codes_of(scene)
-    output = Window(0, 0, *left.state.shape)
-    parameters = Settings(**reference.settings_of(scene))
-    buffer = np.full(left.state.size * 32 * (-(-scene.count // 32)) + 77, 12345, np.uint16)
-    for fresh, used in zip(
-        match(left, right, parameters, output),
-        match(left, right, parameters, output, None, buffer),
-        strict=True,
-    ):
-        for one, other in zip(fresh, used, strict=True):
-            np.testing.assert_array_equal(one, other)
-
-
-@few
-@given(scene=reference.scenes())
 def test_match__cost_is_the_least_of_the_volume(scene):
     raw, _ = matched(scene)
     volume = cost_volume(*codes_of(scene), Settings(**reference.settings_of(scene)))

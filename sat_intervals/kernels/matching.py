@@ -307,19 +307,12 @@ def _sweep_up(patch, settings, row, column, volume, keep, raw, core, index, righ
                 volume[i, j] = curve
 
 
-def _volume(output: Window, size: int, buffer: np.ndarray | None) -> np.ndarray:
-    shape = output.height, output.width, size
-    if buffer is None:
-        return np.empty(shape, np.uint16)
-    return buffer[: output.height * output.width * size].reshape(shape)
-
-
-def _sweep(left, right, settings, output, core, buffer, keep):
+def _sweep(left, right, settings, output, core, keep):
     """Both sweeps; returns the raw products, the right view and the volume (whole curves only with ``keep``)."""
     patch = _prepare(left, right, settings)
     size = patch.curve.size
-    volume = _volume(output, size, buffer)
     shape = output.height, output.width
+    volume = np.empty((*shape, size), np.uint16)
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -345,12 +338,7 @@ def _sweep(left, right, settings, output, core, buffer, keep):
 
 
 def match(
-    left: Codes,
-    right: Codes,
-    settings: Settings,
-    output: Window,
-    core: Window | None = None,
-    buffer: np.ndarray | None = None,
+    left: Codes, right: Codes, settings: Settings, output: Window, core: Window | None = None
 ) -> tuple[Raw, RightView]:
     """Match a patch: census codes in, raw products and the right view's winners out.
 
@@ -366,9 +354,6 @@ def match(
         The pixels of the patch whose products are wanted; the others only support them.
     core
         The pixels that make the right view; by default those of ``output``.
-    buffer
-        uint16 memory for the volume, at least ``output.height * output.width * padded_to_lanes(count)``: fresh pages
-        cost as much as the sweep that fills them.
 
     Returns
     -------
@@ -377,7 +362,7 @@ def match(
     RightView
         of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    raw, right_view, _ = _sweep(left, right, settings, output, core or output, buffer, False)
+    raw, right_view, _ = _sweep(left, right, settings, output, core or output, False)
     return raw, right_view
 
 
@@ -387,4 +372,4 @@ def cost_volume(left: Codes, right: Codes, settings: Settings) -> np.ndarray:
     Parameters as in `match`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *left.state.shape)
-    return _sweep(left, right, settings, whole, whole, None, True)[2][:, :, : settings.count]
+    return _sweep(left, right, settings, whole, whole, True)[2][:, :, : settings.count]
