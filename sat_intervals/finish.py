@@ -14,7 +14,7 @@ from sat_intervals.config import Ambiguity, Config
 from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
-from sat_intervals.products import INVALID, NO_DISPARITY, REGULARIZED
+from sat_intervals.products import BANDS, INVALID, NO_DISPARITY, REGULARIZED
 
 
 class Rows(NamedTuple):
@@ -101,10 +101,11 @@ def finish_rows(rows: Rows, first: int, last: int, scale: Scale, config: Config)
         validity |= cross_check(rows.winner, rows.right_winner, config.disparity.minimum, tolerance)
     kept = searched & (validity & INVALID == 0)
     confidence = normalize(rows.ambiguity, searched, scale.p1, scale.p99)
-    disparity, lower, upper = rows.disparity, _as_float(rows.lower), _as_float(rows.upper)
+    disparity, (lower, upper) = rows.disparity, _bounds(rows, config)
     if config.median:
         disparity = median(disparity, kept, config.median.size)
-        lower, upper = (median(bound, kept, config.median.size) for bound in (lower, upper))
+        if config.interval:
+            lower, upper = median(lower, kept, config.median.size), median(upper, kept, config.median.size)
     inner = slice(first, last)
     if config.regularization:
         lower, upper, low = _regularized(lower, upper, confidence, first, last, config)
@@ -112,15 +113,22 @@ def finish_rows(rows: Rows, first: int, last: int, scale: Scale, config: Config)
     else:
         lower, upper = lower[inner], upper[inner]
     disparity, validity = disparity[inner], validity[inner]
+    bands = np.empty((len(BANDS), *disparity.shape), np.float32)
+    bands[0], bands[3] = disparity, confidence[inner]
     # The law of this tool: after medians and quantiles the interval still holds the disparity.
-    lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
+    np.minimum(lower, disparity, out=bands[1])
+    np.maximum(upper, disparity, out=bands[2])
     written = searched[inner] if config.products.keep_rejected else kept[inner]
-    bands = [np.where(written, band, np.float32(np.nan)) for band in (disparity, lower, upper)]
-    return Final(np.stack([*bands, confidence[inner]]), validity)
+    np.copyto(bands[:3], np.float32(np.nan), where=~written)
+    return Final(bands, validity)
 
 
-def _as_float(bound: np.ndarray) -> np.ndarray:
-    return np.where(bound == NO_DISPARITY, np.float32(np.nan), bound.astype(np.float32))
+def _bounds(rows: Rows, config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """Both bounds as float; what stands where nothing was searched is never written."""
+    if config.interval is None:
+        nothing = np.full(rows.lower.shape, np.float32(np.nan))
+        return nothing, nothing
+    return rows.lower.astype(np.float32), rows.upper.astype(np.float32)
 
 
 def _regularized(

@@ -113,9 +113,13 @@ def low_confidence(confidence, threshold, kernel):
     limit = np.float32(threshold)
     radius = kernel // 2
     low = np.zeros((rows, columns), np.bool_)
+    doubtful = np.zeros(columns + 2 * radius, np.bool_)
     for r in range(rows):
         for c in range(columns):
-            if confidence[r, c] <= limit:
-                for j in range(max(0, c - radius), min(columns, c + radius + 1)):
-                    low[r, j] = not np.isnan(confidence[r, j])
+            doubtful[c + radius] = confidence[r, c] <= limit
+        for j in range(kernel):
+            for c in range(columns):
+                low[r, c] |= doubtful[c + j]
+        for c in range(columns):
+            low[r, c] &= not np.isnan(confidence[r, c])
     return low

@@ -45,21 +45,21 @@ def cross_check(winner, right_winner, minimum, tolerance):
     ``(rows, columns)`` uint16: 0, OCCLUSION or MISMATCH (some right pixel of the range points back).
     """
     rows, columns = winner.shape
-    count = right_winner.shape[1] - columns + 1
     flags = np.zeros((rows, columns), np.uint16)
+    pointed_at = np.empty(columns, np.bool_)
     for r in range(rows):
+        pointed_at[:] = False
+        for x in range(right_winner.shape[1]):
+            c = x - (right_winner[r, x] - minimum)
+            if right_winner[r, x] != NO_DISPARITY and 0 <= c < columns:
+                pointed_at[c] = True
         for c in range(columns):
             d = np.int64(winner[r, c])
             if d == NO_DISPARITY:
                 continue
             back = np.int64(right_winner[r, c + d - minimum])
-            if back != NO_DISPARITY and abs(d - back) <= tolerance:
-                continue
-            flags[r, c] = OCCLUSION
-            for k in range(count):
-                if right_winner[r, c + k] == minimum + k:
-                    flags[r, c] = MISMATCH
-                    break
+            if back == NO_DISPARITY or abs(d - back) > tolerance:
+                flags[r, c] = MISMATCH if pointed_at[c] else OCCLUSION
     return flags
 
 
@@ -98,28 +98,65 @@ def _ordered(a, b, c):
     return a, b, c
 
 
-@njit(nogil=True)
-def _median_of_nine(values, r, result):
-    """Medians of whole 3 x 3 windows along the inside of a row (Devillard 1998)."""
-    above, here, below = values[r - 1], values[r], values[r + 1]
-    for c in range(1, here.size - 1):
-        low_1, middle_1, high_1 = _ordered(above[c - 1], here[c - 1], below[c - 1])
-        low_2, middle_2, high_2 = _ordered(above[c], here[c], below[c])
-        low_3, middle_3, high_3 = _ordered(above[c + 1], here[c + 1], below[c + 1])
-        low = _ordered(low_1, low_2, low_3)[2]
-        middle = _ordered(middle_1, middle_2, middle_3)[1]
-        high = _ordered(high_1, high_2, high_3)[0]
-        result[c] = _ordered(low, middle, high)[1]
+@njit(nogil=True, forceinline=True)
+def _column(values, kept, c, infinity):
+    """The three values of a window's column in ascending order; each that is not kept is an infinity, its sign in turn.
+
+    Returns them and the next infinity.
+    """
+    a, infinity = (values[0][c], infinity) if kept[0][c] else (infinity, -infinity)
+    b, infinity = (values[1][c], infinity) if kept[1][c] else (infinity, -infinity)
+    d, infinity = (values[2][c], infinity) if kept[2][c] else (infinity, -infinity)
+    return _ordered(a, b, d), infinity
+
+
+@njit(nogil=True, forceinline=True)
+def _middle_of_nine(values, kept, c, infinity):
+    """Middle of the window of three columns from c on (Devillard 1998): as many infinities on either side, or one more.
+
+    So it is the median of the kept values where their number is odd. Where it is even it is the lower of the two in the
+    middle if the first infinity is positive, and the upper if it is negative.
+    """
+    (low_1, middle_1, high_1), infinity = _column(values, kept, c, infinity)
+    (low_2, middle_2, high_2), infinity = _column(values, kept, c + 1, infinity)
+    (low_3, middle_3, high_3), infinity = _column(values, kept, c + 2, infinity)
+    low = _ordered(low_1, low_2, low_3)[2]
+    middle = _ordered(middle_1, middle_2, middle_3)[1]
+    high = _ordered(high_1, high_2, high_3)[0]
+    return _ordered(low, middle, high)[1]
 
 
 @njit(nogil=True)
-def _whole_windows(kept, r, whole):
-    """Which 3 x 3 windows along the inside of a row are kept as a whole."""
-    above, here, below = kept[r - 1], kept[r], kept[r + 1]
-    for c in range(1, here.size - 1):
-        left = above[c - 1] & here[c - 1] & below[c - 1]
-        right = above[c + 1] & here[c + 1] & below[c + 1]
-        whole[c] = left & above[c] & here[c] & below[c] & right
+def _medians_of_nine(values, kept, result):
+    """Medians of the 3 x 3 windows along a row, given its three rows with one more pixel at either end."""
+    infinity = np.float32(np.inf)
+    for c in range(result.size):
+        lower, upper = _middle_of_nine(values, kept, c, infinity), _middle_of_nine(values, kept, c, -infinity)
+        result[c] = (lower + upper) / np.float32(2) if kept[1][c + 1] else values[1][c + 1]
+
+
+@njit(nogil=True)
+def _median_3(values, kept):
+    """Medians of 3 x 3 windows: the same operations on every pixel, kept or not, in vectors."""
+    rows, columns = values.shape
+    result = np.empty((rows, columns), np.float32)
+    # The three rows around the current one, with a border where nothing is kept.
+    near, near_kept = np.zeros((3, columns + 2), np.float32), np.zeros((3, columns + 2), np.bool_)
+    for r in range(-1, rows):
+        entering = (r + 1) % 3
+        if r + 1 < rows:
+            near[entering, 1:-1] = values[r + 1]
+            near_kept[entering, 1:-1] = kept[r + 1]
+        else:
+            near_kept[entering] = False
+        if r >= 0:
+            above, here = (r - 1) % 3, r % 3
+            _medians_of_nine(
+                (near[above], near[here], near[entering]),
+                (near_kept[above], near_kept[here], near_kept[entering]),
+                result[r],
+            )
+    return result
 
 
 @njit(nogil=True, cache=True)
@@ -131,7 +168,7 @@ def median(values, kept, size):
     Parameters
     ----------
     values
-        ``(rows, columns)`` float32.
+        ``(rows, columns)``, float32 or integers that fit; no NaN where kept.
     kept
         bool of the same shape.
     size
@@ -141,20 +178,13 @@ def median(values, kept, size):
     -------
     ``(rows, columns)`` float32; of an even number of pixels the mean of the two in the middle.
     """
+    if size == 3:
+        return _median_3(values, kept)
     rows, columns = values.shape
-    radius = size // 2
-    result = values.copy()
+    result = values.astype(np.float32)
     window = np.empty(size * size, np.float32)
-    nine, whole = np.empty(columns, np.float32), np.zeros(columns, np.bool_)
     for r in range(rows):
-        if size == 3 and 0 < r < rows - 1:
-            _median_of_nine(values, r, nine)
-            _whole_windows(kept, r, whole)
-        else:
-            whole[:] = False
         for c in range(columns):
-            if whole[c]:
-                result[r, c] = nine[c]
-            elif kept[r, c]:
-                result[r, c] = _median_around(values, kept, r, c, radius, window)
+            if kept[r, c]:
+                result[r, c] = _median_around(values, kept, r, c, size // 2, window)
     return result

@@ -94,15 +94,17 @@ def _area(s, depth, above, below, visited, area):
 
 
 @njit(nogil=True)
-def _count(steps, segment_row, start, stop, area, members, counts):
-    """Count the values of all pixels of some segments; returns how many."""
-    counts[:] = 0
+def _count(lower_steps, upper_steps, segment_row, start, stop, area, members, lower_counts, upper_counts):
+    """Count the bounds of all pixels of some segments; returns how many pixels there are."""
+    lower_counts[:] = 0
+    upper_counts[:] = 0
     size = 0
     for i in range(members):
         s = area[i]
-        row = steps[segment_row[s]]
+        lower_row, upper_row = lower_steps[segment_row[s]], upper_steps[segment_row[s]]
         for c in range(start[s], stop[s]):
-            counts[row[c]] += 1
+            lower_counts[lower_row[c]] += 1
+            upper_counts[upper_row[c]] += 1
         size += stop[s] - start[s]
     return size
 
@@ -126,18 +128,21 @@ def _quantile(counts, size, quantile):
 
 @njit(nogil=True)
 def _half_pixels(lower, upper, low):
-    """Bounds as steps of half a pixel above the least one: the least one, the number of steps, both as int32."""
-    least, most = np.inf, -np.inf
-    for r in range(low.shape[0]):
-        for c in range(low.shape[1]):
+    """Bounds as steps of half a pixel above the least one: the least one, the number of steps, both as steps.
+
+    uint16, in half the time of int32: no two disparities lie more than 32000 pixels apart.
+    """
+    rows, columns = low.shape
+    least, most = np.float32(np.inf), np.float32(-np.inf)
+    for r in range(rows):
+        for c in range(columns):
             if low[r, c]:
                 least, most = min(least, lower[r, c]), max(most, upper[r, c])
-    lower_steps, upper_steps = np.zeros(low.shape, np.int32), np.zeros(low.shape, np.int32)
-    for r in range(low.shape[0]):
-        for c in range(low.shape[1]):
-            if low[r, c]:
-                lower_steps[r, c] = np.int32(2 * (lower[r, c] - least))
-                upper_steps[r, c] = np.int32(2 * (upper[r, c] - least))
+    lower_steps, upper_steps = np.empty(low.shape, np.uint16), np.empty(low.shape, np.uint16)
+    for r in range(rows):
+        for c in range(columns):  # selections, not branches: they vectorise
+            lower_steps[r, c] = np.uint16(2 * (lower[r, c] - least)) if low[r, c] else 0
+            upper_steps[r, c] = np.uint16(2 * (upper[r, c] - least)) if low[r, c] else 0
     bins = int(2 * (most - least)) + 1 if most >= least else 0
     return least, bins, lower_steps, upper_steps
 
@@ -159,8 +164,8 @@ def regularize(lower, upper, low, depth, quantile, first, last):
     Parameters
     ----------
     lower, upper
-        ``(rows, columns)`` float32 bounds, whole multiples of half a pixel (integers and means of two) wherever
-        ``low``, so that quantiles come from counts.
+        ``(rows, columns)`` float32 bounds within 32000 pixels of each other, whole multiples of half a pixel (integers
+        and means of two) wherever ``low``, so that quantiles come from counts.
     low
         bool of the same shape: low-confidence pixels.
     depth
@@ -184,7 +189,7 @@ def regularize(lower, upper, low, depth, quantile, first, last):
         segment_row[row_start[r] : row_start[r + 1]] = r
     visited, area = np.full(segments, -1, np.int64), np.empty(segments, np.int64)
     base, bins, lower_steps, upper_steps = _half_pixels(lower, upper, low)
-    counts = np.empty(bins, np.int32)
+    lower_counts, upper_counts = np.empty(bins, np.int32), np.empty(bins, np.int32)
     new_lower, new_upper = lower[first:last].copy(), upper[first:last].copy()
     low_bound = high_bound = 0.0
     for s in range(row_start[first], row_start[last]):
@@ -192,10 +197,9 @@ def regularize(lower, upper, low, depth, quantile, first, last):
         # of short segments beside one long segment would cost their number squared.
         if not (depth > 1 and s > row_start[segment_row[s]] and _same_neighbours(s - 1, s, above, below)):
             members = _area(s, depth, above, below, visited, area)
-            size = _count(lower_steps, segment_row, start, stop, area, members, counts)
-            low_bound = base + 0.5 * _quantile(counts, size, 1.0 - quantile)
-            size = _count(upper_steps, segment_row, start, stop, area, members, counts)
-            high_bound = base + 0.5 * _quantile(counts, size, quantile)
+            size = _count(lower_steps, upper_steps, segment_row, start, stop, area, members, lower_counts, upper_counts)
+            low_bound = base + 0.5 * _quantile(lower_counts, size, 1.0 - quantile)
+            high_bound = base + 0.5 * _quantile(upper_counts, size, quantile)
         new_lower[segment_row[s] - first, start[s] : stop[s]] = low_bound
         new_upper[segment_row[s] - first, start[s] : stop[s]] = high_bound
     return new_lower, new_upper
