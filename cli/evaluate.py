@@ -114,10 +114,9 @@ def _judge_pair(
 
 
 def _group(source: _Source) -> str:
-    from sat_intervals.evaluation import read_run
     from sat_intervals.pairs import group_beside
+    from sat_intervals.results import open_run
 
     if source.pair is not None:
         return source.pair.group
-    run, _ = read_run(Path(source.name))
-    return group_beside(run["inputs"]["left"]["path"])
+    return group_beside(open_run(source.name).report["inputs"]["left"]["path"])

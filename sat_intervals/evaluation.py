@@ -1,23 +1,20 @@
 """Intervals of a run against a known truth, strip by strip, whatever the size of the images (method: section 10)."""
 
-import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config, Regularization, load_config
+from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.figures import Figures, Judged, Rules, bias_histogram
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
-from sat_intervals.raster import Image, open_image, read_layers, read_window
-from sat_intervals.tiling import Window
+from sat_intervals.results import Layer, Run, open_run
 
-_READ_ROWS = 512  # a row of the blocks that runs write
 _JUDGED_PIXELS = 1 << 20  # at a time, 150 bytes each; those read and waiting are 25
 
 
@@ -90,14 +87,19 @@ def evaluate_run(
     SatIntervalsError
         No run, no truth, or sizes that do not fit.
     """
-    out = Path(out)
-    run, config = read_run(out)
-    truth_layer = _Layer.open(truth_of(out, run) if truth is None else truth, run)
-    mask_layer = None if mask is None else _Layer.open(mask, run)
+    run = open_run(out)
+    config = run.config
+    if config.interval is None:
+        raise SatIntervalsError(f"{out} has no intervals, its setting interval is null: run match with intervals")
+    if truth is None and not run.truth_beside.exists():
+        left = run.report["inputs"]["left"]["path"]
+        raise SatIntervalsError(f"{out}: there is no truth.tif beside its left image {left}: give --truth")
+    truth_layer = run.layer(truth or run.truth_beside)
+    mask_layer = None if mask is None else run.layer(mask)
     rules = rules_of(config, tolerance)
 
     def strips() -> Iterator[Rows]:
-        return _read_strips(out, run["tiles"]["region"], truth_layer, mask_layer)
+        return _read_strips(run, truth_layer, mask_layer)
 
     return {
         "cost": config.cost.method,
@@ -170,69 +172,14 @@ def _with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int,
         yield waiting, first, waiting.truth.shape[0]
 
 
-# ---- Files -------------------------------------------------------------------------------------------------
-def read_run(out: Path) -> tuple[dict[str, Any], Config]:
-    """What a run says of itself, and its settings."""
-    file = out / "run.json"
-    try:
-        run = json.loads(file.read_text(encoding="utf-8"))
-        config = load_config(run["settings"])
-    except OSError as error:
-        raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
-    if config.interval is None:
-        raise SatIntervalsError(f"{out} has no intervals, its setting interval is null: run match with intervals")
-    return run, config
-
-
-def truth_of(out: Path, run: dict[str, Any]) -> Path:
-    """The truth that lies beside the left image of a run."""
-    left = Path(run["inputs"]["left"]["path"])
-    if not (left.parent / "truth.tif").exists():
-        raise SatIntervalsError(f"{out}: there is no truth.tif beside its left image {left}: give --truth")
-    return left.parent / "truth.tif"
-
-
-@dataclass(frozen=True)
-class _Layer:
-    """A file of the size of a run, or of its left image, of which the run's region is wanted."""
-
-    image: Image
-    row: int
-    column: int
-
-    @classmethod
-    def open(cls, path: str | Path, run: dict[str, Any]) -> "_Layer":
-        image, region, left = open_image(path), run["tiles"]["region"], run["inputs"]["left"]
-        size = image.height, image.width
-        if size == (region["height"], region["width"]):
-            return cls(image, 0, 0)
-        if size == (left["height"], left["width"]):
-            return cls(image, region["row"], region["column"])
-        raise SatIntervalsError(
-            f"{image.path} has {image.height} x {image.width} pixels, the left image {left['height']} x "
-            f"{left['width']}, the run {region['height']} x {region['width']}: give a file of one of these sizes"
-        )
-
-    def read(self, window: Window) -> np.ndarray:
-        """The pixels of a window of the run as floats, NaN where there is no data."""
-        place = Window(self.row + window.row, self.column + window.column, window.height, window.width)
-        pixels, state = read_window(self.image, place)
-        return np.where(state == 0, pixels, np.nan)
-
-
-def _read_strips(out: Path, region: dict[str, int], truth: _Layer, mask: _Layer | None) -> Iterator[Rows]:
+def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[Rows]:
     """Strips of rows, from the top; files are read by rows of blocks, which are then cut."""
-    height, width = region["height"], region["width"]
-    step = max(1, _JUDGED_PIXELS // width)
-    for row in range(0, height, _READ_ROWS):
-        window = Window(row, 0, min(_READ_ROWS, height - row), width)
+    step = max(1, _JUDGED_PIXELS // run.region.width)
+    for window in run.windows():
         true = truth.read(window)
         if mask is not None:
             true[np.nan_to_num(mask.read(window)) == 0] = np.nan
-        disparity, lower, upper, confidence = read_layers(out / "intervals.tif", window)
-        (validity,) = read_layers(out / "validity.tif", window)
+        (disparity, lower, upper, confidence), validity = run.read_bands(window)
         rows = Rows(disparity, lower, upper, confidence, validity, true)
         for first in range(0, window.height, step):
             yield Rows(*(band[first : first + step] for band in rows))

@@ -14,8 +14,8 @@ from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.raster import Image, open_image, read_layers, read_small_image, read_small_layers, read_window
 from sat_intervals.tiling import Window
 
-# Rows read at a time: a row of the blocks that runs write.
-_STRIP_ROWS = 512
+# Rows of the blocks that runs write.
+_BLOCK_ROWS = 512
 
 
 class Bands(NamedTuple):
@@ -53,7 +53,22 @@ class Bands(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Results:
+class Layer:
+    """A raster of the size of a run's region or of its left image, read by windows of the region."""
+
+    image: Image
+    row: int
+    column: int
+
+    def read(self, window: Window) -> np.ndarray:
+        """The pixels of a window of the region as floats, NaN where there is no data."""
+        place = Window(self.row + window.row, self.column + window.column, window.height, window.width)
+        pixels, state = read_window(self.image, place)
+        return np.where(state == 0, pixels, np.nan)
+
+
+@dataclass(frozen=True)
+class Run:
     """The folder of a finished run.
 
     Attributes
@@ -66,31 +81,69 @@ class Results:
         Settings of the run.
     region
         The pixels of the left image that were matched. Rows and columns of the results count from its first pixel.
-    left, right
-        The images.
-    truth
-        True disparity, None without; of the size of the region or of the left image.
     """
 
     out: Path
     report: dict[str, Any]
     config: Config
     region: Window
-    left: Image
-    right: Image
-    truth: Image | None
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the results."""
         return self.region.height, self.region.width
 
+    def read_bands(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
+        """Disparity, lower, upper and confidence ``(4, rows, columns)``, and validity, of a window of the results."""
+        return read_layers(self.out / "intervals.tif", window), read_layers(self.out / "validity.tif", window)[0]
+
+    def windows(self) -> Iterator[Window]:
+        """Full-width windows of the results, from the top, of a row of the blocks that runs write."""
+        height, width = self.shape
+        for row in range(0, height, _BLOCK_ROWS):
+            yield Window(row, 0, min(_BLOCK_ROWS, height - row), width)
+
+    def layer(self, path: str | Path) -> Layer:
+        """Another raster of the same pixels, such as the truth."""
+        image, left = open_image(path), self.report["inputs"]["left"]
+        size = image.height, image.width
+        if size == self.shape:
+            return Layer(image, 0, 0)
+        if size == (left["height"], left["width"]):
+            return Layer(image, self.region.row, self.region.column)
+        raise SatIntervalsError(
+            f"{image.path} has {image.height} x {image.width} pixels, the left image {left['height']} x "
+            f"{left['width']}, the run {self.region.height} x {self.region.width}: give a file of one of these sizes"
+        )
+
+    @property
+    def truth_beside(self) -> Path:
+        """Where the truth lies by default: beside the left image."""
+        return Path(self.report["inputs"]["left"]["path"]).parent / "truth.tif"
+
+
+@dataclass(frozen=True)
+class Results(Run):
+    """The folder of a finished run, its images, and a truth.
+
+    Attributes
+    ----------
+    left, right
+        The images, as the run read them.
+    truth
+        True disparity, None without.
+    """
+
+    left: Image
+    right: Image
+    truth: Layer | None
+
     def read(self, window: Window) -> Bands:
         """Everything of the pixels of a window of the results."""
-        disparity, lower, upper, confidence = read_layers(self.out / "intervals.tif", window)
-        validity = read_layers(self.out / "validity.tif", window)[0]
-        image = _values(self.left, self._in_left(window))
-        return Bands(disparity, lower, upper, confidence, validity, image, self._read_truth(window))
+        (disparity, lower, upper, confidence), validity = self.read_bands(window)
+        image = Layer(self.left, self.region.row, self.region.column).read(window)
+        truth = self.truth.read(window) if self.truth else np.full(validity.shape, np.nan)
+        return Bands(disparity, lower, upper, confidence, validity, image, truth)
 
     def read_pixel(self, row: int, column: int) -> Bands:
         """Everything of one pixel, as arrays of no dimension."""
@@ -99,8 +152,8 @@ class Results:
 
     def strips(self) -> Iterator[tuple[int, Bands]]:
         """Everything, strip by strip from the top, with the first row of each."""
-        for row in range(0, self.region.height, _STRIP_ROWS):
-            yield row, self.read(Window(row, 0, min(_STRIP_ROWS, self.region.height - row), self.region.width))
+        for window in self.windows():
+            yield window.row, self.read(window)
 
     def read_small(self, shape: tuple[int, int]) -> Bands:
         """All of the results but the truth, as ``shape`` pixels: the bands picked, the left image averaged."""
@@ -111,7 +164,8 @@ class Results:
 
     def read_small_left(self, window: Window, shape: tuple[int, int]) -> np.ndarray:
         """The left image under a window of the results, as ``shape`` pixels."""
-        return read_small_image(self.left, self._in_left(window), shape)
+        place = Window(self.region.row + window.row, self.region.column + window.column, window.height, window.width)
+        return read_small_image(self.left, place, shape)
 
     def check_pixel(self, row: int, column: int) -> None:
         """Hold that a pixel is one of the results."""
@@ -122,19 +176,28 @@ class Results:
                 f"rows are 0 to {height - 1}, columns 0 to {width - 1}"
             )
 
-    def _in_left(self, window: Window) -> Window:
-        row, column = self.region.row + window.row, self.region.column + window.column
-        return Window(row, column, window.height, window.width)
 
-    def _read_truth(self, window: Window) -> np.ndarray:
-        if self.truth is None:
-            return np.full((window.height, window.width), np.nan)
-        of_region = (self.truth.height, self.truth.width) == self.shape
-        return _values(self.truth, window if of_region else self._in_left(window))
+def open_run(out: str | Path) -> Run:
+    """Look at the folder of a finished run: ``intervals.tif``, ``validity.tif`` and ``run.json``; no image is needed.
+
+    Raises
+    ------
+    SatIntervalsError
+        No finished run.
+    """
+    out = Path(out)
+    file = out / "run.json"
+    try:
+        report = json.loads(file.read_text(encoding="utf-8"))
+        return Run(out, report, load_config(report["settings"]), Window(**report["tiles"]["region"]))
+    except OSError as error:
+        raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
-    """Look at the folder of a finished run.
+    """Look at the folder of a finished run and at its images.
 
     Parameters
     ----------
@@ -149,18 +212,12 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     SatIntervalsError
         No finished run, images that are no longer there, or a truth of another size.
     """
-    out = Path(out)
-    file = out / "run.json"
-    try:
-        report = json.loads(file.read_text(encoding="utf-8"))
-        config = load_config(report["settings"])
-        region = Window(**report["tiles"]["region"])
-        left, right = (_opened(report["inputs"][side]) for side in ("left", "right"))
-    except OSError as error:
-        raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
-    return Results(out, report, config, region, left, right, _opened_truth(truth, left, region))
+    run = open_run(out)
+    left, right = (_opened(run.report["inputs"][side]) for side in ("left", "right"))
+    if truth is None and run.truth_beside.exists():
+        truth = run.truth_beside
+    layer = None if truth is None else run.layer(truth)
+    return Results(run.out, run.report, run.config, run.region, left, right, layer)
 
 
 def _opened(described: dict[str, Any]) -> Image:
@@ -178,22 +235,3 @@ def _opened(described: dict[str, Any]) -> Image:
             f"{described['height']} x {described['width']}: put that image back or match again"
         )
     return image
-
-
-def _opened_truth(path: str | Path | None, left: Image, region: Window) -> Image | None:
-    beside = Path(left.path).parent / "truth.tif"
-    if path is None and not beside.exists():
-        return None
-    truth = open_image(beside if path is None else path)
-    sizes = (region.height, region.width), (left.height, left.width)
-    if (truth.height, truth.width) not in sizes:
-        raise SatIntervalsError(
-            f"{truth.path} has {truth.height} x {truth.width} pixels, the left image {left.height} x {left.width} and "
-            f"the run {region.height} x {region.width}: give a truth of one of these sizes with --truth"
-        )
-    return truth
-
-
-def _values(image: Image, window: Window) -> np.ndarray:
-    pixels, state = read_window(image, window)
-    return np.where(state == 0, pixels, np.nan)

@@ -243,7 +243,7 @@ def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
     bands, validity, truth = random_bands(40, 50)
     out = write_run(tmp_path, bands, validity)
     write_layer(tmp_path / "truth.tif", truth[1:], np.nan, PLACE)
-    with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 40 x 50 and the run 40 x 50"):
+    with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 40 x 50, the run 40 x 50"):
         open_results(out)
     write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
     with pytest.raises(SatIntervalsError, match="41 x 50 pixels, when it was matched it had 40 x 50"):

@@ -49,7 +49,7 @@ def _contents(results: Results) -> dict[str, Any]:
         low = bands.low(results.config)
         counts.add(bands, low)
         pixels.add(row, bands, low)
-    truth = results.truth.path if results.truth else None
+    truth = results.truth.image.path if results.truth else None
     return {
         "run": results.report,
         "name": Path(results.left.path).name,
