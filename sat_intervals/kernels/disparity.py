@@ -50,8 +50,9 @@ def cross_check(winner, right_winner, minimum, tolerance):
     for r in range(rows):
         pointed_at[:] = False
         for x in range(right_winner.shape[1]):
-            c = x - (right_winner[r, x] - minimum)
-            if right_winner[r, x] != NO_DISPARITY and 0 <= c < columns:
+            d = np.int64(right_winner[r, x])
+            c = x - (d - minimum)
+            if d != NO_DISPARITY and 0 <= c < columns:
                 pointed_at[c] = True
         for c in range(columns):
             d = np.int64(winner[r, c])
