@@ -17,7 +17,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.job import Job
 from sat_intervals.products import FLAGS
-from sat_intervals.raster import OutputError, OutputWriter
+from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
 from sat_intervals.seams import seam_report
 from sat_intervals.summary import Tally
 from sat_intervals.tile import timed
@@ -57,7 +57,7 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else Scale(np.nan, np.nan)
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
-    with _going_on(), OutputWriter(job.out, region.height, region.width, where, _tags(config)) as writer:
+    with _going_on(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
         with timed(seconds, "bands"):
             strips = (Rows(**strip) for strip in store.strips(STRIP_PIXELS // region.width))
             row = 0

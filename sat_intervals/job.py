@@ -17,7 +17,7 @@ from sat_intervals.inputs import identity, pixels_digest
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.memory import fitted, machine_bytes, parse_bytes, volume_bytes
 from sat_intervals.patch import match_patch
-from sat_intervals.raster import Image, check_pair, check_space, open_image, other_files, read_window
+from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files, read_window
 from sat_intervals.store import Store
 from sat_intervals.tiling import Grid, Window
 
@@ -101,7 +101,7 @@ def prepare(
     region = _region(left, window)
     _check_memory(config, region)
     check_output(out, overwrite)
-    check_space(out, region.height, region.width)
+    check_space(out, RUN_FILES, region.height, region.width)
     store = Store(out / "tiles", Grid(region, config.tiles.size), config.disparity.count, config.largest_ambiguity)
     inputs = {"left": _described(left), "right": _described(right)}
     return Job(left, right, config, store, out, inputs)

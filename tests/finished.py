@@ -7,7 +7,7 @@ import numpy as np
 from sat_intervals.config import load_config
 from sat_intervals.kinds import KINDS
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION
-from sat_intervals.raster import OutputWriter, north_up, write_layer
+from sat_intervals.raster import RUN_FILES, OutputWriter, north_up, write_layer
 from sat_intervals.summary import Tally
 
 PLACE = north_up(32631, x=370_000, y=4_830_000, pixel=0.5)
@@ -28,7 +28,7 @@ def write_run(folder, bands, validity, truth=None, image=None):
     if truth is not None:
         write_layer(folder / "truth.tif", truth.astype(np.float32), float("nan"), PLACE)
     out = folder / "out"
-    with OutputWriter(out, height, width, PLACE, {}) as writer:
+    with OutputWriter(out, RUN_FILES, height, width, PLACE, {}) as writer:
         writer.write(0, bands, validity)
         writer.publish({"run.json": json.dumps(_report(inputs, bands, validity))})
     return out

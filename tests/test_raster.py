@@ -23,6 +23,7 @@ from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
+    RUN_FILES,
     Georeferencing,
     Image,
     InputError,
@@ -465,7 +466,7 @@ def products() -> tuple[np.ndarray, np.ndarray]:
 
 def produce(folder: Path, products, *, where=None, rows=256, tags=None, publish=True, texts=None) -> None:
     intervals, validity = products
-    with OutputWriter(folder, *validity.shape, where or Georeferencing(), tags or {}, threads=2) as output:
+    with OutputWriter(folder, RUN_FILES, *validity.shape, where or Georeferencing(), tags or {}, threads=2) as output:
         for row in range(0, len(validity), rows):
             output.write(row, intervals[:, row : row + rows], validity[row : row + rows])
         if publish:
@@ -550,7 +551,7 @@ def test_output_writer__leaves_nothing_when_interrupted(tmp_path, products, erro
     intervals, validity = products
 
     def interrupted() -> None:
-        with OutputWriter(tmp_path, HEIGHT, WIDTH, Georeferencing(), {}) as output:
+        with OutputWriter(tmp_path, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
             output.write(0, intervals, validity)
             if built:
                 output.build()
@@ -620,7 +621,7 @@ def test_output_writer__publishes_no_file_that_differs_from_what_was_written(tmp
 
 def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_path, products):
     intervals, validity = products
-    with OutputWriter(tmp_path, HEIGHT, WIDTH, Georeferencing(), {}) as output:
+    with OutputWriter(tmp_path, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
         output.write(0, intervals[:, :300], validity[:300])
         with pytest.raises(OutputError, match="read back"):
             output.publish()
@@ -661,7 +662,7 @@ def test_output_writer__leaves_nothing_on_a_full_disk(small_disk, products, size
     intervals, validity = products
 
     def fill() -> None:
-        with OutputWriter(disk / "out", HEIGHT, WIDTH, Georeferencing(), {}) as output:
+        with OutputWriter(disk / "out", RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
             (disk / "other").write_bytes(bytes(others))
             for row in range(0, HEIGHT, 100):
                 output.write(row, intervals[:, row : row + 100], validity[row : row + 100])

@@ -1,5 +1,6 @@
 """GeoTIFF in and out: images, their georeferencing, and the files of a run. The only home of rasterio and pyproj."""
 
+from sat_intervals.raster.files import RUN_FILES, File
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
 from sat_intervals.raster.layers import north_up, read_layers, write_layer, write_once
@@ -8,7 +9,9 @@ from sat_intervals.raster.windows import read_window
 from sat_intervals.raster.writer import OutputError, OutputWriter, check_space
 
 __all__ = [
+    "RUN_FILES",
     "ControlPoint",
+    "File",
     "Georeferencing",
     "Image",
     "InputError",

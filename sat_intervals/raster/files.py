@@ -1,41 +1,39 @@
 """What the files of a run say of themselves, from the tables of `sat_intervals.products`."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID
+from sat_intervals.products import BANDS, FLAGS, INVALID, Band
 
 
 @dataclass(frozen=True)
 class File:
-    """What is particular to a file of a run."""
+    """What is particular to a file: its name, type, bands, and further tags of its first band."""
 
     name: str
-    count: int
     dtype: str
     nodata: float | None
+    bands: tuple[Band, ...]
+    tags: Mapping[str, str] = field(default_factory=dict)
 
     def describe(self, dataset: DatasetWriter) -> None:
         """Give the bands their names, units and meanings."""
-        if self is INTERVALS:
-            for index, band in enumerate(BANDS, start=1):
-                dataset.set_band_description(index, band.name)
-                dataset.update_tags(index, meaning=band.meaning)
-                if band.unit:
-                    dataset.set_band_unit(index, band.unit)
-        else:
-            dataset.set_band_description(1, "validity")
-            dataset.update_tags(1, **_flag_tags())
+        for index, band in enumerate(self.bands, start=1):
+            dataset.set_band_description(index, band.name)
+            dataset.update_tags(index, meaning=band.meaning)
+            if band.unit:
+                dataset.set_band_unit(index, band.unit)
+        dataset.update_tags(1, **self.tags)
 
 
-INTERVALS = File("intervals.tif", len(BANDS), "float32", float("nan"))
-VALIDITY = File("validity.tif", 1, "uint16", None)
+# The meaning of every bit, such as ``bit_08 = occlusion (invalid): rejected by cross-checking: occlusion``.
+_FLAG_TAGS = {
+    f"bit_{flag.bit:02}": f"{flag.name}{' (invalid)' if flag.invalid else ''}: {flag.meaning}" for flag in FLAGS
+}
+_VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity & {INVALID}) == 0")
 
-
-def _flag_tags() -> dict[str, str]:
-    """The meaning of every bit, such as ``bit_08 = occlusion (invalid): rejected by cross-checking: occlusion``."""
-    bits = {
-        f"bit_{flag.bit:02}": f"{flag.name}{' (invalid)' if flag.invalid else ''}: {flag.meaning}" for flag in FLAGS
-    }
-    return {"meaning": f"sum of bits; a pixel is valid where (validity & {INVALID}) == 0", **bits}
+INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS)
+VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
+RUN_FILES = (INTERVALS, VALIDITY)

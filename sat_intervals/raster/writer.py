@@ -1,9 +1,9 @@
-"""Files out: the bands and the validity of a run as Cloud-Optimized GeoTIFFs, all of them under their names or none."""
+"""Files out: rasters of one size as Cloud-Optimized GeoTIFFs, all of them under their names or none."""
 
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +19,7 @@ from rasterio.windows import Window as Area
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
-from sat_intervals.raster.files import INTERVALS, VALIDITY, File
+from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 
 # Folder, inside that of the run, where files grow until they are whole. What a killed run left there is replaced.
@@ -45,21 +45,23 @@ class OutputError(SatIntervalsError):
 
 
 class OutputWriter:
-    """``intervals.tif`` and ``validity.tif``, from full-width strips of rows in increasing order.
+    """Files from full-width strips of rows in increasing order.
 
     ::
 
-        with OutputWriter(folder, height, width, georeferencing, tags) as writer:
+        with OutputWriter(folder, RUN_FILES, height, width, georeferencing, tags) as writer:
             writer.write(row, intervals, validity)  # strip by strip
             writer.publish()
 
-    Memory follows the strip. Until `publish` the files are in a hidden folder inside ``folder``, as plain GeoTIFFs of
-    18 bytes a pixel and then as Cloud-Optimized GeoTIFFs; leaving the context removes it, whatever happened.
+    Memory follows the strip. Until `publish` the files are in a hidden folder inside ``folder``, as plain GeoTIFFs and
+    then as Cloud-Optimized GeoTIFFs; leaving the context removes it, whatever happened.
 
     Parameters
     ----------
     folder
         Where the files go; made if missing.
+    files
+        Which.
     height, width
         Pixels.
     georeferencing
@@ -78,6 +80,7 @@ class OutputWriter:
     def __init__(
         self,
         folder: str | os.PathLike[str],
+        files: Sequence[File],
         height: int,
         width: int,
         georeferencing: Georeferencing,
@@ -87,21 +90,22 @@ class OutputWriter:
     ) -> None:
         self._folder = Path(folder)
         self._scratch = self._folder / _SCRATCH
+        self._files = tuple(files)
         self._shape = height, width
         self._georeferencing = georeferencing
         self._tags = dict(tags)
         self._threads = "ALL_CPUS" if threads is None else str(threads)
-        self._strips: dict[File, DatasetWriter] = {}
-        self._sums = {INTERVALS: 0, VALIDITY: 0}
+        self._strips: dict[str, DatasetWriter] = {}
+        self._sums = {file.name: 0 for file in files}
 
     def __enter__(self) -> Self:
         with self._failing(self._folder):
             shutil.rmtree(self._scratch, ignore_errors=True)
             self._scratch.mkdir(parents=True)
         try:
-            check_space(self._folder, *self._shape)
-            for file in (INTERVALS, VALIDITY):
-                self._strips[file] = self._create(file)
+            check_space(self._folder, self._files, *self._shape)
+            for file in self._files:
+                self._strips[file.name] = self._create(file)
         except BaseException:
             self._clean()
             raise
@@ -112,31 +116,30 @@ class OutputWriter:
     ) -> None:
         self._clean()
 
-    def write(self, row: int, intervals: np.ndarray, validity: np.ndarray) -> None:
-        """Write the strip that begins at ``row``: ``(4, rows, width)`` in the order of BANDS, and ``(rows, width)``."""
-        area = Area(0, row, self._shape[1], validity.shape[0])
-        for file, bands in ((INTERVALS, intervals), (VALIDITY, validity[np.newaxis])):
-            bands = np.ascontiguousarray(bands, file.dtype)
+    def write(self, row: int, *rasters: np.ndarray) -> None:
+        """Write the strip that begins at ``row``: of each file ``(bands, rows, width)``, or ``(rows, width)``."""
+        for file, raster in zip(self._files, rasters, strict=True):
+            bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
+            area = Area(0, row, self._shape[1], bands.shape[1])
             with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
-                self._strips[file].write(bands, window=area)
-            self._sums[file] += _sum(bands)
+                self._strips[file.name].write(bands, window=area)
+            self._sums[file.name] += _sum(bands)
 
     def build(self) -> None:
         """Make the files that `publish` names, and read them back."""
         with ThreadPoolExecutor() as threads:  # GDAL's own threads compress, but one alone reads and writes a file
             list(threads.map(self._build, list(self._strips)))
 
-    def _build(self, file: File) -> None:
-        strips = self._strips[file]
-        whole = self._scratch / file.name
+    def _build(self, name: str) -> None:
+        strips, whole = self._strips[name], self._scratch / name
         options = _COG | {"NUM_THREADS": self._threads}
-        with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
+        with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
             self._add_overviews(strips)
             strips.close()
-            del self._strips[file]
+            del self._strips[name]
             copy(strips.name, str(whole), driver="COG", **options)
             _flush(whole)
-            self._verify(whole, self._sums[file])
+            self._verify(whole, self._sums[name])
         os.unlink(strips.name)
 
     def publish(self, texts: Mapping[str, str] | None = None) -> None:
@@ -147,7 +150,7 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 (self._scratch / name).write_text(text, encoding="utf-8")
                 _flush(self._scratch / name)
-        names = (INTERVALS.name, VALIDITY.name, *texts)
+        names = (*(file.name for file in self._files), *texts)
         try:
             for name in names:
                 with self._failing(self._folder / name):
@@ -161,7 +164,7 @@ class OutputWriter:
     def _create(self, file: File) -> DatasetWriter:
         """A plain GeoTIFF for the strips, with all that is said of the file."""
         height, width = self._shape
-        kind = {"count": file.count, "dtype": file.dtype, "nodata": file.nodata}
+        kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
         options = _STRIPS | kind | self._georeferencing.creation_options()
         with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
             strips = gdal.create(str(self._scratch / f"strips-{file.name}"), height=height, width=width, **options)
@@ -203,7 +206,9 @@ class OutputWriter:
             return error.strerror
         # GDAL keeps the system's reason to itself. A Cloud-Optimized GeoTIFF is made with its overviews twice.
         free = shutil.disk_usage(self._folder).free
-        full = f"{os.strerror(errno.ENOSPC)}, {_size(free)} free: " if free < 2 * _bytes(*self._shape) else ""
+        full = (
+            f"{os.strerror(errno.ENOSPC)}, {_size(free)} free: " if free < 2 * _bytes(self._files, *self._shape) else ""
+        )
         return full + gdal.reason(error)
 
     def _clean(self) -> None:
@@ -214,22 +219,22 @@ class OutputWriter:
         shutil.rmtree(self._scratch, ignore_errors=True)
 
 
-def check_space(folder: Path, height: int, width: int) -> None:
-    """Refuse a folder that has no room for the bands of so many pixels.
+def check_space(folder: Path, files: Sequence[File], height: int, width: int) -> None:
+    """Refuse a folder that has no room for files of so many pixels.
 
     Raises
     ------
     OutputError
         With the figures.
     """
-    needed, free = _bytes(height, width), shutil.disk_usage(folder).free
+    needed, free = _bytes(files, height, width), shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(f"{folder} has {_size(free)} left, the bands need {_size(needed)} to begin with: {_WAY_OUT}")
 
 
-def _bytes(height: int, width: int) -> int:
+def _bytes(files: Sequence[File], height: int, width: int) -> int:
     """Of all bands uncompressed."""
-    return height * width * sum(file.count * np.dtype(file.dtype).itemsize for file in (INTERVALS, VALIDITY))
+    return height * width * sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in files)
 
 
 def _areas(dataset: DatasetReader) -> Iterator[Area]:
