@@ -11,6 +11,7 @@ import click
 from sat_intervals.cli.ablate import ablate
 from sat_intervals.cli.batch import batch
 from sat_intervals.cli.demo import demo
+from sat_intervals.cli.dsm import dsm
 from sat_intervals.cli.evaluate import evaluate
 from sat_intervals.cli.match import match
 from sat_intervals.cli.plan import plan
@@ -19,6 +20,7 @@ from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
 from sat_intervals.cli.status import status
+from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
 RESUMED = ("match", "demo", "batch")
@@ -81,3 +83,5 @@ main.add_command(plot)
 main.add_command(report)
 main.add_command(evaluate)
 main.add_command(ablate)
+main.add_command(triangulate)
+main.add_command(dsm)

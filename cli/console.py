@@ -16,6 +16,9 @@ STAGES = {
     "kernels": "preparing kernels (compiled once a machine, then about a second)",
     "tiles": "matching tiles",
     "bands": "finishing rows",
+    "points": "triangulating rows",
+    "extent": "reading points",
+    "cells": "filling rows of cells",
     "files": "writing files",
 }
 

@@ -5,7 +5,8 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.match import overrides, path, run_options
+from sat_intervals.cli.match import overrides, run_options
+from sat_intervals.cli.options import path
 
 
 @click.command(short_help="Make a scene of known truth, match it, compare.")

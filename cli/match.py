@@ -6,27 +6,9 @@ from typing import Any, TypeVar
 
 import click
 
+from sat_intervals.cli.options import debug_option, named, path, quiet_option
+
 Number = TypeVar("Number", int, float)
-
-
-def named(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
-    """Refuse names that the shell makes of a variable that is not set, and those that GDAL cannot be told."""
-    if value == "":
-        raise click.BadParameter("it is empty: name a file or folder")
-    try:
-        (value or "").encode()
-    except UnicodeEncodeError as error:
-        raise click.BadParameter(f"{value!r} is no UTF-8: rename it") from error
-    return value
-
-
-def path(context: click.Context, parameter: click.Parameter, value: str | None) -> Path | None:
-    """Make a path of a name: one of an empty name would be the current folder."""
-    return None if value is None else Path(str(named(context, parameter, value)))
-
-
-def _debug(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    context.meta["sat_intervals.debug"] = value
 
 
 def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -45,8 +27,8 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles in OUT/tiles."),
         click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
-        click.option("--quiet", is_flag=True, help="Print errors only."),
-        click.option("--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."),
+        quiet_option,
+        debug_option,
     ]
     for option in reversed(options):
         command = option(command)

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.options import debug_option
+
 if TYPE_CHECKING:
     from sat_intervals.tables import Scene
-
-
-def _debug(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    context.meta["sat_intervals.debug"] = value
 
 
 def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -34,7 +32,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Truth so far outside an interval still counts as inside; for truth given in steps, half a step.",
         ),
         click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
-        click.option("--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."),
+        debug_option,
     ]
     for option in reversed(options):
         command = option(command)

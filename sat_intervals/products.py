@@ -1,4 +1,4 @@
-"""What a run writes: the bands, the validity bits, the states of an input pixel. One table for every reader."""
+"""What is written: bands, validity bits, and the states of an input pixel. One table for every reader."""
 
 from dataclasses import dataclass
 
@@ -57,7 +57,7 @@ FLAGS = (
 
 @dataclass(frozen=True)
 class Band:
-    """One band of ``intervals.tif``: its name (the GeoTIFF description), unit ("" = none) and meaning."""
+    """One band of a file: its name (the GeoTIFF description), unit ("" = none) and meaning."""
 
     name: str
     unit: str
@@ -69,4 +69,28 @@ BANDS = (
     Band("lower", "px", "lower bound of the disparity interval"),
     Band("upper", "px", "upper bound of the disparity interval"),
     Band("confidence", "", "confidence from ambiguity, 0 to 1, high = easy to tell"),
+)
+
+# Of points.tif: longitude and latitude in degrees, heights in metres above the ellipsoid of WGS 84 (EPSG:4979).
+POINTS = (
+    Band("longitude", "degree", "of the point that the disparity gives, WGS 84 (EPSG:4979)"),
+    Band("latitude", "degree", "of the same point"),
+    Band("height", "m", "of the same point above the ellipsoid of WGS 84"),
+    Band("height_lower", "m", "the lower of the heights that the two bounds of the disparity give"),
+    Band("height_upper", "m", "the upper of them"),
+    Band("residual", "m", "distance of the point from either line of sight: tells models that do not fit, not matches"),
+    Band("longitude_lower", "degree", "of the point at height_lower, which lies on the same left line of sight"),
+    Band("latitude_lower", "degree", "of the point at height_lower"),
+    Band("longitude_upper", "degree", "of the point at height_upper"),
+    Band("latitude_upper", "degree", "of the point at height_upper"),
+)
+
+# Of a surface model.
+SURFACE = (
+    Band("height", "m", "mean of the points that reach the cell, the nearer the heavier"),
+    Band("height_lower", "m", "lower bound of the height"),
+    Band("height_upper", "m", "upper bound of the height"),
+    Band("count", "", "points that reach the cell"),
+    Band("confidence", "", "mean of their confidences, 0 to 1, high = easy to match"),
+    Band("agreement", "", "1 where the intervals of several pairs meet, 0 where they do not; no data for one pair"),
 )

@@ -1,14 +1,16 @@
 """GeoTIFF in and out: images, their georeferencing, and the files of a run. The only home of rasterio and pyproj."""
 
-from sat_intervals.raster.files import RUN_FILES, File
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
-from sat_intervals.raster.layers import north_up, read_layers, write_layer, write_once
+from sat_intervals.raster.layers import north_up, read_layers, read_tags, write_layer, write_once
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
+from sat_intervals.raster.projection import Projection, utm_of
 from sat_intervals.raster.windows import read_window
 from sat_intervals.raster.writer import OutputError, OutputWriter, check_space
 
 __all__ = [
+    "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
     "File",
@@ -17,6 +19,7 @@ __all__ = [
     "InputError",
     "OutputError",
     "OutputWriter",
+    "Projection",
     "check_pair",
     "check_space",
     "north_up",
@@ -25,7 +28,10 @@ __all__ = [
     "read_layers",
     "read_small_image",
     "read_small_layers",
+    "read_tags",
     "read_window",
+    "surface_file",
+    "utm_of",
     "write_layer",
     "write_once",
 ]

@@ -5,18 +5,19 @@ from dataclasses import dataclass, field
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, Band
+from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, Band
 
 
 @dataclass(frozen=True)
 class File:
-    """What is particular to a file: its name, type, bands, and further tags of its first band."""
+    """What is particular to a file: its name, type, bands, further tags of its first band, TIFF predictor."""
 
     name: str
     dtype: str
     nodata: float | None
     bands: tuple[Band, ...]
     tags: Mapping[str, str] = field(default_factory=dict)
+    predictor: str = "NO"
 
     def describe(self, dataset: DatasetWriter) -> None:
         """Give the bands their names, units and meanings."""
@@ -37,3 +38,9 @@ _VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity
 INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS)
 VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
 RUN_FILES = (INTERVALS, VALIDITY)
+POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT"),)
+
+
+def surface_file(name: str) -> File:
+    """A surface model."""
+    return File(name, "float32", float("nan"), SURFACE)

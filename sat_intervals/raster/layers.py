@@ -17,9 +17,9 @@ from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
 
 
-def north_up(epsg: int, x: float, y: float, pixel: float) -> Georeferencing:
+def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing:
     """The georeferencing of an image whose upper left corner is at ``x, y`` of a CRS, with square pixels."""
-    return Georeferencing(crs=CRS.from_epsg(epsg), transform=Affine(pixel, 0.0, x, 0.0, -pixel, y))
+    return Georeferencing(crs=CRS.from_user_input(crs), transform=Affine(pixel, 0.0, x, 0.0, -pixel, y))
 
 
 def write_layer(
@@ -58,3 +58,9 @@ def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> n
     area = window and Area(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
         return np.asarray(dataset.read(window=area))
+
+
+def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:
+    """What a file says of itself as a whole."""
+    with opened(str(path)) as dataset:
+        return dict(dataset.tags())

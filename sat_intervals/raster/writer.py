@@ -28,8 +28,8 @@ _SCRATCH = ".unpublished"
 # which the final files are made in four fifths of the time.
 _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "band", "bigtiff": "IF_SAFER"}
 # DEFLATE is read by all that read GeoTIFF. On the bands of a Pleiades pair level 1 makes 5.4 Mpx a second and core, and
-# 49 bits a pixel; level 6, 3.2 and 46; no compression, 9.1 and 186. Predictors make it slower and larger (4.3 and 63):
-# bounds are whole numbers and V-fits fractions of small ones, which come back byte for byte.
+# 49 bits a pixel; level 6, 3.2 and 46; no compression, 9.1 and 186. Predictors make these slower and larger (4.3 and
+# 63): bounds are whole numbers and V-fits fractions of small ones, which come back byte for byte.
 _COG = {"COMPRESS": "DEFLATE", "LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
 # Pixels of a side below which there is no smaller overview.
 _OVERVIEW_SIZE = 512
@@ -128,11 +128,11 @@ class OutputWriter:
     def build(self) -> None:
         """Make the files that `publish` names, and read them back."""
         with ThreadPoolExecutor() as threads:  # GDAL's own threads compress, but one alone reads and writes a file
-            list(threads.map(self._build, list(self._strips)))
+            list(threads.map(self._build, [file for file in self._files if file.name in self._strips]))
 
-    def _build(self, name: str) -> None:
-        strips, whole = self._strips[name], self._scratch / name
-        options = _COG | {"NUM_THREADS": self._threads}
+    def _build(self, file: File) -> None:
+        name, strips, whole = file.name, self._strips[file.name], self._scratch / file.name
+        options = _COG | {"NUM_THREADS": self._threads, "PREDICTOR": file.predictor}
         with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
             self._add_overviews(strips)
             strips.close()

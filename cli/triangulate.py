@@ -1,0 +1,42 @@
+"""``sat-intervals triangulate``: points and heights of a run."""
+
+from pathlib import Path
+
+import click
+
+from sat_intervals.cli.options import debug_option, path, quiet_option
+
+
+@click.command(short_help="Points and heights of a run, with bounds, through sensor models.")
+@click.argument("out", callback=path)
+@click.option("--left-model", required=True, callback=path, metavar="FILE", help="RPC model of the left sensor image.")
+@click.option(
+    "--right-model", required=True, callback=path, metavar="FILE", help="RPC model of the right sensor image."
+)
+@click.option("--left-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the left image.")
+@click.option("--right-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the right image.")
+@quiet_option  # type: ignore[untyped-decorator]
+@debug_option  # type: ignore[untyped-decorator]
+def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path, quiet: bool) -> None:
+    """Triangulate the disparity and both bounds of the finished run in the folder OUT.
+
+    \b
+    OUT/points.tif   longitude, latitude, height, height_lower, height_upper, residual, where the bounds' points lie
+
+    Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files; grids hold the sensor column and row (bands 1 and 2) of
+    epipolar positions, as CARS and shareloc write them. Needs shareloc: pip install 'sat-intervals[dsm]'.
+    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
+    from sat_intervals.cli.console import Console
+    from sat_intervals.triangulation import triangulate
+
+    with Console(quiet) as console:
+        report = triangulate(out, left_model, right_model, left_grid, right_grid, progress=console.progress)
+    if report["points"]:
+        (lowest, highest), residual = report["height"], report["residual"][1]
+        console.say(
+            f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid, "
+            f"lines of sight at most {residual:.2g} m apart"
+        )
+    else:
+        console.say("no valid pixel, no points")
+    console.say(str(out / "points.tif"))

@@ -1,0 +1,51 @@
+"""Trilinear interpolation of what varies smoothly with row, column and disparity.
+
+Letters: r row, c column, i, j, k node of the lattice along rows, columns and disparities, v value.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(nogil=True, cache=True)
+def interpolate(lattice, spacing, first, disparity):
+    """Values at the disparities of some pixels.
+
+    Parameters
+    ----------
+    lattice
+        ``(rows, columns, disparities, values)`` float64 at the nodes, at least two along every axis.
+    spacing
+        Pixels between nodes along rows, columns and disparities.
+    first
+        Row, column and disparity of the first node, in the frame in which the first pixel is ``0, 0``.
+    disparity
+        ``(rows, columns)`` in pixels, NaN for none.
+
+    Returns
+    -------
+    ``(values, rows, columns)`` float64, NaN where there is no disparity.
+    """
+    rows, columns = disparity.shape
+    values = lattice.shape[3]
+    result = np.full((values, rows, columns), np.nan)
+    for r in range(rows):
+        y = (r - first[0]) / spacing[0]
+        i = min(max(int(np.floor(y)), 0), lattice.shape[0] - 2)
+        y -= i
+        for c in range(columns):
+            if np.isnan(disparity[r, c]):
+                continue
+            x = (c - first[1]) / spacing[1]
+            j = min(max(int(np.floor(x)), 0), lattice.shape[1] - 2)
+            x -= j
+            z = (disparity[r, c] - first[2]) / spacing[2]
+            k = min(max(int(np.floor(z)), 0), lattice.shape[2] - 2)
+            z -= k
+            for v in range(values):
+                near = (1 - x) * lattice[i, j, k, v] + x * lattice[i, j + 1, k, v]
+                far = (1 - x) * lattice[i + 1, j, k, v] + x * lattice[i + 1, j + 1, k, v]
+                near_up = (1 - x) * lattice[i, j, k + 1, v] + x * lattice[i, j + 1, k + 1, v]
+                far_up = (1 - x) * lattice[i + 1, j, k + 1, v] + x * lattice[i + 1, j + 1, k + 1, v]
+                result[v, r, c] = (1 - z) * ((1 - y) * near + y * far) + z * ((1 - y) * near_up + y * far_up)
+    return result

@@ -1,0 +1,56 @@
+"""Points on the ground to the cells of a grid.
+
+Letters: i, j row and column of a cell, u, v position of a point in cells from the grid's upper left corner.
+"""
+
+import numpy as np
+from numba import njit
+
+# What is gathered of a cell.
+WEIGHT, HEIGHT, CONFIDENCE, LOWER, UPPER, LEAST, MOST, COUNT = range(8)
+
+
+def empty_cells(rows: int, columns: int) -> np.ndarray:
+    """Cells that no point has reached: ``(8, rows, columns)`` float64, see `splat`."""
+    cells = np.zeros((8, rows, columns))
+    cells[LEAST], cells[MOST] = np.inf, -np.inf
+    return cells
+
+
+@njit(nogil=True, cache=True)
+def splat(column, row, height, lower, upper, confidence, radius, cells):
+    """Let points reach all cells whose centre lies within a radius.
+
+    A point weighs ``exp(-d^2 / 2)`` at a distance of ``d`` cells.
+
+    Parameters
+    ----------
+    column, row
+        ``(n,)`` positions in cells from the upper left corner of the first cell; those of centres end in one half.
+    height, lower, upper, confidence
+        ``(n,)``; a point of NaN height reaches nothing.
+    radius
+        In cells.
+    cells
+        ``(8, rows, columns)`` float64, updated: sums of weights and of weighted height, confidence, lower and upper
+        bound, the least lower bound, the largest upper bound, the number of points.
+    """
+    rows, columns = cells.shape[1:]
+    for n in range(height.size):
+        if np.isnan(height[n]):
+            continue
+        u, v = column[n] - 0.5, row[n] - 0.5
+        for i in range(max(0, int(np.ceil(v - radius))), min(rows, int(np.floor(v + radius)) + 1)):
+            for j in range(max(0, int(np.ceil(u - radius))), min(columns, int(np.floor(u + radius)) + 1)):
+                square = (i - v) ** 2 + (j - u) ** 2
+                if square > radius**2:
+                    continue
+                weight = np.exp(-0.5 * square)
+                cells[WEIGHT, i, j] += weight
+                cells[HEIGHT, i, j] += weight * height[n]
+                cells[CONFIDENCE, i, j] += weight * confidence[n]
+                cells[LOWER, i, j] += weight * lower[n]
+                cells[UPPER, i, j] += weight * upper[n]
+                cells[LEAST, i, j] = min(cells[LEAST, i, j], lower[n])
+                cells[MOST, i, j] = max(cells[MOST, i, j], upper[n])
+                cells[COUNT, i, j] += 1

@@ -1,0 +1,75 @@
+"""Longitude and latitude to a map, and ellipsoidal heights to a geoid."""
+
+from pathlib import Path
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
+from pyproj.exceptions import CRSError, ProjError
+
+from sat_intervals.errors import SatIntervalsError
+
+_GEOGRAPHIC = "EPSG:4326"
+
+
+def utm_of(longitude: float, latitude: float) -> str:
+    """The UTM zone of a place (degrees), such as ``EPSG:32637``."""
+    area = AreaOfInterest(longitude, latitude, longitude, latitude)
+    zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)
+    if not zones:
+        raise SatIntervalsError(f"no UTM zone at longitude {longitude:.2f}, latitude {latitude:.2f}: give --crs")
+    return f"EPSG:{zones[0].code}"
+
+
+class Projection:
+    """Points to map coordinates in metres, and heights above the ellipsoid to heights above a geoid.
+
+    Parameters
+    ----------
+    crs
+        A projected CRS in metres, such as ``EPSG:32637``.
+    geoid
+        A grid of geoid heights that PROJ reads (GTX, GeoTIFF); None leaves heights above the ellipsoid.
+
+    Raises
+    ------
+    SatIntervalsError
+        Another CRS, a grid that cannot be read.
+    """
+
+    def __init__(self, crs: str, geoid: Path | None = None) -> None:
+        try:
+            target = CRS.from_user_input(crs)
+        except CRSError as error:
+            raise SatIntervalsError(f"{crs} is no CRS that PROJ knows: give one such as EPSG:32637") from error
+        if not target.is_projected or target.axis_info[0].unit_name != "metre":
+            raise SatIntervalsError(
+                f"{crs} ({target.name}) is no map in metres: give a projected CRS such as EPSG:32637"
+            )
+        self.crs = crs
+        self._map = Transformer.from_crs(_GEOGRAPHIC, target, always_xy=True)
+        self._geoid = None if geoid is None else _geoid(geoid)
+
+    def place(self, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Easting and northing in metres."""
+        return self._map.transform(longitude, latitude)
+
+    def undulation(self, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
+        """Metres from the ellipsoid up to the geoid; 0 without one, NaN beyond its grid."""
+        if self._geoid is None:
+            return np.zeros(longitude.shape)
+        height = np.asarray(self._geoid.transform(longitude, latitude, np.zeros(longitude.shape))[2])
+        return np.where(np.isfinite(height), -height, np.nan)
+
+
+def _geoid(path: Path) -> Transformer:
+    if not path.is_file():
+        raise SatIntervalsError(f"{path}: no such file: give a grid of geoid heights")
+    radians = "+proj=unitconvert +xy_in=deg +xy_out=rad"
+    degrees = "+proj=unitconvert +xy_in=rad +xy_out=deg"
+    shift = f'+proj=vgridshift +grids="{path.resolve()}" +multiplier=-1'
+    try:
+        return Transformer.from_pipeline(f"+proj=pipeline +step {radians} +step {shift} +step {degrees}")
+    except ProjError as error:
+        raise SatIntervalsError(f"{path} is no grid of geoid heights that PROJ reads: {error}") from error
