@@ -21,9 +21,9 @@ FLOORS = [
     {"conclude"},
     {"tile"},
     {"job"},
-    {"evaluation"},
+    {"evaluation", "triangulation", "surface"},
     {"finish", "patch", "demo", "results"},
-    {"store", "raster", "cluster", "memory", "seams", "summary"},
+    {"store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
     {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
     {"tiling", "products", "errors", "configs"},
 ]
@@ -41,6 +41,7 @@ HOMES = {
     "pyproj": {"raster"},
     "rasterio": {"raster"},
     "rich": {"cli"},
+    "shareloc": {"geometry"},
     "zarr": {"store"},
 }
 

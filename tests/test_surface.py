@@ -1,0 +1,208 @@
+"""Surface models from points that the tests make up."""
+
+import numpy as np
+import pytest
+import rasterio
+from click.testing import CliRunner
+from finished import write_run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from pyproj import Transformer
+from rasterio.transform import Affine
+
+from sat_intervals import SatIntervalsError
+from sat_intervals.cli import main
+from sat_intervals.kernels.splat import empty_cells, splat
+from sat_intervals.products import POINTS, SURFACE
+from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, Projection
+from sat_intervals.surface import make_surface
+
+FINISHED = "2026-11-21T12:00:00+00:00"  # of the runs that finished.write_run writes
+TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
+BAND = {band.name: index for index, band in enumerate(SURFACE)}
+LEFT, TOP = 370_000.0, 4_830_000.0
+
+
+def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run=FINISHED):
+    """A run whose pixels are points at map places (metres from LEFT, TOP; y upwards), NaN height for none."""
+    x, y, height = (np.atleast_2d(np.asarray(values, np.float64)) for values in (x, y, height))
+    folder.mkdir(exist_ok=True)
+    bands = np.full((4, *height.shape), 1.0, np.float32)
+    bands[3] = confidence
+    out = write_run(folder, bands, np.zeros(height.shape, np.uint16))
+    longitude, latitude = TO_DEGREES.transform(LEFT + x, TOP + y)
+    nothing = np.isnan(height)
+    layers = dict.fromkeys((band.name for band in POINTS), np.zeros(height.shape)) | {
+        "longitude": longitude,
+        "latitude": latitude,
+        "height": height,
+        "height_lower": height - lower,
+        "height_upper": height + upper,
+    }
+    points = np.stack([np.where(nothing, np.nan, layers[band.name]) for band in POINTS])
+    with OutputWriter(out, POINT_FILES, *height.shape, Georeferencing(), {"RUN": run}) as writer:
+        writer.write(0, points)
+        writer.publish()
+    return out
+
+
+def surface_of(outs, tmp_path, **options):
+    report = make_surface(outs, tmp_path / "dsm.tif", **{"resolution": 1.0, "crs": "EPSG:32631"} | options)
+    with rasterio.open(tmp_path / "dsm.tif") as dataset:
+        return dataset.read(), dataset.transform, report
+
+
+def cell_of(place, x, y):
+    """Row and column of the cell in which a map place falls."""
+    return np.floor((y - place.f) / place.e).astype(int), np.floor((x - place.c) / place.a).astype(int)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_splat__equals_its_slow_twin(data):
+    rows, columns, count = (data.draw(st.integers(1, top)) for top in (6, 7, 12))
+    random = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    radius = data.draw(st.floats(0.3, 3.0))
+    column, row = random.uniform(-2, columns + 2, count), random.uniform(-2, rows + 2, count)
+    height, confidence = random.normal(50, 10, count), random.random(count)
+    height[random.random(count) < 0.2] = np.nan
+    lower, upper = height - random.random(count), height + random.random(count)
+    cells = empty_cells(rows, columns)
+    splat(column, row, height, lower, upper, confidence, radius, cells)
+    for i in range(rows):
+        for j in range(columns):
+            distance = np.hypot(column - (j + 0.5), row - (i + 0.5))
+            near = (distance <= radius) & ~np.isnan(height)
+            weight = np.exp(-(distance[near] ** 2) / 2)
+            sums = [weight.sum(), *((weight * band[near]).sum() for band in (height, confidence, lower, upper))]
+            assert_allclose(cells[:5, i, j], sums, atol=1e-9)
+            assert cells[5, i, j] == min(lower[near], default=np.inf)
+            assert cells[6, i, j] == max(upper[near], default=-np.inf)
+            assert cells[7, i, j] == near.sum()
+
+
+def test_make_surface__worked_example(tmp_path):
+    # Cells of 1 m, radius 0.6 m. Points at (0.5, -0.5) and (0.5, -0.9), heights 10 and 14: the first reaches cell
+    # (0, 0) alone, from its centre; the second lies 0.4 m below that centre and 0.6 m above that of cell (1, 0).
+    # Cell (0, 0): weights 1 and exp(-.08) = .92312; height (10 + .92312 x 14) / 1.92312 = 11.9200; bounds 9 and 16.
+    # Cell (1, 0): the second point alone: 14, 13 to 16. Nothing reaches the point at (3.5, -0.5) but its own cell: 20.
+    out = write_points(tmp_path / "a", [0.5, 0.5, 3.5, 9], [-0.5, -0.9, -0.5, 0], [10, 14, 20, np.nan])
+    surface, place, report = surface_of([out], tmp_path, radius=0.6001)
+    i, j = cell_of(place, LEFT, TOP)
+    expected = {(0, 0): (11.92, 9, 16, 2), (1, 0): (14, 13, 16, 1), (0, 3): (20, 19, 22, 1), (1, 3): (np.nan,) * 4}
+    for (row, column), values in expected.items():
+        assert_allclose(surface[:4, i + row, j + column], values, atol=1e-4)
+    assert_allclose(surface[BAND["confidence"], i, j], 0.5)
+    assert np.isnan(surface[BAND["agreement"]]).all()
+    assert (place.a, place.e, place.c % 1, place.f % 1) == (1, -1, 0, 0)
+    assert report["points"] == 3
+    assert report["filled"] == np.isfinite(surface[0]).mean()
+    assert report["disagreeing"] is None
+
+
+def test_make_surface__the_envelope_holds_every_point_and_the_mean_lies_inside(tmp_path):
+    random = np.random.default_rng(1)
+    x, y = random.uniform(0, 9, (2, 20, 20))
+    height = random.normal(100, 5, x.shape)
+    out = write_points(tmp_path / "a", x, -y, height)
+    wide, place, _ = surface_of([out], tmp_path, radius=1.0)
+    narrow, _, _ = surface_of([out], tmp_path, radius=1.0, interval="mean")
+    row, column = cell_of(place, LEFT + x, TOP - y)
+    assert (wide[1, row, column] <= height - 1 + 1e-4).all()
+    assert (wide[2, row, column] >= height + 2 - 1e-4).all()
+    filled = np.isfinite(wide[0])
+    assert (wide[1] <= wide[0])[filled].all()
+    assert (wide[0] <= wide[2])[filled].all()
+    assert_allclose((narrow[2] - narrow[1])[filled], 3.0, atol=1e-4)
+    assert_allclose(narrow[0], wide[0])
+
+
+def test_make_surface__several_runs_are_intersected_where_they_meet(tmp_path):
+    # Three cells 10 m apart. One run says 9 to 12 in each, the other 10 to 13, 29 to 32, and nothing.
+    one = write_points(tmp_path / "a", [0.5, 10.5, 20.5], [-0.5] * 3, [10.0] * 3, confidence=1.0)
+    two = write_points(tmp_path / "b", [0.5, 10.5, 20.5], [-0.5] * 3, [11.0, 30.0, np.nan], confidence=0.0)
+    for outs in ([one, two], [two, one]):
+        surface, place, report = surface_of(outs, tmp_path, radius=0.6)
+        i, j = cell_of(place, LEFT, TOP)
+        cells = surface[:, i, [j, j + 10, j + 20]]
+        assert_allclose(cells[BAND["height_lower"]], [10, 9, 9], atol=1e-4)
+        assert_allclose(cells[BAND["height_upper"]], [12, 32, 12], atol=1e-4)
+        assert_allclose(cells[BAND["height"]], [10.5, 20, 10], atol=1e-4)
+        assert_allclose(cells[BAND["confidence"]], [0.5, 0.5, 1.0], atol=1e-4)
+        assert_array_equal(cells[BAND["count"]], [2, 2, 1])
+        assert_array_equal(cells[BAND["agreement"]], [1, 0, np.nan])
+        assert report["disagreeing"] == 0.5
+
+
+def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
+    random = np.random.default_rng(2)
+    x, y = random.uniform(0, 40, (2, 12, 12))
+    out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
+    whole, place, _ = surface_of([out], tmp_path)
+    monkeypatch.setattr("sat_intervals.surface._WINDOW", 7)
+    monkeypatch.setattr("sat_intervals.surface._TILE_ROWS", 20)
+    monkeypatch.setattr("sat_intervals.surface._TILE_COLUMNS", 25)
+    tiled, same_place, _ = surface_of([out], tmp_path)
+    assert place == same_place
+    assert_allclose(tiled, whole, atol=1e-4)
+    assert_array_equal(tiled[3], whole[3])
+
+
+def test_make_surface__file_says_what_it_is(tmp_path):
+    out = write_points(tmp_path / "a", [0.5, 1.5], [-0.5, -0.5], [10.0, 11.0])
+    make_surface([out], tmp_path / "new" / "model.tif", resolution=1.0)
+    with rasterio.open(tmp_path / "new" / "model.tif") as dataset:
+        assert dataset.crs.to_epsg() == 32631  # the zone of the points
+        assert dataset.descriptions == tuple(band.name for band in SURFACE)
+        assert dataset.units[:3] == ("m", "m", "m")
+        assert np.isnan(dataset.nodata)
+        tags = dataset.tags()
+    assert (tags["INTERVAL"], tags["RADIUS"]) == ("envelope", "1 m")
+    assert tags["HEIGHTS"] == "above the WGS 84 ellipsoid"
+
+
+def write_geoid(path, height):
+    """A geoid at one height over the whole area."""
+    kind = {"height": 4, "width": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(path, "w", driver="GTiff", transform=Affine(1, 0, 0, 0, -1, 46), **kind) as grid:
+        grid.write(np.full((1, 4, 4), height, np.float32))
+    return path
+
+
+def test_make_surface__heights_count_from_a_geoid(tmp_path):
+    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
+    surface, _, _ = surface_of([out], tmp_path, geoid=write_geoid(tmp_path / "geoid.tif", 49.5), radius=0.6)
+    filled = np.isfinite(surface[0])
+    assert_allclose(surface[:3, filled].T, [[50.5, 49.5, 52.5]], atol=1e-3)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:2274", "nonsense"])
+def test_projection__refuses_what_is_no_map_in_metres(crs):
+    with pytest.raises(SatIntervalsError, match="EPSG:32637"):
+        Projection(crs)
+
+
+def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
+    plain = write_run(tmp_path, np.ones((4, 3, 3), np.float32), np.zeros((3, 3), np.uint16))
+    old = write_points(tmp_path / "old", [0.5], [-0.5], [1.0], run="another")
+    empty = write_points(tmp_path / "empty", [0.5], [-0.5], [np.nan])
+    far = [write_points(tmp_path / f"far{x}", [x], [-0.5], [1.0]) for x in (0, 200_000)]
+    (tmp_path / "geoid.txt").write_text("no grid")
+    cases = [
+        ([plain], [], "has no points.tif: run sat-intervals triangulate on it first"),
+        ([old], [], "is of an earlier run"),
+        ([empty], [], "no valid pixel"),
+        (far, [], "choose a coarser --resolution, or runs of one place"),
+        ([far[0]], ["--resolution", "-1"], "--resolution is -1, it must be above 0"),
+        ([far[0]], ["--geoid", str(tmp_path / "none.gtx")], "none.gtx: no such file"),
+        ([far[0]], ["--crs", "EPSG:4326"], "is no map in metres"),
+        ([tmp_path / "nowhere"], [], "give the folder of a finished run"),
+    ]
+    for outs, options, message in cases:
+        words = ["dsm", *map(str, outs), "--resolution", "1", *options]
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+        assert result.stderr.count("\n") == 1
+        assert not (outs[0] / "dsm.tif").exists()

@@ -1,0 +1,268 @@
+"""Points and heights: cameras of known geometry, shareloc's own points, a real pair and a peer's surface of it."""
+
+import csv
+import os
+
+import numpy as np
+import pytest
+import rasterio
+from click.testing import CliRunner
+from finished import MAXIMUM, MINIMUM, write_run
+from rasterio.rpc import RPC
+from rasterio.transform import Affine
+from rasterio.warp import reproject
+
+from sat_intervals import match_pair
+from sat_intervals.cli import main
+from sat_intervals.products import INVALID, POINTS
+from sat_intervals.scene import DATUM, PIXEL, VIEWS, make_scene
+from sat_intervals.surface import make_surface
+from sat_intervals.tiling import Window
+
+if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") != "1":
+    pytest.importorskip("shareloc", reason="needs the extra [dsm]")
+
+from sat_intervals.geometry import Lattice, Sensors
+from sat_intervals.triangulation import triangulate
+
+# Epipolar images have no georeferencing.
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+# Where the scene stands, and metres in a degree there, of longitude and of latitude.
+LONGITUDE, LATITUDE = 1.45, 43.6
+EAST, NORTH = 80_700.0, 111_110.0
+BAND = {band.name: index for index, band in enumerate(POINTS)}
+
+
+def camera(path, view):
+    """Write the RPC of a view of the procedural scene: column = u + a (h - h0), row down the latitudes."""
+    scale = 0.01, 60.0  # degrees, metres; over a few metres lines in degrees are straight
+    column, line, one = np.zeros(20), np.zeros(20), np.eye(20)[0]
+    column[1], column[3] = EAST / PIXEL * scale[0], VIEWS[view] * scale[1]
+    line[2] = -NORTH / PIXEL * scale[0]
+    rpc = RPC(
+        line_off=0.0, line_scale=1.0, samp_off=0.0, samp_scale=1.0,
+        lat_off=LATITUDE, lat_scale=scale[0], long_off=LONGITUDE, long_scale=scale[0],
+        height_off=DATUM, height_scale=scale[1],
+        line_num_coeff=list(line), line_den_coeff=list(one), samp_num_coeff=list(column), samp_den_coeff=list(one),
+    )  # fmt: skip
+    with rasterio.open(
+        path, "w", driver="GTiff", height=8, width=8, count=1, dtype="uint8", crs="EPSG:4326", rpcs=rpc
+    ) as dataset:
+        dataset.write(np.zeros((1, 8, 8), np.uint8))
+    return path
+
+
+def grid(path, rows, columns, *, step=20, offset=0.5):
+    """Write the grid that leads every position to the same of the sensor, whose first pixel centre is at one half."""
+    row, column = (np.arange(-2 * step, size + 3 * step, step, dtype=np.float64) for size in (rows, columns))
+    positions = np.stack(np.broadcast_arrays(column + offset, row[:, None] + offset))
+    place = Affine(step, 0, column[0] - step / 2, 0, step, row[0] - step / 2)
+    kind = {"height": row.size, "width": column.size, "count": 2, "dtype": "float64"}
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:4326", transform=place, **kind) as dataset:
+        dataset.write(positions)
+    return path
+
+
+def cameras(folder, rows, columns):
+    return [
+        camera(folder / "left_model.tif", 0),
+        camera(folder / "right_model.tif", 1),
+        grid(folder / "left_grid.tif", rows, columns),
+        grid(folder / "right_grid.tif", rows, columns),
+    ]
+
+
+def on_the_ground(row, column, height):
+    """Longitude and latitude of the point that the left view shows at a pixel."""
+    east = (column - VIEWS[0] * (height - DATUM)) * PIXEL
+    return LONGITUDE + east / EAST, LATITUDE - row * PIXEL / NORTH
+
+
+def read(path):
+    with rasterio.open(path) as dataset:
+        return dataset.read()
+
+
+def test_triangulate__heights_of_an_exact_scene_come_back(tmp_path):
+    scene = make_scene(150, 190, seed=4)
+    truth = np.clip(scene.truth, MINIMUM + 3, MAXIMUM - 3)
+    validity = np.where(np.isnan(truth), 1, 0).astype(np.uint16)
+    bands = np.stack([truth, truth - 2.0, truth + 3.0, np.ones_like(truth)]).astype(np.float32)
+    out = write_run(tmp_path, bands, validity)
+    report = triangulate(out, *cameras(tmp_path, *truth.shape))
+    points = read(out / "points.tif")
+    known = validity == 0
+    assert report["points"] == known.sum()
+    assert report["residual"][1] < 1e-3
+    heights = {"height": truth, "height_lower": truth - 2.0, "height_upper": truth + 3.0}
+    row, column = np.indices(truth.shape)
+    for name, disparity in heights.items():
+        height = DATUM + disparity / (VIEWS[1] - VIEWS[0])
+        assert np.abs(points[BAND[name]] - height)[known].max() < 0.01, name
+        longitude, latitude = on_the_ground(row, column, height)
+        end = name.removeprefix("height")
+        assert np.abs(points[BAND[f"longitude{end}"]] - longitude)[known].max() * EAST < 0.01
+        assert np.abs(points[BAND[f"latitude{end}"]] - latitude)[known].max() * NORTH < 0.01
+    assert np.isnan(points[:, ~known]).all()
+
+
+def test_triangulate__orders_bounds_by_height(tmp_path):
+    # The views change places: height falls as disparity grows.
+    bands = np.full((4, 40, 50), 1.0, np.float32)
+    bands[1], bands[2] = -1.5, 4.0
+    out = write_run(tmp_path, bands, np.zeros((40, 50), np.uint16))
+    left, right, *grids = cameras(tmp_path, 40, 50)
+    triangulate(out, right, left, *grids)
+    points = read(out / "points.tif")
+    assert np.abs(points[BAND["height_lower"]] - (DATUM - 4.0)).max() < 0.01
+    assert np.abs(points[BAND["height_upper"]] - (DATUM + 1.5)).max() < 0.01
+    assert np.abs(points[BAND["height"]] - (DATUM - 1.0)).max() < 0.01
+
+
+@pytest.fixture(scope="module")
+def matched_scene(tmp_path_factory):
+    """A procedural scene, matched and triangulated: the scene and the folder of the run."""
+    folder = tmp_path_factory.mktemp("scene")
+    scene = make_scene(260, 300, seed=2)
+    for name, image in (("left", scene.left), ("right", scene.right)):
+        kind = {"height": 260, "width": 300, "count": 1, "dtype": "uint16", "nodata": 0}
+        with rasterio.open(folder / f"{name}.tif", "w", driver="GTiff", crs="EPSG:32631",
+                           transform=Affine(0.5, 0, 0, 0, -0.5, 0), **kind) as dataset:  # fmt: skip
+            dataset.write(image, 1)
+    search = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}}
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", search)
+    triangulate(folder / "out", *cameras(folder, 260, 300))
+    return scene, folder / "out"
+
+
+def test_triangulate__as_many_true_heights_are_inside_as_disparities(matched_scene):
+    scene, out = matched_scene
+    (disparity, lower, upper, _), validity = read(out / "intervals.tif"), read(out / "validity.tif")[0]
+    points = read(out / "points.tif")
+    judged = (validity & INVALID == 0) & np.isfinite(scene.truth)
+    inside = ((lower <= scene.truth) & (scene.truth <= upper))[judged]
+    height = DATUM + scene.truth / (VIEWS[1] - VIEWS[0])
+    low, high = points[BAND["height_lower"]], points[BAND["height_upper"]]
+    assert 0.8 < inside.mean() < 1
+    assert ((low - 1e-3 <= height) & (height <= high + 1e-3))[judged].mean() >= inside.mean()
+    assert np.nanmax(np.abs(points[BAND["height"]] - (DATUM + disparity))) < 0.01
+
+
+def test_make_surface__as_many_true_heights_are_inside_cells_as_disparities(matched_scene, tmp_path):
+    scene, out = matched_scene
+    make_surface([out], tmp_path / "dsm.tif", resolution=PIXEL)
+    with rasterio.open(tmp_path / "dsm.tif") as dataset:
+        surface, place, crs = dataset.read(), dataset.transform, dataset.crs
+    assert crs.to_epsg() == 32631
+    # The true ground under every cell: the points of the visible truth, each in the cell it falls in.
+    row, column = np.nonzero(scene.visible)
+    height = DATUM + scene.truth[row, column]
+    x, y = rasterio.warp.transform("EPSG:4326", crs, *on_the_ground(row, column, height))
+    i = np.floor((np.array(y) - place.f) / place.e).astype(int)
+    j = np.floor((np.array(x) - place.c) / place.a).astype(int)
+    inner = (i >= 0) & (j >= 0) & (i < surface.shape[1]) & (j < surface.shape[2])
+    _, low, high = surface[:3, i[inner], j[inner]]
+    filled = np.isfinite(low)
+    inside = (low - 1e-3 <= height[inner]) & (height[inner] <= high + 1e-3)
+    (_, lower, upper, _), validity = read(out / "intervals.tif"), read(out / "validity.tif")[0]
+    judged = (validity & INVALID == 0) & scene.visible
+    held = ((lower <= scene.truth) & (scene.truth <= upper))[judged].mean()
+    assert filled.mean() > 0.9
+    assert inside[filled].mean() >= held
+
+
+def test_lattice__equals_shareloc(shared_data):
+    folder = shared_data / "dsm_picanteo"
+    sensors = Sensors.load(*(folder / name for name in FILES))
+    lattice = Lattice.over(sensors, Window(0, 0, 1216, 1262), 1262, -35, 18)
+    with (folder / "triangulation_check.csv").open() as stream:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
+    assert len(rows) == 200
+    for point in rows:
+        window = Window(int(point["row"]), int(point["col"]), 1, 1)
+        here = lattice.points(window, np.array([[point["disparity"]]]))
+        assert abs(here.height[0, 0] - point["height"]) < 1e-3
+        assert abs(here.longitude[0, 0] - point["lon"]) * 88_000 < 1e-3
+        assert abs(here.latitude[0, 0] - point["lat"]) * 111_000 < 1e-3
+
+
+FILES = ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif")
+OPTIONS = ("--left-model", "--right-model", "--left-grid", "--right-grid")
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def given(files):
+    return [word for pair in zip(OPTIONS, files, strict=True) for word in pair]
+
+
+def test_commands__a_real_pair_to_a_surface_like_that_of_a_peer(shared_data, tmp_path):
+    folder, out = shared_data / "dsm_picanteo", tmp_path / "out"
+    steps = [
+        ("match", folder / "left.tif", folder / "right.tif", out, "--disparity", -35, 18, "--quiet"),
+        ("triangulate", out, *given(folder / name for name in FILES)),
+        ("dsm", out, "--resolution", 1),
+    ]
+    for step in steps:
+        result = run(*step)
+        assert result.exit_code == 0, result.output
+    with rasterio.open(folder / "peer_dsm_mean_1m.tif") as peer, rasterio.open(out / "dsm.tif") as ours:
+        expected, surface = peer.read(1), np.full(peer.shape, np.nan, np.float32)
+        assert ours.crs == peer.crs
+        reproject(ours.read(1), surface, src_transform=ours.transform, src_crs=ours.crs, dst_transform=peer.transform,
+                  dst_crs=peer.crs, src_nodata=np.nan, dst_nodata=np.nan)  # fmt: skip
+    both = np.isfinite(surface) & np.isfinite(expected)
+    difference = (surface - expected)[both]
+    assert both.sum() > 0.99 * np.isfinite(expected).sum()
+    assert abs(np.median(difference)) < 0.2
+    assert (np.abs(difference) <= 1.0).mean() > 0.9
+
+
+def test_triangulate__a_region_of_the_image_gives_the_same_points(shared_data, tmp_path):
+    folder = shared_data / "dsm_picanteo"
+    pair = folder / "left.tif", folder / "right.tif"
+    config = {"disparity": {"minimum": -35, "maximum": 18}, "regularization": None, "median": None}
+    for name, window in (("whole", Window(500, 400, 200, 240)), ("part", Window(560, 470, 80, 90))):
+        match_pair(*pair, tmp_path / name, config, window=window)
+        triangulate(tmp_path / name, *(folder / file for file in FILES))
+    part = read(tmp_path / "part" / "points.tif")
+    whole = read(tmp_path / "whole" / "points.tif")[:, 60:140, 70:160]
+    same = read(tmp_path / "part" / "intervals.tif")[0] == read(tmp_path / "whole" / "intervals.tif")[0, 60:140, 70:160]
+    assert same.mean() > 0.3
+    for band, allowed in (("longitude", 1e-8), ("latitude", 1e-8), ("height", 2e-3)):
+        assert np.abs(part - whole)[BAND[band]][same].max() < allowed
+
+
+@pytest.fixture
+def small_run(tmp_path):
+    bands = np.full((4, 40, 50), 1.0, np.float32)
+    return write_run(tmp_path, bands, np.zeros((40, 50), np.uint16)), cameras(tmp_path, 40, 50)
+
+
+def test_triangulate_command__what_it_cannot_use_gets_one_line(small_run, tmp_path):
+    out, files = small_run
+    short = grid(tmp_path / "short.tif", 10, 10, step=10)
+    (tmp_path / "model.geom").write_text("no model\n")
+    cases = [
+        ({0: tmp_path / "missing.geom"}, "missing.geom: no such file: give the RPC model of the image"),
+        ({1: tmp_path / "model.geom"}, "is no RPC model that shareloc reads"),
+        ({2: tmp_path / "model.geom"}, "is no epipolar grid that shareloc reads"),
+        ({3: short}, "covers rows -20 to 30 and columns -20 to 30 of the right epipolar image, the run rows 0 to 39"),
+        ({3: grid(tmp_path / "far.tif", 40, 50, offset=9000.0)}, "the models do not fit these images"),
+    ]
+    for changed, message in cases:
+        result = run("triangulate", out, *given(changed.get(place, file) for place, file in enumerate(files)))
+        assert result.exit_code == 2, result.output
+        assert message in result.output
+        assert result.output.count("\n") == 1
+        assert not (out / "points.tif").exists()
+
+
+def test_triangulate_command__needs_a_run(tmp_path):
+    files = cameras(tmp_path, 40, 50)
+    result = run("triangulate", tmp_path, *given(files))
+    assert result.exit_code == 2
+    assert "give the folder of a finished run" in result.output
