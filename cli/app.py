@@ -13,6 +13,7 @@ from sat_intervals.cli.batch import batch
 from sat_intervals.cli.demo import demo
 from sat_intervals.cli.dsm import dsm
 from sat_intervals.cli.evaluate import evaluate
+from sat_intervals.cli.export import export
 from sat_intervals.cli.match import match
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
@@ -85,3 +86,4 @@ main.add_command(evaluate)
 main.add_command(ablate)
 main.add_command(triangulate)
 main.add_command(dsm)
+main.add_command(export)

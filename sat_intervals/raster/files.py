@@ -10,7 +10,7 @@ from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, Band
 
 @dataclass(frozen=True)
 class File:
-    """What is particular to a file: its name, type, bands, further tags of its first band, TIFF predictor."""
+    """What is particular to a file: its name, type, bands, further tags of its first band, predictor, GDAL driver."""
 
     name: str
     dtype: str
@@ -18,6 +18,7 @@ class File:
     bands: tuple[Band, ...]
     tags: Mapping[str, str] = field(default_factory=dict)
     predictor: str = "NO"
+    driver: str = "COG"
 
     def describe(self, dataset: DatasetWriter) -> None:
         """Give the bands their names, units and meanings."""

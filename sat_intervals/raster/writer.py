@@ -132,12 +132,13 @@ class OutputWriter:
 
     def _build(self, file: File) -> None:
         name, strips, whole = file.name, self._strips[file.name], self._scratch / file.name
-        options = _COG | {"NUM_THREADS": self._threads, "PREDICTOR": file.predictor}
+        options = _COG | {"NUM_THREADS": self._threads, "PREDICTOR": file.predictor} if file.driver == "COG" else {}
         with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
-            self._add_overviews(strips)
+            if file.driver == "COG":
+                self._add_overviews(strips)
             strips.close()
             del self._strips[name]
-            copy(strips.name, str(whole), driver="COG", **options)
+            copy(strips.name, str(whole), driver=file.driver, **options)
             _flush(whole)
             self._verify(whole, self._sums[name])
         os.unlink(strips.name)

@@ -1,0 +1,28 @@
+"""``sat-intervals export``: a run as the files of another tool."""
+
+from pathlib import Path
+
+import click
+
+from sat_intervals.cli.options import debug_option, path
+
+
+@click.command(short_help="Write a run as the files of CARS, ASP, s2p or OTB.")
+@click.argument("out", callback=path)
+@click.argument("target", callback=path)
+@click.option("--to", "form", type=click.Choice(["cars", "asp", "s2p", "otb"]), required=True, help="Whose files.")
+@debug_option  # type: ignore[untyped-decorator]
+def export(out: Path, target: Path, form: str) -> None:
+    """Write the finished run in the folder OUT to the folder TARGET in the form of another tool.
+
+    \b
+    cars   epi_disp.tif, epi_disp_interval_bounds_inf.tif and _sup.tif,
+           epi_disp_ambiguity.tif (1 - confidence), epi_disp_mask.tif (255 = valid)
+    asp    TARGET-F.tif: horizontal, vertical, valid; TARGET is the prefix
+    s2p    rectified_disp.tif, rectified_mask.png (1 = valid), rectified_disp_confidence.tif
+    otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
+    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
+    from sat_intervals.export import export
+
+    for file in export(out, form, target):
+        click.echo(file)

@@ -1,0 +1,114 @@
+"""A run as the files that other photogrammetry tools take for their own.
+
+In all of them disparity is ``x_right - x_left`` of the epipolar pair, as here, and none has a CRS.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.products import INVALID, Band
+from sat_intervals.raster import File, Georeferencing, OutputWriter
+from sat_intervals.results import open_run
+
+
+class _Pixels(NamedTuple):
+    """Some pixels of a run, all ``(rows, columns)``; the floats NaN where not valid."""
+
+    disparity: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    confidence: np.ndarray
+    valid: np.ndarray
+
+
+Raster = tuple[File, Callable[[_Pixels], np.ndarray]]
+"""A file, and its bands from those of a run; NaN becomes the file's no-data value, or 0 where it has none."""
+
+
+def _file(name: str, *bands: str, dtype: str = "float32", nodata: float | None = None, driver: str = "COG") -> File:
+    return File(name, dtype, nodata, tuple(Band(band, "", band) for band in bands), driver=driver)
+
+
+def _two(horizontal: np.ndarray, *more: np.ndarray) -> np.ndarray:
+    """A horizontal disparity and the vertical one, which is nil."""
+    return np.stack([horizontal, np.zeros_like(horizontal), *more])
+
+
+def _cars(prefix: str) -> list[Raster]:
+    """The epipolar disparity that CARS 1.3 saves: 255 = valid in the mask, -9999 = no data in all others."""
+    return [
+        (_file("epi_disp.tif", "disparity", nodata=-9999), lambda pixels: pixels.disparity),
+        (_file("epi_disp_interval_bounds_inf.tif", "lower", nodata=-9999), lambda pixels: pixels.lower),
+        (_file("epi_disp_interval_bounds_sup.tif", "upper", nodata=-9999), lambda pixels: pixels.upper),
+        (_file("epi_disp_ambiguity.tif", "ambiguity", nodata=-9999), lambda pixels: 1 - pixels.confidence),
+        (_file("epi_disp_mask.tif", "valid", dtype="uint8"), lambda pixels: 255 * pixels.valid),
+    ]
+
+
+def _asp(prefix: str) -> list[Raster]:
+    """The disparity that ``parallel_stereo --entry-point 5`` triangulates: horizontal, vertical, 1 = valid."""
+    file = _file(f"{prefix}-F.tif", "horizontal", "vertical", "valid")
+    return [(file, lambda pixels: _two(np.nan_to_num(pixels.disparity), pixels.valid))]
+
+
+def _s2p(prefix: str) -> list[Raster]:
+    """What s2p leaves in the folder of a tile after matching: NaN = no disparity, 1 = valid in the mask."""
+    return [
+        (_file("rectified_disp.tif", "disparity", nodata=float("nan")), lambda pixels: pixels.disparity),
+        (_file("rectified_mask.png", "valid", dtype="uint8", driver="PNG"), lambda pixels: pixels.valid),
+        (_file("rectified_disp_confidence.tif", "confidence", nodata=float("nan")), lambda pixels: pixels.confidence),
+    ]
+
+
+def _otb(prefix: str) -> list[Raster]:
+    """What OTB's DisparityMapToElevationMap takes as ``-io.in`` (horizontal, vertical) and ``-io.mask``."""
+    return [
+        (_file("disparity.tif", "horizontal", "vertical"), lambda pixels: _two(np.nan_to_num(pixels.disparity))),
+        (_file("mask.tif", "valid", dtype="uint8"), lambda pixels: 255 * pixels.valid),
+    ]
+
+
+FORMATS: dict[str, Callable[[str], list[Raster]]] = {"cars": _cars, "asp": _asp, "s2p": _s2p, "otb": _otb}
+
+
+def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
+    """Write a run in the form of another tool.
+
+    Parameters
+    ----------
+    out
+        Folder of the finished run.
+    form
+        One of FORMATS.
+    target
+        The folder to write to; for ``asp`` the prefix of the file, such as ``stereo/run`` of ``stereo/run-F.tif``.
+
+    Returns
+    -------
+    The files written; files of these names that were there are replaced.
+
+    Raises
+    ------
+    SatIntervalsError
+        No run, or a file that cannot be written.
+    """
+    run, target = open_run(out), Path(target)
+    folder, prefix = (target.parent, target.name) if form == "asp" else (target, "")
+    rasters = FORMATS[form](prefix)
+    files = [file for file, _ in rasters]
+    with OutputWriter(folder, files, *run.shape, Georeferencing(), {}) as writer:
+        for window in run.windows():
+            bands, validity = run.read_bands(window)
+            valid = (validity & INVALID == 0) & np.isfinite(bands[0])
+            disparity, lower, upper, confidence = np.where(valid, bands, np.float32(np.nan))
+            pixels = _Pixels(disparity, lower, upper, confidence, valid.astype(np.uint8))
+            writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))
+        writer.publish()
+    return [folder / file.name for file in files]
+
+
+def _filled(bands: np.ndarray, file: File) -> np.ndarray:
+    return bands if file.nodata is None else np.where(np.isnan(bands), file.nodata, bands)
