@@ -1,5 +1,6 @@
 """``sat-intervals evaluate``: how often intervals hold the truth, and how wide they are for it."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -28,11 +29,13 @@ class _Source:
 
 
 @click.command(short_help="Judge intervals by a known truth.")
-@click.argument("folders", metavar="OUT...", nargs=-1, required=True, type=_FILE)
+@click.argument("folders", metavar="OUT...", nargs=-1, type=_FILE)
 @click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each OUT, in their order.")
 @click.option("--mask", type=_FILE, multiple=True, help="Pixels to judge: not 0; one for each OUT, in their order.")
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
 @click.option("--group", metavar="LABEL", help="Count all as one group, whatever meta.json says.")
+@click.option("--dsm", type=_FILE, help="Instead of runs, judge this surface model by --reference.")
+@click.option("--reference", type=_FILE, help="Reference heights above the same datum, in any CRS.")
 @judging_options  # type: ignore[untyped-decorator]
 def evaluate(
     folders: tuple[Path, ...],
@@ -40,6 +43,8 @@ def evaluate(
     mask: tuple[Path, ...],
     remove_bias: bool,
     group: str | None,
+    dsm: Path | None,
+    reference: Path | None,
     config_file: Path | None,
     accurate: bool,
     tolerance: float,
@@ -56,7 +61,16 @@ def evaluate(
     pair, which is matched first: a folder of left.tif, right.tif, truth.tif and meta.json (`disparity`:
     [minimum, maximum], `group`), or a CSV file of the columns left, right, truth, minimum, maximum and, if
     you like, name and group, its paths relative to it.
+
+    Of a surface model (--dsm) printed are the share of reference heights inside the cells' intervals, the median width,
+    the median of height - reference and its NMAD (1.4826 times the median distance from the median), by slope of the
+    reference and by width of the interval.
     """
+    if dsm or reference:
+        _evaluate_surface(folders, dsm, reference, as_json)
+        return
+    if not folders:
+        raise click.UsageError("Missing argument 'OUT...'.")
     from sat_intervals.cli.tables import show_groups, show_missed, show_scene
     from sat_intervals.evaluation import evaluate_run
     from sat_intervals.tables import Scene, table_1
@@ -77,6 +91,21 @@ def evaluate(
     else:
         show_groups(table_1(scenes), "means over scenes, valid pixels")
         show_missed(scenes)
+
+
+def _evaluate_surface(folders: tuple[Path, ...], dsm: Path | None, reference: Path | None, as_json: bool) -> None:
+    if not (dsm and reference):
+        raise click.UsageError("--dsm and --reference go together: give both.")
+    if folders:
+        raise click.UsageError(f"{folders[0]} is a run, --dsm a surface model: judge one kind at a time.")
+    from sat_intervals.cli.tables import show_surface
+    from sat_intervals.surface_evaluation import evaluate_surface
+
+    report = evaluate_surface(dsm, reference)
+    if as_json:
+        click.echo(json.dumps(report, indent=1))
+    else:
+        show_surface(str(dsm), report)
 
 
 def _sources(folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...]) -> list[_Source]:

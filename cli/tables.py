@@ -81,6 +81,17 @@ def show_scene(scene: Scene) -> None:
         show(["confidence", "pixels", "accuracy", "mean width (px)"], deciles, "by decile of confidence")
 
 
+def show_surface(name: str, report: dict[str, Any]) -> None:
+    """Print the figures of a surface model, by slope and by width of the interval."""
+    columns = ("accuracy", "median_width", "bias", "nmad")
+    rows = [["all cells", *_measures(report["all"], *columns)]]
+    for key, label in (("slope", "slope {} degrees"), ("width", "width {} m")):
+        for kind in report[key]:
+            ends = f"{kind['from']:g} to {kind['to']:g}" if kind["to"] is not None else f"from {kind['from']:g}"
+            rows.append([label.format(ends), *_measures(kind, *columns)])
+    show(["", "cells", "accuracy", "median width (m)", "bias (m)", "NMAD (m)"], rows, name)
+
+
 def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
     """Rows of all pixels, and of those of high and of low confidence."""
     columns = ("accuracy", "relative_size", "mean_width", "relative_overestimation")

@@ -83,6 +83,16 @@ class Histogram:
         middle = np.searchsorted(upto, [(upto[-1] - 1) // 2, upto[-1] // 2], side="right")
         return float(self._first + middle.sum() / (2 * self._steps))
 
+    def deviation(self) -> float | None:
+        """Median distance of the values from their median; None of no values."""
+        median = self.median()
+        if median is None:
+            return None
+        distance = np.abs(self._first + np.arange(self._counts.size) / self._steps - median)
+        nearest_first = np.argsort(distance, kind="stable")
+        upto = np.cumsum(self._counts[nearest_first])
+        return float(distance[nearest_first[np.searchsorted(upto, (upto[-1] - 1) // 2, side="right")]])
+
 
 class _Intervals:
     """Accuracy and size of the intervals of some pixels (paper eq. 14 and 15)."""

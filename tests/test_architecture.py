@@ -21,7 +21,7 @@ FLOORS = [
     {"conclude"},
     {"tile"},
     {"job"},
-    {"evaluation", "triangulation", "surface", "export"},
+    {"evaluation", "triangulation", "surface", "surface_evaluation", "export"},
     {"finish", "patch", "demo", "results"},
     {"store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
     {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables"},

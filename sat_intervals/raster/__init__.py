@@ -6,6 +6,7 @@ from sat_intervals.raster.images import Image, InputError, check_pair, open_imag
 from sat_intervals.raster.layers import north_up, read_layers, read_tags, write_layer, write_once
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
+from sat_intervals.raster.surfaces import read_heights, read_place
 from sat_intervals.raster.windows import read_window
 from sat_intervals.raster.writer import OutputError, OutputWriter, check_space
 
@@ -25,7 +26,9 @@ __all__ = [
     "north_up",
     "open_image",
     "other_files",
+    "read_heights",
     "read_layers",
+    "read_place",
     "read_small_image",
     "read_small_layers",
     "read_tags",

@@ -1,0 +1,114 @@
+"""Surface models against reference heights."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rasterio.transform import Affine
+
+from sat_intervals.cli import main
+from sat_intervals.figures import Histogram
+from sat_intervals.products import SURFACE
+from sat_intervals.surface_evaluation import evaluate_surface
+
+PLACE = Affine(1, 0, 370_000, 0, -1, 4_830_000)
+
+
+def write(path, bands, place=PLACE, crs="EPSG:32631"):
+    bands = np.asarray(bands, np.float32)
+    kind = {"height": bands.shape[1], "width": bands.shape[2], "count": bands.shape[0], "dtype": "float32"}
+    with rasterio.open(path, "w", driver="GTiff", nodata=np.nan, crs=crs, transform=place, **kind) as dataset:
+        dataset.write(bands)
+    return path
+
+
+def surface(path, height, lower, upper):
+    more = np.zeros((len(SURFACE) - 3, *np.shape(height)))
+    return write(path, np.concatenate([[height, lower, upper], more]))
+
+
+def test_evaluate_surface__worked_example(tmp_path):
+    # Reference: 10 in the first columns, then up 1 m a cell: slope 0 at the first cell, atan(1/2) = 26.6 degrees at the
+    # second (half of the way from 10 to 11 on either side), 45 at the third, 26.6 at the last, where the edge goes on.
+    # Errors height - reference, in order: -1 .5 2 4, median (bias) 1.25; distances from it .75 .75 2.25 2.75, the lower
+    # of the two in the middle .75; NMAD 1.4826 x .75. Inside: 10 in [9, 11], 11 in [10, 14]; not 10 in [8, 9.5], 12 in
+    # [15, 17]: .5. Widths 2 1.5 4 2, median 2.
+    reference = np.array([[10.0, 10, 11, 12]])
+    height, lower, upper = [[10.5, 9, 13, 16]], [[9, 8, 10, 15]], [[11, 9.5, 14, 17]]
+    report = evaluate_surface(
+        surface(tmp_path / "dsm.tif", height, lower, upper), write(tmp_path / "reference.tif", [reference])
+    )
+    everything = report["all"]
+    assert (everything["count"], everything["accuracy"], everything["median_width"]) == (4, 0.5, 2.0)
+    assert everything["bias"] == pytest.approx(1.25)
+    assert everything["nmad"] == pytest.approx(1.4826 * 0.75)
+    assert {kind["from"]: kind["count"] for kind in report["slope"]} == {0: 1, 5: 0, 15: 2, 30: 0, 45: 1}
+    assert {kind["from"]: kind["count"] for kind in report["width"]} == {0: 0, 1: 1, 2: 3, 5: 0, 10: 0, 20: 0}
+    assert report["width"][1] == {
+        "from": 1.0, "to": 2.0, "count": 1, "accuracy": 0.0, "median_width": 1.5, "bias": -1.0, "nmad": 0.0
+    }  # fmt: skip
+
+
+def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkeypatch):
+    random = np.random.default_rng(0)
+    height = random.normal(50, 3, (23, 31))
+    height[random.random(height.shape) < 0.1] = np.nan
+    model = surface(tmp_path / "dsm.tif", height, height - 1, height + 2)
+    # Twice as fine and one metre further out: the reference of a cell is the one nearest to its centre.
+    fine = np.repeat(np.repeat(random.normal(50, 3, (25, 33)), 2, axis=0), 2, axis=1)
+    place = Affine(0.5, 0, PLACE.c - 1, 0, -0.5, PLACE.f + 1)
+    reference = write(tmp_path / "reference.tif", [fine], place)
+    truth = fine[::2, ::2][1:-1, 1:-1]
+    known = np.isfinite(height)
+    whole = evaluate_surface(model, reference)
+    assert whole["all"]["count"] == known.sum()
+    inside = ((height - 1 <= truth) & (truth <= height + 2))[known]
+    assert whole["all"]["accuracy"] == pytest.approx(inside.mean(), abs=2e-3)
+    assert whole["all"]["bias"] == pytest.approx(np.median((height - truth)[known]), abs=0.01)
+    monkeypatch.setattr("sat_intervals.surface_evaluation._ROWS", 5)
+    assert evaluate_surface(model, reference) == whole
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(-900, 900), min_size=1, max_size=40))
+def test_histogram__deviation_is_the_median_distance_from_the_median(values):
+    values = np.array(values) / 100
+    histogram = Histogram(-10, 10, 100)
+    histogram.add(values)
+    distances = np.sort(np.abs(values - np.median(values)))
+    assert histogram.deviation() == pytest.approx(distances[(values.size - 1) // 2], abs=1e-9)
+
+
+def run(*words):
+    return CliRunner().invoke(main, ["evaluate", *map(str, words)])
+
+
+def test_evaluate_command__of_a_surface(tmp_path):
+    model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
+    reference = write(tmp_path / "reference.tif", [[[1.5, 9]]])
+    result = run("--dsm", model, "--reference", reference)
+    assert result.exit_code == 0
+    assert result.stdout.splitlines()[2].split() == ["all", "cells", "2", "0.500", "2.000", "-3.750", "4.818"]
+    assert json.loads(run("--dsm", model, "--reference", reference, "--json").stdout)["all"]["count"] == 2
+
+
+def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
+    model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
+    away = write(tmp_path / "away.tif", [[[1.5, 9]]], Affine(1, 0, 5, 0, -1, 5))
+    nowhere = write(tmp_path / "nowhere.tif", [[[1.5, 9]]], crs=None)
+    for words, message in (
+        ([], "Missing argument 'OUT...'"),
+        (["--dsm", model], "--dsm and --reference go together"),
+        ([tmp_path, "--dsm", model, "--reference", away], "judge one kind at a time"),
+        (["--dsm", tmp_path / "none.tif", "--reference", away], "none.tif"),
+        (["--dsm", model, "--reference", away], "give a reference of the same place"),
+        (["--dsm", model, "--reference", nowhere], "does not say where it lies"),
+    ):
+        result = run(*words)
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+        assert result.stderr.count("\n") == 1
