@@ -13,7 +13,7 @@ from sat_intervals.evaluation import Rows as Judgeable
 from sat_intervals.evaluation import evaluate, rules_of
 from sat_intervals.finish import Final, Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.kernels.cost import census, padded_to_lanes
+from sat_intervals.kernels.cost import between, census, padded_to_lanes
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.pairs import Pair
@@ -125,7 +125,7 @@ def _volume(left: Reader, right: Reader, whole: Window, config: Config) -> np.nd
     facing_area = facing(whole, search.minimum, search.maximum)
     left_codes = census(*left(whole.grown(beyond, beyond)), window)
     right_codes = census(*right(facing_area.grown(beyond, beyond)), window)
-    return cost_volume(left_codes, right_codes, kernel_settings(config))
+    return cost_volume(between(left_codes, right_codes), kernel_settings(config))
 
 
 def _right_winners(left: Reader, right: Reader, whole: Window, volume: np.ndarray, config: Config) -> np.ndarray:

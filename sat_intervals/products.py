@@ -11,6 +11,9 @@ NO_DISPARITY = -32768
 # The aggregated cost of an impossible candidate, above every declared span.
 IMPOSSIBLE_COST = 65535
 
+# MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008, 0 to 250: it fits in a byte.
+COSINE_STEPS = 125
+
 # Validity bits (method: section 9), with the numbers of Pandora so that its readers read ours.
 LEFT_WINDOW = 1 << 0
 NO_CANDIDATE = 1 << 1

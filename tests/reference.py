@@ -87,16 +87,27 @@ def census_cost(left, right, left_state, right_state, window):
 # ---- 2, 3. Semi-global matching and the cost span ----------------------------------------------------------
 def aggregate(cost, window, p1, p2):
     """Section 2: the sum of the eight path costs; an empty pixel carries nothing, paths restart behind it."""
+    return aggregate_with(cost, window * window + p2 + 1, lambda step: (p1, p2))
+
+
+def aggregate_with(cost, price, penalties):
+    """Section 2, an impossible candidate at a price; ``penalties(step)`` gives P1 and P2 of a path.
+
+    Both are numbers, or arrays of the shape of the cost that hold what it takes to come to (r, c, k) on that path.
+    """
     impossible = cost == IMPOSSIBLE_COST
     empty = impossible.all(axis=2)
-    priced = np.where(impossible, window * window + p2 + 1, cost)
-    total = sum(path_cost(priced, empty, step, p1, p2) for step in PATHS)
+    priced = np.where(impossible, price, cost)
+    total = 0
+    for step in PATHS:
+        p1, p2 = (np.broadcast_to(p, cost.shape) for p in penalties(step))
+        total = total + path_cost(priced, empty, step, p1, p2)
     return np.where(impossible, IMPOSSIBLE_COST, total)
 
 
 def path_cost(cost, empty, step, p1, p2):
     """Section 2: L along one path; ``step`` leads from the previous pixel q to the pixel p."""
-    rows, columns, count = cost.shape
+    rows, columns = cost.shape[:2]
     path = np.zeros_like(cost)
     for r in range(rows)[:: step[0] or 1]:
         for c in range(columns)[:: step[1] or 1]:
@@ -106,11 +117,51 @@ def path_cost(cost, empty, step, p1, p2):
             path[r, c] = cost[r, c]
             if 0 <= q[0] < rows and 0 <= q[1] < columns and not empty[q]:
                 least = path[q].min()
-                smaller, larger = np.full(count, least + p2), np.full(count, least + p2)
-                smaller[1:] = path[q][:-1] + p1
-                larger[:-1] = path[q][1:] + p1
-                path[r, c] += np.minimum.reduce([path[q], smaller, larger, np.full(count, least + p2)]) - least
+                jump = least + p2[r, c]
+                smaller, larger = jump.copy(), jump.copy()
+                smaller[1:] = path[q][:-1] + p1[r, c, 1:]
+                larger[:-1] = path[q][1:] + p1[r, c, :-1]
+                path[r, c] += np.minimum.reduce([path[q], smaller, larger, jump]) - least
     return path
+
+
+def edge_penalties(left, right, count, step, tables, edges, own_column=None):
+    """P1 and P2 of a path by the number of images, none to both, whose gradient along it is above its edge.
+
+    ``tables`` are P1 and P2 by that number; ``own_column`` = -minimum looks at the right image in the left pixel's own
+    column instead of at the pixel that a candidate faces.
+    """
+    shape = *left.shape, count
+    p1, p2 = np.zeros(shape, int), np.zeros(shape, int)
+    for r, c, k in np.ndindex(shape):
+        x = c + (k if own_column is None else own_column)
+        found = gradient(left, (r, c), step) > edges[0], gradient(right, (r, x), step) > edges[1]
+        p1[r, c, k], p2[r, c, k] = (table[sum(found)] for table in tables)
+    return p1, p2
+
+
+def gradient(image, p, step):
+    """Between a pixel and the one before it on a path; 0 where there is none."""
+    q = p[0] - step[0], p[1] - step[1]
+    inside = 0 <= q[0] < image.shape[0] and 0 <= q[1] < image.shape[1]
+    return abs(float(image[p]) - float(image[q])) if inside else 0.0
+
+
+def banz_penalties(left, count, step, p1, p2, curve):
+    """P1 and P2 of a path where P2 is a curve of the left image's gradient, at least p2 (Banz et al. 2012)."""
+    result = np.zeros((*left.shape, count), int)
+    for r, c in np.ndindex(left.shape):
+        result[r, c] = max(p2, math.floor(curve(gradient(left, (r, c), step)) + 0.5))
+    return p1, result
+
+
+def correlation(left, right):
+    """1 - cosine of unit vectors ``(features, rows, columns)``; ``right`` has count - 1 columns more."""
+    _, rows, columns = left.shape
+    cost = np.zeros((rows, columns, right.shape[2] - columns + 1))
+    for r, c, k in np.ndindex(cost.shape):
+        cost[r, c, k] = 1 - np.dot(left[:, r, c].astype(float), right[:, r, c + k].astype(float))
+    return cost
 
 
 def span(window, p2):
@@ -544,7 +595,7 @@ def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True)
     return {
         "minimum": scene.minimum,
         "count": scene.count,
-        "window": scene.window,
+        "impossible": scene.window**2 + scene.p2 + 1,
         "p1": scene.p1,
         "p2": scene.p2,
         "regularized": scene.regularized,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
-from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import Settings, match
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
@@ -27,7 +27,7 @@ def matched(scene, **options):
     left = census(scene.left, scene.left_state, scene.window)
     right = census(scene.right, scene.right_state, scene.window)
     parameters = Settings(**reference.settings_of(scene, **options))
-    return match(left, right, parameters, Window(0, 0, *left.state.shape))[0]
+    return match(between(left, right), parameters, Window(0, 0, *left.state.shape))[0]
 
 
 # ---- Ambiguity ---------------------------------------------------------------------------------------------
@@ -43,7 +43,7 @@ def test_match__ambiguity_worked_example():
     scene = SimpleNamespace(window=5, minimum=-2, count=4, p1=8, p2=32, regularized=False)
     parameters = Settings(**reference.settings_of(scene, eta_max="0.15", eta_step="0.05"))
     assert parameters.weights.tolist() == [3, 2, 1] + 22 * [0]
-    raw, _ = match(left, right, parameters, Window(0, 0, 3, 1))
+    raw, _ = match(between(left, right), parameters, Window(0, 0, 3, 1))
     assert raw.ambiguity.tolist() == [[4], [9], [7]]
     assert reference.ambiguity(curves[:, np.newaxis], "0.15", "0.05", 24).tolist() == [[4], [9], [7]]
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.matching import Settings, cost_volume, match
 from sat_intervals.products import (
@@ -46,7 +46,7 @@ def matched(scene, output=None, core=None, **options):
     """Raw products and right view of a scene, of the whole patch by default."""
     left, right = codes_of(scene)
     output = output or Window(0, 0, *left.state.shape)
-    return match(left, right, Settings(**reference.settings_of(scene, **options)), output, core)
+    return match(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
 
 
 def bare(left_levels, right_levels, minimum=0, **options):
@@ -60,7 +60,7 @@ def bare(left_levels, right_levels, minimum=0, **options):
     count = codes[1].state.shape[1] - codes[0].state.shape[1] + 1
     scene = SimpleNamespace(window=5, minimum=minimum, count=count, p1=8, p2=32, regularized=False)
     parameters = Settings(**reference.settings_of(scene, **options))
-    return match(*codes, parameters, Window(0, 0, *codes[0].state.shape))
+    return match(between(*codes), parameters, Window(0, 0, *codes[0].state.shape))
 
 
 # ---- Winner and refinement ---------------------------------------------------------------------------------
@@ -151,7 +151,7 @@ def test_match__any_part_equals_the_whole(scene, data):
 @given(scene=reference.scenes())
 def test_match__cost_is_the_least_of_the_volume(scene):
     raw, _ = matched(scene)
-    volume = cost_volume(*codes_of(scene), Settings(**reference.settings_of(scene)))
+    volume = cost_volume(between(*codes_of(scene)), Settings(**reference.settings_of(scene)))
     np.testing.assert_array_equal(raw.cost, volume.min(axis=2))
 
 
@@ -251,7 +251,7 @@ def test_match__validity_worked_example():
     state = np.array([[0, 0, 1, 1, 0], [2, 1, 2, 0, 0], [0, 0, 0, 0, 0]], np.uint8)
     right = Codes(np.zeros((1, 3, 5), np.uint32), state)
     scene = SimpleNamespace(window=3, minimum=0, count=2, p1=1, p2=2, regularized=True)
-    raw, _ = match(left, right, Settings(**reference.settings_of(scene)), Window(0, 0, 3, 4))
+    raw, _ = match(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 3, 4))
     part = RANGE_INCOMPLETE | NOT_REFINED
     expected = [
         [NOT_REFINED, part, NO_CANDIDATE, part],
@@ -269,7 +269,7 @@ def test_match__left_window_and_no_candidate_stand_together():
     scene = SimpleNamespace(window=3, minimum=0, count=2, p1=1, p2=2, regularized=True)
     for states, bit in (([1, 1], NO_CANDIDATE), ([1, 2], RIGHT_MASKED), ([3, 1], RIGHT_MASKED), ([0, 1], 0)):
         right = Codes(np.zeros((1, 1, 2), np.uint32), np.array([states], np.uint8))
-        raw, _ = match(left, right, Settings(**reference.settings_of(scene)), Window(0, 0, 1, 1))
+        raw, _ = match(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 1, 1))
         assert raw.validity.item() == LEFT_WINDOW | bit
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sat_intervals.config import load_config
 from sat_intervals.finish import Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.in_memory import match_arrays
-from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Settings, match
 from sat_intervals.patch import match_patch
@@ -34,7 +34,7 @@ def matched(scene, **options):
     left = census(scene.left, scene.left_state, scene.window)
     right = census(scene.right, scene.right_state, scene.window)
     parameters = Settings(**reference.settings_of(scene, **options))
-    return match(left, right, parameters, Window(0, 0, *left.state.shape))[0]
+    return match(between(left, right), parameters, Window(0, 0, *left.state.shape))[0]
 
 
 def of_curves(curves, minimum, **options):
@@ -45,7 +45,7 @@ def of_curves(curves, minimum, **options):
     left = Codes(np.zeros((1, rows, 1), np.uint32), np.zeros((rows, 1), np.uint8))
     right = Codes(words.astype(np.uint32)[np.newaxis], np.where(curves == X, NO_DATA, 0).astype(np.uint8))
     scene = SimpleNamespace(window=5, minimum=minimum, count=count, p1=8, p2=32, regularized=False)
-    return match(left, right, Settings(**reference.settings_of(scene, **options)), Window(0, 0, rows, 1))[0]
+    return match(between(left, right), Settings(**reference.settings_of(scene, **options)), Window(0, 0, rows, 1))[0]
 
 
 # ---- Alpha-cut ---------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ import xarray as xr
 
 from sat_intervals import load_config, match_arrays
 from sat_intervals.config import Config
-from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.patch import kernel_settings
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
@@ -147,7 +147,7 @@ def our_volume(pair: Pair) -> np.ndarray:
     window, search = pair.config.cost.window, pair.config.disparity
     left = census_codes(pair.left, window, 0, 0)
     right = census_codes(pair.right, window, -search.minimum, search.maximum)
-    return cost_volume(left, right, kernel_settings(pair.config))
+    return cost_volume(between(left, right), kernel_settings(pair.config))
 
 
 def census_codes(image: np.ma.MaskedArray, window: int, before: int, after: int) -> Codes:

@@ -8,8 +8,9 @@ import reference
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.cost import Codes, Costs, between, census
 from sat_intervals.kernels.matching import Settings, cost_volume
+from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.products import IMPOSSIBLE_COST, MASKED, NO_DATA
 
 bounded = settings(max_examples=150, derandomize=True, deadline=None)
@@ -22,7 +23,7 @@ def volume(scene, **changes):
     """The kernel's aggregated costs of a scene."""
     left = census(scene.left, scene.left_state, scene.window)
     right = census(scene.right, scene.right_state, scene.window)
-    return cost_volume(left, right, Settings(**{**reference.settings_of(scene), **changes}))
+    return cost_volume(between(left, right), Settings(**{**reference.settings_of(scene), **changes}))
 
 
 def bare_codes(levels):
@@ -48,7 +49,7 @@ def test_cost_volume__worked_example():
     #     S      1 40  40 18  18 56  56 9
     left, right = bare_codes([[0, 0, 0, 0]]), bare_codes([[0, 5, 2, 7, 1]])
     expected = [[[1, 40], [40, 18], [18, 56], [56, 9]]]
-    assert cost_volume(left, right, example_settings(2)).tolist() == expected
+    assert cost_volume(between(left, right), example_settings(2)).tolist() == expected
     cost = np.array([[[0, 5], [5, 2], [2, 7], [7, 1]]])
     assert reference.aggregate(cost, 3, 1, 3).tolist() == expected
 
@@ -60,7 +61,7 @@ def test_cost_volume__paths_restart_behind_empty_pixels():
     left, right = bare_codes([[0, 0, 0, 0]]), bare_codes([[0, 5, 2, 7, 1]])
     left.state[0, 1] = MASKED
     expected = [[[0, 40], [X, X], [17, 56], [56, 9]]]
-    assert cost_volume(left, right, example_settings(2)).tolist() == expected
+    assert cost_volume(between(left, right), example_settings(2)).tolist() == expected
     cost = np.array([[[0, 5], [X, X], [2, 7], [7, 1]]])
     assert reference.aggregate(cost, 3, 1, 3).tolist() == expected
 
@@ -72,7 +73,7 @@ def test_cost_volume__impossible_candidates_cost_more_inside():
     left, right = bare_codes([[0, 0]]), bare_codes([[0, 5, 1]])
     right.state[0, 1] = NO_DATA
     expected = [[[1, X], [X, 9]]]
-    assert cost_volume(left, right, example_settings(2)).tolist() == expected
+    assert cost_volume(between(left, right), example_settings(2)).tolist() == expected
     assert reference.aggregate(np.array([[[0, X], [X, 1]]]), 3, 1, 3).tolist() == expected
 
 
@@ -82,7 +83,7 @@ def test_cost_volume__all_directions_worked_example():
     levels[1, 1] = 8
     expected = 8 * levels[:, :, np.newaxis]
     left, right = bare_codes(np.zeros((3, 4), int)), bare_codes(levels)
-    np.testing.assert_array_equal(cost_volume(left, right, example_settings(1)), expected)
+    np.testing.assert_array_equal(cost_volume(between(left, right), example_settings(1)), expected)
 
 
 @bounded
@@ -247,3 +248,95 @@ def test_cost_volume__empty_rows_cut_the_patch_in_two():
     np.testing.assert_array_equal(whole[:2], part(slice(0, 4)))
     assert (whole[2:5] == IMPOSSIBLE_COST).all()
     np.testing.assert_array_equal(whole[5:], part(slice(5, None)))
+
+
+# ---- Penalties that follow the gradients -------------------------------------------------------------------
+def gradients_of(scene, **rule):
+    """The windows' centres of a scene's images, and a rule."""
+    radius = scene.window // 2
+    inner = np.s_[radius : scene.left.shape[0] - radius]
+    left, right = (
+        np.ascontiguousarray(image[inner, radius : image.shape[1] - radius]) for image in (scene.left, scene.right)
+    )
+    return Gradients(left, right, Rule(**rule))
+
+
+def varying_volume(scene, gradients):
+    left = census(scene.left, scene.left_state, scene.window)
+    right = census(scene.right, scene.right_state, scene.window)
+    return cost_volume(between(left, right), Settings(**reference.settings_of(scene)), gradients)
+
+
+def expected_volume(scene, penalties):
+    cost = reference.census_cost(scene.left, scene.right, scene.left_state, scene.right_state, scene.window)
+    return reference.aggregate_with(cost, scene.window**2 + scene.p2 + 1, penalties)
+
+
+# P1 and P2 by path, along the row, the falling and the rising diagonal and the column, and by images with an edge.
+P1 = np.array([[6, 3, 1], [5, 2, 1], [7, 4, 2], [3, 2, 0]], np.uint16)
+P2 = np.array([[40, 20, 3], [41, 21, 4], [42, 22, 5], [43, 23, 6]], np.uint16)
+
+
+def line_of(step):
+    """Which of the four lines a path follows."""
+    return 0 if step[0] == 0 else 3 if step[1] == 0 else 1 if step[0] == step[1] else 2
+
+
+@pytest.mark.parametrize("facing", [True, False])
+@bounded
+@given(scene=reference.scenes(rows=6, columns=12), left_edge=st.integers(0, 6), right_edge=st.integers(0, 6))
+def test_cost_volume__equals_reference_with_penalties_that_follow_edges(facing, scene, left_edge, right_edge):
+    scene.regularized, scene.p2 = True, int(P2.max())
+    own_column = min(max(-scene.minimum, 0), scene.count - 1)
+    rule = {"kind": EDGES, "p1": P1, "p2": P2, "left_edge": float(left_edge), "right_edge": float(right_edge)}
+    gradients = gradients_of(scene, **rule, facing=facing, own_column=own_column)
+
+    def penalties(step):
+        tables, edges = (P1[line_of(step)], P2[line_of(step)]), (left_edge, right_edge)
+        images = gradients.left, gradients.right, scene.count
+        return reference.edge_penalties(*images, step, tables, edges, None if facing else own_column)
+
+    np.testing.assert_array_equal(varying_volume(scene, gradients), expected_volume(scene, penalties))
+
+
+@pytest.mark.parametrize("kind", [NEGATIVE, INVERSE])
+@few
+@given(scene=reference.scenes(rows=6, columns=12), p2=st.integers(8, 30))
+def test_cost_volume__equals_reference_with_penalties_of_banz(kind, scene, p2):
+    scene.regularized, scene.p2 = True, 60
+    alpha, beta, gamma = (4.5, 0.0, 60.0) if kind == NEGATIVE else (80.0, 1.6, 10.0)
+    table = np.full((4, 3), 5, np.uint16), np.full((4, 3), p2, np.uint16)
+    gradients = gradients_of(scene, kind=kind, p1=table[0], p2=table[1], alpha=alpha, beta=beta, gamma=gamma)
+
+    def curve(gradient):
+        return gamma - alpha * gradient if kind == NEGATIVE else gamma + alpha / (gradient + beta)
+
+    def penalties(step):
+        return reference.banz_penalties(gradients.left, scene.count, step, 5, p2, curve)
+
+    np.testing.assert_array_equal(varying_volume(scene, gradients), expected_volume(scene, penalties))
+
+
+@few
+@given(scene=reference.scenes())
+def test_cost_volume__penalties_without_gradients_are_constant(scene):
+    scene.regularized, scene.p2 = True, 32
+    tables = np.full((4, 3), scene.p1, np.uint16), np.full((4, 3), 32, np.uint16)
+    gradients = gradients_of(scene, kind=EDGES, p1=tables[0], p2=tables[1])
+    np.testing.assert_array_equal(varying_volume(scene, gradients), volume(scene))
+
+
+@few
+@given(scene=reference.scenes())
+def test_cost_volume__of_stored_costs_equals_that_of_codes(scene):
+    # The same Hamming distances, computed beforehand; what stands at impossible candidates is not looked at.
+    left = census(scene.left, scene.left_state, scene.window)
+    right = census(scene.right, scene.right_state, scene.window)
+    rows, columns = left.state.shape
+    stored = np.full((rows, columns, -(-scene.count // 32) * 32), 255, np.uint8)
+    for k in range(scene.count):
+        differing = left.words ^ right.words[:, :, k : k + columns]
+        stored[:, :, k] = np.bitwise_count(differing).sum(axis=0)
+    costs = Costs(stored, np.zeros((0, 0, 0), np.uint8), left.state, right.state)
+    parameters = Settings(**reference.settings_of(scene))
+    np.testing.assert_array_equal(cost_volume(costs, parameters), cost_volume(between(left, right), parameters))

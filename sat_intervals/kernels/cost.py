@@ -1,4 +1,4 @@
-"""Census matching cost (Zabih and Woodfill 1994; method: section 1).
+"""Matching costs as the sweeps read them: Census (Zabih and Woodfill 1994; method: section 1), or a volume.
 
 Letters: r row, c column, k disparity index (disparity = minimum + k), w word of a code.
 """
@@ -6,9 +6,10 @@ Letters: r row, c column, k disparity index (disparity = minimum + k), w word of
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import overload
 
-from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, store
+from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, load_bytes, store
 
 
 class Codes(NamedTuple):
@@ -24,6 +25,38 @@ class Codes(NamedTuple):
 
     words: np.ndarray
     state: np.ndarray
+
+
+class Costs(NamedTuple):
+    """The matching costs of a patch: codes to compare, or costs that were computed beforehand.
+
+    Attributes
+    ----------
+    left, right
+        Words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)`` with whole vectors behind the
+        last column; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` nothing, uint8 as well.
+    left_state
+        ``(rows, columns)`` uint8, 0 = usable window.
+    right_state
+        ``(rows, columns + count - 1)`` uint8: ``right_state[r, c + k]`` faces left ``(r, c)`` at index k.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    left_state: np.ndarray
+    right_state: np.ndarray
+
+
+def between(left: Codes, right: Codes) -> Costs:
+    """Costs between the codes of a patch: Hamming distances.
+
+    ``right`` has ``columns + count - 1`` columns: ``right[r, c + k]`` faces ``left[r, c]``.
+    """
+    rows, columns = left.state.shape
+    size = padded_to_lanes(right.state.shape[1] - columns + 1)
+    words = np.zeros((right.words.shape[0], rows, columns + size), right.words.dtype)
+    words[:, :, : right.words.shape[2]] = right.words
+    return Costs(left.words, words, left.state, right.state)
 
 
 @njit(nogil=True, cache=True)
@@ -87,28 +120,37 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     return codes
 
 
-@njit(nogil=True, forceinline=True)
-def hamming_costs(left, right, r, c, k):
-    """Hamming distances of the left pixel ``(r, c)`` to its candidates ``k .. k + 31``.
+def matching_costs(left, right, r, c, k):
+    """Costs of the left pixel ``(r, c)`` and its candidates ``k .. k + 31``; arguments as in `Costs`.
 
-    ``right`` is ``(words, rows, width)`` with ``width >= c + k + 32``: 32 columns lie behind the last candidate.
+    For kernels alone, which are compiled for the kind of costs that they are given.
     """
-    width = right.shape[2]
-    rows = right.shape[1]
-    costs = hamming(right, r * width + c + k, left[0, r, c])
-    for w in range(1, left.shape[0]):
-        costs = add(costs, hamming(right, (w * rows + r) * width + c + k, left[w, r, c]))
-    return costs
+    raise NotImplementedError
+
+
+@overload(matching_costs, jit_options={"nogil": True, "forceinline": True})
+def _matching_costs(left, right, r, c, k):
+    def hamming_costs(left, right, r, c, k):
+        rows, width = right.shape[1:]
+        costs = hamming(right, r * width + c + k, left[0, r, c])
+        for w in range(1, left.shape[0]):
+            costs = add(costs, hamming(right, (w * rows + r) * width + c + k, left[w, r, c]))
+        return costs
+
+    def stored_costs(left, right, r, c, k):
+        return load_bytes(left, (r * left.shape[1] + c) * left.shape[2] + k)
+
+    return stored_costs if left.dtype == types.uint8 else hamming_costs
 
 
 @njit(nogil=True, forceinline=True)
 def candidate_costs(left, right, barrier, beyond, r, c, k):
-    """Costs of the candidates ``k .. k + 31``: Hamming distance, or a constant where the candidate is impossible.
+    """Costs of the candidates ``k .. k + 31``, a constant where the candidate is impossible.
 
     ``barrier[c + k]`` is the cost of an impossible candidate, or 0, for the row; ``beyond[k]`` keeps lanes behind
     the search range above every cost.
     """
-    costs = larger(hamming_costs(left, right, r, c, k), load(barrier, c + k))
+    costs = larger(matching_costs(left, right, r, c, k), load(barrier, c + k))
     return larger(costs, load(beyond, k))
 
 

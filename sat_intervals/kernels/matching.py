@@ -1,4 +1,4 @@
-"""Census, SGM and the reading of every finished cost curve, in two sweeps over a patch.
+"""SGM and the reading of every finished cost curve, in two sweeps over a patch.
 
 The sweep down keeps the sum of its four paths; the sweep up adds its own to it and reads winner, refinement,
 interval, ambiguity and the right view's winner off the finished curve while it is in the cache. No volume but the
@@ -13,9 +13,10 @@ import numpy as np
 from numba import njit
 
 from sat_intervals.kernels.confidence import ambiguity
-from sat_intervals.kernels.cost import Codes, cost_curve, padded_to_lanes
+from sat_intervals.kernels.cost import Costs, cost_curve, padded_to_lanes
 from sat_intervals.kernels.disparity import vfit
 from sat_intervals.kernels.intervals import alpha_cut
+from sat_intervals.kernels.penalties import Gradients, fill_row, row_penalties
 from sat_intervals.kernels.sgm import WALL, add_curve, advance_pixel, enter_row, path_slots, restart_all
 from sat_intervals.kernels.vector import (
     LANES,
@@ -50,21 +51,22 @@ class Settings(NamedTuple):
     ----------
     minimum, count
         First disparity of the search range and number of disparities.
-    window
-        Side of the census window in pixels.
+    impossible
+        Matching cost of an impossible candidate inside SGM, above all others.
     p1, p2, regularized
-        SGM penalties; without regularisation the aggregated cost is the matching cost itself.
+        SGM penalties where they are constant; without regularisation the aggregated cost is the matching cost itself.
     cut_level
         ``floor((1 - alpha) * span)``; -1: no interval.
     weights
-        ``(span + 1,)`` uint16: the number of etas that count a cost so far above the lowest; empty: no ambiguity.
+        uint16: the number of etas that count a cost so far above the lowest, for all that there can be; empty: no
+        ambiguity.
     refine
         Whether winners are refined, and bounds extended for it.
     """
 
     minimum: int
     count: int  # type: ignore[assignment]
-    window: int
+    impossible: int
     p1: int
     p2: int
     regularized: bool
@@ -180,9 +182,9 @@ def _see_from_right(curve, index, cost, best, start):
 class _Patch(NamedTuple):
     """What both sweeps read and write. They unpack it once: counting references would cost more than a pixel."""
 
-    left_words: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
     left_state: np.ndarray
-    right_words: np.ndarray  # padded by whole vectors behind the last column
     right_state: np.ndarray
     barrier: np.ndarray
     possible: np.ndarray
@@ -192,19 +194,15 @@ class _Patch(NamedTuple):
     curve: np.ndarray
 
 
-def _prepare(left: Codes, right: Codes, settings: Settings) -> _Patch:
-    rows, columns = left.state.shape
-    size = padded_to_lanes(settings.count)
-    right_words = np.zeros((right.words.shape[0], rows, columns + size), right.words.dtype)
-    right_words[:, :, : right.words.shape[2]] = right.words
+def _prepare(costs: Costs) -> _Patch:
+    columns = costs.left_state.shape[1]
+    count = costs.right_state.shape[1] - columns + 1
+    size = padded_to_lanes(count)
     beyond = np.zeros(size, np.uint16)
-    beyond[settings.count :] = WALL
+    beyond[count:] = WALL
     slots = 1 + 3 * columns
     return _Patch(
-        left_words=left.words,
-        left_state=left.state,
-        right_words=right_words,
-        right_state=right.state,
+        *costs,
         barrier=np.zeros(columns + size, np.uint16),
         possible=np.zeros(columns, np.int64),
         beyond=beyond,
@@ -215,26 +213,27 @@ def _prepare(left: Codes, right: Codes, settings: Settings) -> _Patch:
 
 
 @njit(nogil=True, cache=True)
-def _sweep_down(patch, settings, row, column, volume):
+def _sweep_down(patch, gradients, settings, row, column, volume):
     """Store the sums of the downward paths of the wanted pixels, which begin at ``row, column``."""
-    left, left_state, right, right_state, barrier, possible, beyond, paths, lowest, curve = patch
-    count, p1, p2 = settings.count, settings.p1, settings.p2
-    impossible = settings.window**2 + p2 + 1
+    left, right, left_state, right_state, barrier, possible, beyond, paths, lowest, curve = patch
+    count, impossible = settings.count, settings.impossible
     height, width, size = volume.shape
     columns = possible.size
+    p1, p2, edges = row_penalties(gradients, settings.p1, settings.p2, columns, size)
     for r in range(row + height):
         _candidates(left_state, right_state, r, count, impossible, barrier, possible)
         falling, rising = -r % columns, r % columns
         enter_row(paths, lowest, columns, falling, rising, True)
+        fill_row(gradients, r, True, p1, p2, edges)
         for c in range(columns):
             slots = path_slots(c, columns, falling, rising)
             if possible[c] == 0:
                 restart_all(paths, lowest, slots)
             elif r >= row and column <= c < column + width:
                 offset = ((r - row) * width + c - column) * size
-                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slots, volume, offset)
+                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, edges, paths, lowest, slots, volume, offset)
             else:
-                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slots, curve, 0)
+                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, edges, paths, lowest, slots, curve, 0)
 
 
 @njit(nogil=True)
@@ -255,18 +254,20 @@ def _explain(left_state, right_state, r, c, count, possible):
 
 
 @njit(nogil=True, cache=True)
-def _sweep_up(patch, settings, row, column, volume, keep, raw, core, index, right_cost, right_best):
+def _sweep_up(patch, gradients, settings, row, column, volume, keep, raw, core, index, right_cost, right_best):
     """Finish the curves of the wanted pixels and read them; ``core`` is what the right view is made of."""
-    left, left_state, right, right_state, barrier, possible, beyond, paths, lowest, curve = patch
+    left, right, left_state, right_state, barrier, possible, beyond, paths, lowest, curve = patch
     winner, lower, upper, disparity, cost, doubt, validity = raw
-    minimum, count, window, p1, p2, regularized, cut_level, weights, refine = settings
-    impossible = window**2 + p2 + 1
+    minimum, count, impossible, _, _, regularized, cut_level, weights, refine = settings
     height, width, size = volume.shape
     columns = possible.size
+    p1, p2, edges = row_penalties(gradients, settings.p1, settings.p2, columns, size)
     for r in range(left_state.shape[0] - 1, row - 1, -1):
         _candidates(left_state, right_state, r, count, impossible, barrier, possible)
         falling, rising = -r % columns, r % columns
         enter_row(paths, lowest, columns, falling, rising, False)
+        if regularized:
+            fill_row(gradients, r, False, p1, p2, edges)
         wanted_row = r < row + height
         seen_row = core[0] <= r < core[0] + core[2]
         for c in range(columns - 1, -1, -1):
@@ -274,7 +275,7 @@ def _sweep_up(patch, settings, row, column, volume, keep, raw, core, index, righ
             if possible[c] == 0:
                 restart_all(paths, lowest, slots)
             elif regularized:
-                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slots, curve, 0)
+                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, edges, paths, lowest, slots, curve, 0)
             if not (wanted_row and column <= c < column + width):
                 continue
             i, j = r - row, c - column
@@ -307,9 +308,9 @@ def _sweep_up(patch, settings, row, column, volume, keep, raw, core, index, righ
                 volume[i, j] = curve
 
 
-def _sweep(left, right, settings, output, core, keep):
+def _sweep(costs, gradients, settings, output, core, keep):
     """Both sweeps; returns the raw products, the right view and the volume (whole curves only with ``keep``)."""
-    patch = _prepare(left, right, settings)
+    patch = _prepare(costs)
     size = patch.curve.size
     shape = output.height, output.width
     volume = np.empty((*shape, size), np.uint16)
@@ -326,11 +327,12 @@ def _sweep(left, right, settings, output, core, keep):
     right_best = np.zeros(right_cost.shape, np.uint16)
     index = np.arange(size, dtype=np.uint16)
     if settings.regularized:
-        _sweep_down(patch, settings, output.row, output.column, volume)
+        _sweep_down(patch, gradients, settings, output.row, output.column, volume)
         patch.paths[:] = 0
         patch.lowest[:] = 0
     bounds = core.row, core.column, core.height, core.width
-    _sweep_up(patch, settings, output.row, output.column, volume, keep, raw, bounds, index, right_cost, right_best)
+    wanted = output.row, output.column
+    _sweep_up(patch, gradients, settings, *wanted, volume, keep, raw, bounds, index, right_cost, right_best)
     cost = right_cost[:, : core.width + settings.count - 1]
     winner = right_best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
@@ -338,22 +340,26 @@ def _sweep(left, right, settings, output, core, keep):
 
 
 def match(
-    left: Codes, right: Codes, settings: Settings, output: Window, core: Window | None = None
+    costs: Costs,
+    settings: Settings,
+    output: Window,
+    core: Window | None = None,
+    gradients: Gradients | None = None,
 ) -> tuple[Raw, RightView]:
-    """Match a patch: census codes in, raw products and the right view's winners out.
+    """Match a patch: matching costs in, raw products and the right view's winners out.
 
     Parameters
     ----------
-    left
-        Codes of ``(rows, columns)`` pixels.
-    right
-        Codes of ``(rows, columns + count - 1)`` pixels: ``right[r, c + k]`` faces ``left[r, c]``.
+    costs
+        Of ``(rows, columns)`` pixels.
     settings
-        See `Settings`; ``8 * (window**2 - 1 + p2) < IMPOSSIBLE_COST``.
+        See `Settings`; 8 times the largest cost and the largest P2 stay below IMPOSSIBLE_COST.
     output
         The pixels of the patch whose products are wanted; the others only support them.
     core
         The pixels that make the right view; by default those of ``output``.
+    gradients
+        What P1 and P2 follow; by default they are those of ``settings`` everywhere.
 
     Returns
     -------
@@ -362,14 +368,14 @@ def match(
     RightView
         of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    raw, right_view, _ = _sweep(left, right, settings, output, core or output, False)
+    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False)
     return raw, right_view
 
 
-def cost_volume(left: Codes, right: Codes, settings: Settings) -> np.ndarray:
+def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = None) -> np.ndarray:
     """Aggregated costs S (the matching cost itself without regularisation) of a whole patch.
 
     Parameters as in `match`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
-    whole = Window(0, 0, *left.state.shape)
-    return _sweep(left, right, settings, whole, whole, True)[2][:, :, : settings.count]
+    whole = Window(0, 0, *costs.left_state.shape)
+    return _sweep(costs, gradients, settings, whole, whole, True)[2][:, :, : settings.count]

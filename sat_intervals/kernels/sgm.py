@@ -2,8 +2,9 @@
 
     L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + P1, L(q, d + 1) + P1, min L(q) + P2) - min L(q)
 
-with q the pixel before p on the path. A sweep down the rows, columns ascending, advances the four paths that come
-from the left, the upper left, above and the upper right; a sweep up the rows, columns descending, the other four.
+with q the pixel before p on the path; P1 and P2 are constant, or those of the candidate on the path. A sweep down the
+rows, columns ascending, advances the four paths that come from the left, the upper left, above and the upper right; a
+sweep up the rows, columns descending, the other four.
 
 Letters: r row, c column, k disparity index, in blocks of 32 lanes.
 """
@@ -12,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from sat_intervals.kernels.cost import candidate_costs
+from sat_intervals.kernels.penalties import penalty
 from sat_intervals.kernels.vector import (
     LANES,
     add,
@@ -25,7 +27,7 @@ from sat_intervals.kernels.vector import (
     subtract,
 )
 
-# Above every L of a candidate: an impossible one reaches at most window^2 + 2 P2 + 1 < 16505.
+# Above every L of a candidate: an impossible one reaches at most 2 P2 + 2 and the largest cost twice, < 16505.
 WALL = 32768
 
 
@@ -45,13 +47,15 @@ def _block_after(paths, start, k, size):
 
 
 @njit(nogil=True, forceinline=True)
-def advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slots, target, offset):
+def advance_pixel(left, right, barrier, beyond, r, c, p1, p2, edges, paths, lowest, slots, target, offset):
     """Advance four paths by the pixel ``(r, c)`` and write the sum of their L.
 
     Parameters
     ----------
     left, right, barrier, beyond
         See ``candidate_costs``.
+    p1, p2, edges
+        See ``row_penalties``.
     paths
         ``(slots, size)`` uint16: the last L of each path under way; updated in place.
     lowest
@@ -65,10 +69,7 @@ def advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slo
     slot_1, slot_2, slot_3, slot_4 = slots
     lowest_1, lowest_2 = splat(lowest[slot_1]), splat(lowest[slot_2])
     lowest_3, lowest_4 = splat(lowest[slot_3]), splat(lowest[slot_4])
-    change, wall = splat(np.uint16(p2)), splat(np.uint16(WALL))
-    jump_1, jump_2 = add(lowest_1, change), add(lowest_2, change)
-    jump_3, jump_4 = add(lowest_3, change), add(lowest_4, change)
-    small = splat(np.uint16(p1))
+    wall = splat(np.uint16(WALL))
     start_1, start_2, start_3, start_4 = slot_1 * size, slot_2 * size, slot_3 * size, slot_4 * size
     here_1, here_2 = load(paths, start_1), load(paths, start_2)
     here_3, here_4 = load(paths, start_3), load(paths, start_4)
@@ -78,10 +79,14 @@ def advance_pixel(left, right, barrier, beyond, r, c, p1, p2, paths, lowest, slo
         costs = candidate_costs(left, right, barrier, beyond, r, c, k)
         after_1, after_2 = _block_after(paths, start_1, k, size), _block_after(paths, start_2, k, size)
         after_3, after_4 = _block_after(paths, start_3, k, size), _block_after(paths, start_4, k, size)
-        path_1 = _advance(before_1, here_1, after_1, costs, small, jump_1, lowest_1)
-        path_2 = _advance(before_2, here_2, after_2, costs, small, jump_2, lowest_2)
-        path_3 = _advance(before_3, here_3, after_3, costs, small, jump_3, lowest_3)
-        path_4 = _advance(before_4, here_4, after_4, costs, small, jump_4, lowest_4)
+        small, jump = penalty(p1, edges, 0, c, k), add(lowest_1, penalty(p2, edges, 0, c, k))
+        path_1 = _advance(before_1, here_1, after_1, costs, small, jump, lowest_1)
+        small, jump = penalty(p1, edges, 1, c, k), add(lowest_2, penalty(p2, edges, 1, c, k))
+        path_2 = _advance(before_2, here_2, after_2, costs, small, jump, lowest_2)
+        small, jump = penalty(p1, edges, 2, c, k), add(lowest_3, penalty(p2, edges, 2, c, k))
+        path_3 = _advance(before_3, here_3, after_3, costs, small, jump, lowest_3)
+        small, jump = penalty(p1, edges, 3, c, k), add(lowest_4, penalty(p2, edges, 3, c, k))
+        path_4 = _advance(before_4, here_4, after_4, costs, small, jump, lowest_4)
         before_1, before_2, before_3, before_4 = here_1, here_2, here_3, here_4
         here_1, here_2, here_3, here_4 = after_1, after_2, after_3, after_4
         store(paths, start_1 + k, path_1)

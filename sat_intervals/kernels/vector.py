@@ -1,4 +1,4 @@
-"""Explicit vectors of 32 unsigned 16-bit lanes for numba kernels.
+"""Explicit vectors of 32 lanes for numba kernels: unsigned 16-bit ones, and floats for correlation.
 
 LLVM vectorises a plain loop over disparities only behind run-time checks that no two arrays overlap, which costs
 more than the loop itself when a curve is two or four vectors long. These few primitives say what is meant. LLVM
@@ -14,26 +14,31 @@ from numba.extending import intrinsic, models, register_model
 
 LANES = 32
 
+_BYTE = ir.IntType(8)
 _HALF = ir.IntType(16)
 _WORD = ir.IntType(32)
+_BYTES = ir.VectorType(_BYTE, LANES)
 _VECTOR = ir.VectorType(_HALF, LANES)
+_FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _LANE_INDEX = ir.VectorType(_WORD, LANES)
 
 
 class _VectorType(types.Type):
-    """The numba type of 32 x uint16."""
+    """The numba type of 32 lanes of a kind."""
 
-    def __init__(self) -> None:
-        super().__init__(name="vector_32_uint16")
+    def __init__(self, lane: str, kind: ir.VectorType) -> None:
+        super().__init__(name=f"vector_32_{lane}")
+        self.kind = kind
 
 
-vector_type = _VectorType()
+vector_type = _VectorType("uint16", _VECTOR)
+float_vector_type = _VectorType("float32", _FLOATS)
 
 
 @register_model(_VectorType)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _VECTOR)
+        super().__init__(manager, kind, kind.kind)
 
 
 def _address(context, builder, array_type, array, index, pointee):
@@ -75,6 +80,66 @@ def store(typing_context, array, index, vector):
     def generate(context, builder, signature, arguments):
         pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _VECTOR)
         builder.store(arguments[2], pointer, align=2)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector), generate
+
+
+@intrinsic
+def load_bytes(typing_context, array, index):
+    """Return ``array.ravel()[index : index + 32]`` of a contiguous uint8 array, as uint16 lanes."""
+
+    def generate(context, builder, signature, arguments):
+        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _BYTES)
+        return builder.zext(builder.load(pointer, align=1), _VECTOR)
+
+    return vector_type(array, types.intp), generate
+
+
+@intrinsic
+def load_floats(typing_context, array, index):
+    """Return ``array.ravel()[index : index + 32]`` of a contiguous float32 array."""
+
+    def generate(context, builder, signature, arguments):
+        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _FLOATS)
+        return builder.load(pointer, align=4)
+
+    return float_vector_type(array, types.intp), generate
+
+
+@intrinsic
+def splat_float(typing_context, value):
+    """Return a vector with the float32 ``value`` in every lane."""
+
+    def generate(context, builder, signature, arguments):
+        return _splat(builder, arguments[0], _FLOATS)
+
+    return float_vector_type(types.float32), generate
+
+
+@intrinsic
+def multiply_add(typing_context, first, second, total):
+    """Lane by lane ``first * second + total`` of float vectors, rounded once where the processor can."""
+
+    def generate(context, builder, signature, arguments):
+        return _call(builder, f"llvm.fmuladd.v{LANES}f32", _FLOATS, arguments)
+
+    return float_vector_type(first, second, total), generate
+
+
+@intrinsic
+def store_rounded(typing_context, array, index, vector):
+    """Write a float vector, rounded to the nearest of 0 to 255, to ``array.ravel()[index : index + 32]``, uint8."""
+
+    def generate(context, builder, signature, arguments):
+        array, index, value = arguments
+        zeros, most, half = (ir.Constant(_FLOATS, [limit] * LANES) for limit in (0.0, 255.0, 0.5))
+        value = builder.fadd(value, half)
+        value = builder.select(builder.fcmp_ordered(">", value, zeros), value, zeros)  # NaN becomes 0
+        value = builder.select(builder.fcmp_ordered("<", value, most), value, most)
+        words = builder.fptoui(value, ir.VectorType(_WORD, LANES))
+        pointer = _address(context, builder, signature.args[0], array, index, _BYTES)
+        builder.store(builder.trunc(words, _BYTES), pointer, align=1)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, vector), generate
@@ -171,6 +236,17 @@ def fill_where_nonzero(typing_context, vector):
         return builder.sext(builder.icmp_unsigned("!=", arguments[0], zeros), _VECTOR)
 
     return vector_type(vector), generate
+
+
+@intrinsic
+def mix(typing_context, mask, first, second):
+    """Return ``second`` in the lanes whose mask is 65535, ``first`` in those whose mask is 0."""
+
+    def generate(context, builder, signature, arguments):
+        mask, first, second = arguments
+        return builder.xor(first, builder.and_(mask, builder.xor(first, second)))
+
+    return vector_type(mask, first, second), generate
 
 
 @intrinsic

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.cost import Codes, census
+from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.patch import kernel_settings
@@ -62,9 +62,10 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     pixel = Window(results.region.row + row, results.region.column + column, 1, 1)
     area = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
     settings = kernel_settings(config)
-    left = _codes(results.left, area, settings.window)
-    right = _codes(results.right, facing(area, config.disparity.minimum, config.disparity.maximum), settings.window)
-    curve = np.ascontiguousarray(cost_volume(left, right, settings)[pixel.relative_to(area).slices])
+    left = _codes(results.left, area, config.cost.window)
+    there = facing(area, config.disparity.minimum, config.disparity.maximum)
+    right = _codes(results.right, there, config.cost.window)
+    curve = np.ascontiguousarray(cost_volume(between(left, right), settings)[pixel.relative_to(area).slices])
     possible = curve[0, 0] != IMPOSSIBLE_COST
     if not possible.any():
         raise SatIntervalsError(_explain(results, row, column))

@@ -1,0 +1,72 @@
+"""Matching costs of features: how far the cosine of two unit vectors is from 1 (Zbontar and LeCun 2016).
+
+Letters: r row, c column, k disparity index, x = c + k column of the right features, f feature.
+"""
+
+import numpy as np
+from numba import njit
+
+from sat_intervals.kernels.vector import LANES, load_floats, multiply_add, splat_float, store_rounded
+from sat_intervals.products import COSINE_STEPS
+
+
+@njit(nogil=True)
+def _copy_row(features, r, factor, row):
+    """A row's features times a factor, close together: in the volume they lie so far apart that caches collide."""
+    for f in range(features.shape[0]):
+        for x in range(features.shape[2]):
+            row[f, x] = factor * features[f, r, x]
+
+
+@njit(nogil=True, forceinline=True)
+def _correlate_four(here, there, c, start, curves):
+    """Costs of the pixels ``c .. c + 3``: ``curves[i, x]`` of the pixel ``c + i`` and the right pixel ``c + x``.
+
+    ``start`` and the sum of products, rounded. Four pixels share what is loaded of the right ones, and their sums do
+    not wait for each other.
+    """
+    features, width, size = here.shape[0], there.shape[1], curves.shape[1]
+    for x in range(0, size, LANES):
+        total_1 = total_2 = total_3 = total_4 = splat_float(start)
+        for f in range(features):
+            facing = load_floats(there, f * width + c + x)
+            total_1 = multiply_add(facing, splat_float(here[f, c]), total_1)
+            total_2 = multiply_add(facing, splat_float(here[f, c + 1]), total_2)
+            total_3 = multiply_add(facing, splat_float(here[f, c + 2]), total_3)
+            total_4 = multiply_add(facing, splat_float(here[f, c + 3]), total_4)
+        store_rounded(curves, x, total_1)
+        store_rounded(curves, size + x, total_2)
+        store_rounded(curves, 2 * size + x, total_3)
+        store_rounded(curves, 3 * size + x, total_4)
+
+
+@njit(nogil=True, cache=True)
+def _correlate(left, right, steps, costs, here, there, curves):
+    rows, columns, size = costs.shape
+    for r in range(rows):
+        _copy_row(left, r, np.float32(-steps), here)
+        _copy_row(right, r, np.float32(1), there)
+        for first in range(0, columns, 4):
+            _correlate_four(here, there, first, np.float32(steps), curves)
+            for i in range(min(4, columns - first)):
+                for k in range(size):
+                    costs[r, first + i, k] = curves[i, i + k]
+
+
+def correlate(left: np.ndarray, right: np.ndarray, costs: np.ndarray) -> None:
+    """Write the costs of rows of pixels, ``round(COSINE_STEPS * (1 - cosine))``.
+
+    Parameters
+    ----------
+    left
+        ``(features, rows, columns)`` float32 unit vectors.
+    right
+        ``(features, rows, columns + count - 1)``: ``right[:, r, c + k]`` faces ``left[:, r, c]``.
+    costs
+        ``(rows, columns, size)`` uint8, filled: whole vectors that hold ``count`` costs, 0 to 2 COSINE_STEPS.
+    """
+    features, _, columns = left.shape
+    size = costs.shape[2] + LANES
+    here = np.zeros((features, columns + 3), np.float32)
+    there = np.zeros((features, columns + 3 + size), np.float32)
+    _correlate(left, right, COSINE_STEPS, costs, here, there, np.empty((4, size), np.uint8))
