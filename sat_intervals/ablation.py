@@ -7,19 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Config, Interval, load_config
+from sat_intervals.config import Config, Interval, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows as Judgeable
 from sat_intervals.evaluation import evaluate, rules_of
 from sat_intervals.finish import Final, Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.kernels.cost import between, census, padded_to_lanes
+from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.normalization import Scales, measure
 from sat_intervals.pairs import Pair
-from sat_intervals.patch import Reader, kernel_settings, match_patch
+from sat_intervals.patch import kernel_settings, match_patch
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY
-from sat_intervals.raster import check_pair, open_image, read_window
+from sat_intervals.raster import Image, check_pair, open_image, read_window
+from sat_intervals.similarity import Area, Reader, compare
 from sat_intervals.tables import METHODS
 from sat_intervals.tiling import Window, facing
 
@@ -63,7 +65,8 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
         )
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
-    finals = _all_methods(partial(read_window, left), partial(read_window, right), whole, config)
+    readers = partial(read_window, left), partial(read_window, right)
+    finals = _all_methods(*readers, whole, config, _scales(*readers, left, right, config))
     pixels, state = read_window(truth, whole)
     true = np.where(state == 0, pixels.astype(np.float64), np.nan)
     report: dict[str, Any] = {"cost": config.cost.method}
@@ -73,6 +76,13 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
         rows = Judgeable(disparity, lower, upper, confidence, final.validity, true)
         report[method] = evaluate(partial(list, [rows]), rules)["all"]
     return report
+
+
+def _scales(left: Reader, right: Reader, left_image: Image, right_image: Image, config: Config) -> Scales | None:
+    if not isinstance(config.cost, Mccnn):
+        return None
+    views = (left, left_image), (right, right_image)
+    return Scales(*(measure(read, image.height, image.width) for read, image in views))
 
 
 def _check_memory(whole: Window, config: Config) -> None:
@@ -85,10 +95,10 @@ def _check_memory(whole: Window, config: Config) -> None:
         )
 
 
-def _all_methods(left: Reader, right: Reader, whole: Window, config: Config) -> dict[str, Final]:
+def _all_methods(left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None) -> dict[str, Final]:
     """Final bands by every one of METHODS."""
     search = config.disparity
-    volume = _volume(left, right, whole, config)
+    volume = _volume(left, right, whole, config, scales)
     refine = config.refinement is not None
     weights = np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights
     winner, disparity, ambiguity = read_winners(volume, search.minimum, weights, refine)
@@ -100,7 +110,7 @@ def _all_methods(left: Reader, right: Reader, whole: Window, config: Config) -> 
     assert config.ambiguity is not None  # regularisation needs it
     scale = confidence_scale(config.ambiguity, histogram)
     validity = np.where(winner == NO_DISPARITY, NO_CANDIDATE, 0).astype(np.uint16)
-    seen = _right_winners(left, right, whole, volume, config)
+    seen = _right_winners(left, right, whole, volume, config, scales)
     finals = {}
     for method, (lower, upper) in bounds.items():
         rows = Rows(winner, lower, upper, disparity, ambiguity, validity, seen)
@@ -118,17 +128,15 @@ def _finished(rows: Rows, method: str, scale: Scale, config: Config) -> Final:
     return finish_rows(rows, 0, rows.winner.shape[0], scale, config)
 
 
-def _volume(left: Reader, right: Reader, whole: Window, config: Config) -> np.ndarray:
+def _volume(left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None) -> np.ndarray:
     """Aggregated costs of the whole pair, ``(rows, columns, count)`` uint16."""
-    window, search = config.cost.window, config.disparity
-    beyond = window // 2
-    facing_area = facing(whole, search.minimum, search.maximum)
-    left_codes = census(*left(whole.grown(beyond, beyond)), window)
-    right_codes = census(*right(facing_area.grown(beyond, beyond)), window)
-    return cost_volume(between(left_codes, right_codes), kernel_settings(config))
+    (similarity,) = compare(left, right, [Area.of(whole, config)], config, scales)
+    return cost_volume(similarity.costs, kernel_settings(config), similarity.gradients)
 
 
-def _right_winners(left: Reader, right: Reader, whole: Window, volume: np.ndarray, config: Config) -> np.ndarray:
+def _right_winners(
+    left: Reader, right: Reader, whole: Window, volume: np.ndarray, config: Config, scales: Scales | None
+) -> np.ndarray:
     """The right view's winners, as the run's way of cross-checking finds them."""
     search = config.disparity
     if config.cross_check is None or config.cross_check.method == "fast":
@@ -138,5 +146,6 @@ def _right_winners(left: Reader, right: Reader, whole: Window, volume: np.ndarra
         config, {"disparity": {"minimum": -search.maximum, "maximum": -search.minimum}, "cross_check": None}
     )
     reach = facing(whole, search.minimum, search.maximum)
-    winner = match_patch(right, left, reach, reach, reach, mirrored).raw.winner
+    swapped = None if scales is None else Scales(scales.right, scales.left)
+    winner = match_patch(right, left, reach, reach, reach, mirrored, swapped).raw.winner
     return np.where(winner == NO_DISPARITY, NO_DISPARITY, -winner).astype(np.int16)

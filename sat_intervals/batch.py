@@ -16,10 +16,10 @@ import yaml
 from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Config, load_config
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.job import OUTPUTS, Job, compile_kernels, prepare
 from sat_intervals.raster import open_image
-from sat_intervals.run import check_failures, matched
+from sat_intervals.run import check_failures, matched, measure_images
 
 _IMAGES = ("left", "right", "left_mask", "right_mask")
 
@@ -174,15 +174,23 @@ def _matched(jobs: list[Job], names: dict[int, str], keep_tiles: bool, progress:
     for config in {_kernels(job.config): job.config for job in jobs}.values():
         compile_kernels(config)
     waiting: list[tuple[Job, Future[dict[str, Any]]]] = []
+    ended: list[tuple[str, Any]] = []
     with ThreadPoolExecutor(1) as thread, connected(jobs[0].config.cluster) as client:
-        for job, failures in matched(client, jobs, progress):
+        measured = []
+        for job in jobs:
+            try:
+                measure_images(client, job, progress)
+                measured.append(job)
+            except RunError as error:
+                ended.append((names[id(job)], {"state": "failed", "error": str(error)}))
+        for job, failures in matched(client, measured, progress):
             waiting.append((job, thread.submit(_concluded, job, failures, keep_tiles)))
-    return [(names[id(job)], future.result()) for job, future in waiting]
+    return ended + [(names[id(job)], future.result()) for job, future in waiting]
 
 
 def _kernels(config: Config) -> str:
     """What distinguishes the kernels that a configuration needs."""
-    return config.model_dump_json(include={"cost": True, "cross_check": {"method"}})
+    return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
 def _concluded(job: Job, failures: dict[str, BaseException], keep_tiles: bool) -> dict[str, Any]:

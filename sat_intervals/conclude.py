@@ -28,7 +28,7 @@ Item = TypeVar("Item")
 STRIP_PIXELS = 1 << 20
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage ("kernels", "tiles", "bands", "files"), how much of it is done, and how much there is."""
+"""Called with a stage ("kernels", "images", "tiles", "bands", "files"), how much of it is done, and how much in all."""
 
 
 def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
@@ -145,6 +145,7 @@ def _report(job: Job, scale: Scale, tally: Tally, seconds: dict[str, float]) -> 
             "overlap": config.tiles.overlap,
         },
         "cost_span": config.cost_span,
+        "normalization": job.store.normalization(),
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),
         "validity_bits": {

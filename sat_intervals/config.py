@@ -23,14 +23,13 @@ from pydantic import (
     Field,
     PlainSerializer,
     ValidationError,
-    field_validator,
     model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import IMPOSSIBLE_COST
+from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST
 
 SGM_PATHS = 8
 
@@ -62,10 +61,12 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    @field_validator("*", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _accept_numpy_scalars(cls, value: Any) -> Any:
-        return value.item() if isinstance(value, np.generic) else value
+    def _accept_numpy_scalars(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        return {key: value.item() if isinstance(value, np.generic) else value for key, value in values.items()}
 
 
 class Disparity(Section):
@@ -89,21 +90,126 @@ class Disparity(Section):
 class Census(Section):
     """Matching cost: Hamming distance of Census codes."""
 
-    method: Literal["census"] = Field("census", description="matching cost")
+    method: Literal["census"] = Field("census", description="matching cost, census or mccnn")
     window: Odd = Field(5, ge=3, le=11, description="side of the square window, in pixels")
 
+    @property
+    def steps(self) -> int:
+        """Integer costs to a unit of the settings: a bit."""
+        return 1
 
-class Sgm(Section):
+    @property
+    def largest(self) -> int:
+        """The largest integer cost."""
+        return self.window**2 - 1
+
+    @property
+    def ceiling(self) -> int:
+        """From which the cost of impossible candidates is counted, as libSGM does."""
+        return self.window**2
+
+
+class Mccnn(Section):
+    """Matching cost: 1 - cosine of the features of a network, MC-CNN fast (Zbontar and LeCun 2016)."""
+
+    method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
+    weights: str | None = Field(None, description="ONNX file of the network; null: the one of the extra [mccnn]")
+
+    @property
+    def window(self) -> int:
+        """Side of what a feature sees, in pixels."""
+        return 11
+
+    @property
+    def steps(self) -> int:
+        """Integer costs to a unit of the settings: of the cosine."""
+        return COSINE_STEPS
+
+    @property
+    def largest(self) -> int:
+        """The largest integer cost."""
+        return 2 * COSINE_STEPS
+
+    @property
+    def ceiling(self) -> int:
+        """From which the cost of impossible candidates is counted."""
+        return self.largest
+
+
+class _Penalties(Section):
     """Semi-global matching over 8 paths (Hirschmuller 2008)."""
-
-    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
-    p2: int = Field(32, ge=1, description="penalty of a larger step, at least p1")
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        if self.p1 > self.p2:
-            raise ValueError(f"p1 {self.p1} is above p2 {self.p2}, the penalty of a larger step")
+        p1, p2 = getattr(self, "p1"), getattr(self, "p2")  # noqa: B009 (each kind declares its own)
+        if p1 > p2:
+            raise ValueError(f"p1 {p1} is above p2 {p2}, the penalty of a larger step")
         return self
+
+
+class Sgm(_Penalties):
+    """Constant penalties."""
+
+    penalty: Literal["constant"] = Field("constant", description="the same everywhere; or negative or inverse")
+    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
+    p2: int = Field(32, ge=1, description="penalty of a larger step, at least p1")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return Fraction(self.p2)
+
+
+class NegativeSgm(_Penalties):
+    """The penalty of a larger step falls with the gradient of the left image, in a line (Banz et al. 2012)."""
+
+    penalty: Literal["negative"] = Field("negative", description="p2 is gamma - alpha * gradient")
+    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
+    p2: int = Field(32, ge=1, description="least penalty of a larger step, at least p1")
+    alpha: float = Field(ge=0, description="fall of the penalty by a grey value of gradient")
+    gamma: float = Field(gt=0, description="penalty of a larger step without gradient")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return max(Fraction(self.p2), Fraction(self.gamma))
+
+
+class InverseSgm(_Penalties):
+    """The penalty of a larger step falls with the inverse of the left image's gradient (Banz et al. 2012)."""
+
+    penalty: Literal["inverse"] = Field("inverse", description="p2 is gamma + alpha / (gradient + beta)")
+    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
+    p2: int = Field(32, ge=1, description="least penalty of a larger step, at least p1")
+    alpha: float = Field(ge=0, description="share of the penalty that gradients bring down, times beta")
+    beta: float = Field(gt=0, description="gradient, in grey values, that halves this share")
+    gamma: float = Field(ge=0, description="penalty of a larger step at an endless gradient")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return max(Fraction(self.p2), Fraction(self.gamma) + Fraction(self.alpha) / Fraction(self.beta))
+
+
+class MccnnSgm(_Penalties):
+    """Penalties of MC-CNN, in units of the cosine: they fall where an image has an edge along the path."""
+
+    penalty: Literal["mc_cnn_fast"] = Field("mc_cnn_fast", description="they fall where the images have edges")
+    p1: Exact = Field(Decimal("0.5"), gt=0, description="penalty of a disparity step of one pixel")
+    p2: Exact = Field(Decimal("0.75"), gt=0, description="penalty of a larger step, at least p1")
+    q1: Exact = Field(Decimal(3), ge=1, description="divides both where one of the images has an edge")
+    q2: Exact = Field(Decimal(6), ge=1, description="divides them again where both have")
+    v: Exact = Field(Decimal("1.5"), ge=1, description="divides p1 on the vertical paths")
+    d: float = Field(0.08, ge=0, description="gradient above which there is an edge")
+    gradients: Literal["normalized", "raw"] = Field(
+        "normalized", description="in standard deviations, right where a candidate faces it; or as the reference"
+    )
+    span: Exact = Field(Decimal(16), gt=0, description="cost that etas and alpha are shares of, after SGM")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return Fraction(self.p2)
 
 
 class Ambiguity(Section):
@@ -218,8 +324,8 @@ class Config(Section):
     """All settings of a run; a section that is None switches its step off."""
 
     disparity: Disparity
-    cost: Census = Census()
-    sgm: Sgm | None = Sgm()
+    cost: Census | Mccnn = Field(Census(), discriminator="method")
+    sgm: Sgm | NegativeSgm | InverseSgm | MccnnSgm | None = Field(Sgm(), discriminator="penalty")
     ambiguity: Ambiguity | None = Ambiguity()
     interval: Interval | None = Interval()
     refinement: Refinement | None = Refinement()
@@ -230,41 +336,92 @@ class Config(Section):
     products: Products = Products()
     cluster: Cluster = Cluster()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _choose_methods(cls, values: Any) -> Any:
+        """Where a section does not say its kind: census, and the penalties of the cost."""
+        if not isinstance(values, Mapping):
+            return values
+        values = dict(values)
+        cost = values.setdefault("cost", {})
+        if isinstance(cost, Mapping):
+            cost = values["cost"] = {"method": "census", **cost}
+        method = cost.get("method") if isinstance(cost, Mapping) else getattr(cost, "method", None)
+        sgm = values.setdefault("sgm", {})
+        if isinstance(sgm, Mapping):
+            values["sgm"] = {"penalty": "mc_cnn_fast" if method == "mccnn" else "constant", **sgm}
+        return values
+
     @model_validator(mode="after")
     def _check_sections(self) -> Self:
-        # The largest uint16 is kept free: it marks the summed cost of an impossible candidate.
-        largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self._largest_cost
-        if self.sgm is not None and self.sgm.p2 > largest:
-            raise ValueError(
-                f"sgm.p2 is {self.sgm.p2}, allowed: <= {largest} with cost.window {self.cost.window}, "
-                f"so that costs summed over {SGM_PATHS} paths fit in 16 bits"
-            )
+        if self.sgm is not None:
+            self._check_sgm(self.sgm)
         off = [name for name in ("ambiguity", "interval") if getattr(self, name) is None]
         if self.regularization is not None and off:
             raise ValueError(
                 f"regularization needs {' and '.join(off)}, which null switches off: "
                 f"give {' and '.join(off)} or set regularization to null"
             )
-        # Neighbouring tiles are compared on a ring of one pixel around the core: Census must be whole there.
+        # Neighbouring tiles are compared on a ring of one pixel around the core: windows must be whole there.
         smallest = self.cost.window // 2 + 1
         if self.tiles.overlap < smallest:
             raise ValueError(
-                f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with cost.window {self.cost.window}"
+                f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with {self._cost_in_words}"
             )
         return self
 
+    def _check_sgm(self, sgm: Sgm | NegativeSgm | InverseSgm | MccnnSgm) -> None:
+        if isinstance(sgm, MccnnSgm) != isinstance(self.cost, Mccnn):
+            known = "mc_cnn_fast" if isinstance(self.cost, Mccnn) else "constant, negative or inverse"
+            raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: {known} with cost.method {self.cost.method}")
+        # The largest uint16 is kept free: it marks the summed cost of an impossible candidate.
+        largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.cost.largest
+        if self.largest_p2 > largest:
+            key = "p2" if sgm.penalty in ("constant", "mc_cnn_fast") else "gamma, the penalty without gradient,"
+            raise ValueError(
+                f"sgm.{key} is {float(sgm.largest_p2):g}, allowed: <= {largest // self.cost.steps} with "
+                f"{self._cost_in_words}, so that costs summed over {SGM_PATHS} paths fit in 16 bits"
+            )
+        if isinstance(sgm, MccnnSgm):
+            if self.cost_span > self.largest_sum:
+                raise ValueError(
+                    f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
+                )
+            if sgm.gradients == "raw" and not self.disparity.minimum <= 0 <= self.disparity.maximum:
+                raise ValueError("sgm.gradients raw looks at the right image at disparity 0, which is not searched")
+
     @property
-    def _largest_cost(self) -> int:
-        return self.cost.window**2 - 1
+    def _cost_in_words(self) -> str:
+        return f"cost.window {self.cost.window}" if isinstance(self.cost, Census) else f"cost.method {self.cost.method}"
+
+    def in_steps(self, value: Decimal | float | Fraction) -> int:
+        """The nearest integer cost to a value in units of the settings."""
+        return floor(Fraction(value) * self.cost.steps + Fraction(1, 2))
+
+    @property
+    def largest_p2(self) -> int:
+        """The largest penalty, as an integer cost; 0 without SGM."""
+        return 0 if self.sgm is None else self.in_steps(self.sgm.largest_p2)
+
+    @property
+    def impossible_cost(self) -> int:
+        """What an impossible candidate costs inside SGM."""
+        return self.cost.ceiling + self.largest_p2 + self.cost.steps
+
+    @property
+    def largest_sum(self) -> int:
+        """The largest possible cost, after SGM where it is on; the smallest is 0."""
+        return self.cost.largest if self.sgm is None else SGM_PATHS * (self.cost.largest + self.largest_p2)
 
     @property
     def cost_span(self) -> int:
-        """Largest minus smallest possible cost, after SGM where it is on.
+        """What etas and alpha are shares of: largest minus smallest possible cost, or what the settings declare.
 
-        The paper's ``max C_V - min C_V``, declared and not measured: real scenes attain both bounds, and a
-        span measured on a tile would make the result depend on the tiling.
+        The paper's ``max C_V - min C_V``, declared and not measured: a span measured on a tile would make the result
+        depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they come nowhere near, and
+        differ: see ``span`` in its settings.
         """
-        return self._largest_cost if self.sgm is None else SGM_PATHS * (self._largest_cost + self.sgm.p2)
+        return self.in_steps(self.sgm.span) if isinstance(self.sgm, MccnnSgm) else self.largest_sum
 
     @property
     def cut_level(self) -> int | None:
@@ -289,7 +446,7 @@ class Config(Section):
 
     @property
     def ambiguity_weights(self) -> npt.NDArray[np.uint16] | None:
-        """Table ``(cost_span + 1,)`` of what a candidate adds to the ambiguity, by its ``S(d) - min S``.
+        """Table ``(largest_sum + 1,)`` of what a candidate adds to the ambiguity, by its ``S(d) - min S``.
 
         The number of levels at or above it; ``weights[0]``, all of them, is also what an impossible candidate
         adds. None if off.
@@ -297,7 +454,7 @@ class Config(Section):
         levels = self.ambiguity_levels
         if levels is None:
             return None
-        below = np.searchsorted(levels, np.arange(self.cost_span + 1), side="left")
+        below = np.searchsorted(levels, np.arange(self.largest_sum + 1), side="left")
         return (len(levels) - below).astype(np.uint16)
 
 
@@ -334,7 +491,7 @@ def load_config(
         case _:
             raise ConfigError(f"settings are {_shown(source)}, allowed: a YAML file, a mapping or a Config")
     try:
-        return Config.model_validate(_merged(values, overrides))
+        return Config.model_validate(_merged(_without_other_cost(values, overrides), overrides))
     except ValidationError as error:
         problems = error.errors(include_url=False)
         if all(_given(overrides, problem["loc"]) for problem in problems):
@@ -360,8 +517,10 @@ def allowed(field: FieldInfo) -> str:
     nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false", str: "text"}
     signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
     kinds = get_args(field.annotation) or (field.annotation,)
-    section = _section(field)
-    kind = f"section of {', '.join(section.model_fields)}" if section else nouns.get(kinds[0]) or " or ".join(kinds)
+    sections = _sections(field)
+    kind = (
+        f"section of {', '.join(sections[0].model_fields)}" if sections else nouns.get(kinds[0]) or " or ".join(kinds)
+    )
     bounds = [
         f"{sign} {getattr(constraint, name)}"
         for constraint in field.metadata
@@ -373,17 +532,28 @@ def allowed(field: FieldInfo) -> str:
     return " ".join(filter(None, [kind, ", ".join(bounds), "or null" if NoneType in kinds else ""]))
 
 
-def _section(field: FieldInfo) -> type[Section] | None:
+def _sections(field: FieldInfo) -> list[type[Section]]:
+    """The kinds of section that a field holds."""
     kinds = get_args(field.annotation) or (field.annotation,)
-    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)), None)
+    return [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)]
 
 
 def _explained(problem: ErrorDetails) -> str:
     path = [str(key) for key in problem["loc"]]
+    owner: type[Section] = Config
+    if path and path[0] in Config.model_fields:
+        field = Config.model_fields[path[0]]
+        kinds = _sections(field)
+        if problem["type"] == "union_tag_invalid":
+            known = " or ".join(str(kind.model_fields[str(field.discriminator)].default) for kind in kinds)
+            return f"{path[0]}.{field.discriminator} is {_shown(problem['ctx']['tag'])}, allowed: {known}"
+        if len(kinds) > 1 and len(path) > 1:
+            tag = path.pop(1)  # pydantic names the kind as well
+            kinds = [kind for kind in kinds if kind.model_fields[str(field.discriminator)].default == tag]
+        owner = kinds[0] if len(path) > 1 else Config
     where = ".".join(path)
     if problem["type"] == "value_error":
         return ": ".join(filter(None, [where, str(problem["ctx"]["error"])]))
-    owner = (len(path) > 1 and _section(Config.model_fields[path[0]])) or Config
     if problem["type"] in ("extra_forbidden", "invalid_key"):
         return f"unknown key {where!r}{_known(path[-1], owner.model_fields)}"
     state = "missing" if problem["type"] == "missing" else _shown(problem["input"])
@@ -400,6 +570,18 @@ def _shown(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return json.dumps(value)
     return str(value) if isinstance(value, Decimal) else reprlib.repr(value)
+
+
+def _without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The settings without cost and penalties where the overrides choose another method, whose keys are others."""
+
+    def method(settings: Mapping[str, Any]) -> Any:
+        cost = settings.get("cost")
+        return cost.get("method") if isinstance(cost, Mapping) else None
+
+    if method(overrides) in (None, method(values) or "census"):
+        return values
+    return {key: value for key, value in values.items() if key != "cost" and (key != "sgm" or value is None)}
 
 
 def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:

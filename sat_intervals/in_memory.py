@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sat_intervals.config import Config, load_config
+from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.finish import Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.memory import machine_bytes, volume_bytes
-from sat_intervals.patch import Reader, match_patch
+from sat_intervals.normalization import Scales, measure
+from sat_intervals.patch import match_patch
 from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
+from sat_intervals.similarity import Reader
 from sat_intervals.tiling import Window
 
 Array = np.ndarray | xr.DataArray
@@ -45,7 +47,11 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     _check_fit(left_pixels, right_pixels, config)
     left_image, right_image = _image(left_pixels), _image(right_pixels)
     whole = Window(0, 0, *left_image.shape)
-    patch = match_patch(_reader(left_image), _reader(right_image), whole, whole, whole, config)
+    readers = _reader(left_image), _reader(right_image)
+    scales = None
+    if isinstance(config.cost, Mccnn):
+        scales = Scales(measure(readers[0], *left_image.shape), measure(readers[1], *right_image.shape))
+    patch = match_patch(*readers, whole, whole, whole, config, scales)
     raw = patch.raw
     rows = Rows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
     scale = Scale(np.nan, np.nan)
@@ -103,7 +109,7 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
             f"columns, out of the right, {right.shape[1]}: check their sign, x_right = x_left + disparity"
         )
     rows, columns = left.shape
-    needed, there = volume_bytes(rows, columns, search.count), machine_bytes()
+    needed, there = volume_bytes(rows, columns, config), machine_bytes()
     if needed > there:
         raise SatIntervalsError(
             f"{rows} x {columns} pixels x {search.count} disparities "

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.cluster import available_cores
-from sat_intervals.config import Config, load_config
+from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.features import load_network, weights_file
 from sat_intervals.finish import Rows, Scale, finish_strips
 from sat_intervals.inputs import identity, pixels_digest
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.memory import fitted, machine_bytes, parse_bytes, volume_bytes
+from sat_intervals.normalization import Scale as ImageScale
+from sat_intervals.normalization import Scales
 from sat_intervals.patch import match_patch
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files, read_window
 from sat_intervals.store import Store
@@ -41,7 +44,7 @@ class Job:
     out
         Folder of the run.
     inputs
-        What run.json says of the images.
+        What run.json says of the images, and of the weights of MC-CNN.
     """
 
     left: Image
@@ -69,7 +72,12 @@ class Job:
         self.store.open(manifest, overwrite=overwrite, is_mended=self._reads_what_was_read)
 
     def _reads_what_was_read(self) -> bool:
-        """Whether every tile that is done would read today the pixels that it was made of."""
+        """Whether every tile that is done would read today the pixels that it was made of.
+
+        With MC-CNN all pixels have a part in every tile, by their mean.
+        """
+        if isinstance(self.config.cost, Mccnn):
+            return False
         images = {"left": self.left, "right": self.right}
         reads = (read for record in self.store.records().values() for read in record["pixels_read"])
         return all(
@@ -104,6 +112,8 @@ def prepare(
     check_space(out, RUN_FILES, region.height, region.width)
     store = Store(out / "tiles", Grid(region, config.tiles.size), config.disparity.count, config.largest_ambiguity)
     inputs = {"left": _described(left), "right": _described(right)}
+    if isinstance(config.cost, Mccnn):
+        inputs["weights"] = weights_identity(config.cost)
     return Job(left, right, config, store, out, inputs)
 
 
@@ -111,7 +121,14 @@ def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Co
     """Open the images of a pair and check that they can be matched."""
     left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
     check_pair(left, right, config.disparity.minimum, config.disparity.maximum)
+    if isinstance(config.cost, Mccnn):
+        load_network(weights_file(config.cost.weights))
     return left, right
+
+
+def weights_identity(cost: Mccnn) -> dict[str, Any]:
+    """What run.json and the manifest say of the weights, and of what runs them."""
+    return {**identity(str(weights_file(cost.weights))), "onnxruntime": version("onnxruntime")}
 
 
 def check_output(out: Path, overwrite: bool) -> None:
@@ -139,7 +156,8 @@ def compile_kernels(config: Config) -> None:
         return pixels, np.zeros(pixels.shape, np.uint8)
 
     spot = Window(0, 0, 4, 4)
-    patch = match_patch(read, read, spot, spot, spot, config)
+    scales = Scales(ImageScale(0.5, 0.3), ImageScale(0.5, 0.3))
+    patch = match_patch(read, read, spot, spot, spot, config, scales)
     raw = patch.raw
     rows = Rows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
     list(finish_strips([rows], Scale(0.0, 1.0), config))
@@ -163,7 +181,7 @@ def _check_memory(config: Config, region: Window) -> None:
         return
     height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
     workers = min(config.cluster.workers or available_cores(), len(Grid(region, config.tiles.size)))
-    needed, there = workers * volume_bytes(height, width, config.disparity.count), machine_bytes()
+    needed, there = workers * volume_bytes(height, width, config), machine_bytes()
     if needed > there:
         raise SatIntervalsError(
             f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {workers} at once, need "

@@ -3,13 +3,15 @@
 import os
 import re
 
-from sat_intervals.config import Config, ConfigError
+from sat_intervals.config import Config, ConfigError, Mccnn
 
 # A process before its first tile, its libraries and compiled kernels; measured 240 MB.
 PROCESS_BYTES = 300 * 10**6
 # Per pixel of a tile with its overlap: pixels as float32 and float64 on their way, states, codes of both images, and
 # what numpy keeps meanwhile; per pixel of the core: raw products and their compressed copies.
 _PATCH_BYTES, _CORE_BYTES = 40, 60
+# Per column of a patch: what the network of MC-CNN holds of a strip of rows, and the features of both images.
+_NETWORK_BYTES = 140_000
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
 
 
@@ -32,19 +34,28 @@ def machine_bytes() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def volume_bytes(height: int, width: int, count: int) -> int:
-    """The volume of so many pixels and disparities, the most of what matching takes."""
-    return 2 * height * width * (-(-count // 32) * 32)
+def _lanes(config: Config) -> int:
+    """Disparities in whole vectors."""
+    return -(-config.disparity.count // 32) * 32
+
+
+def volume_bytes(height: int, width: int, config: Config) -> int:
+    """The volume of so many pixels, the most of what matching takes; that of MC-CNN's costs comes on top."""
+    return (3 if isinstance(config.cost, Mccnn) else 2) * height * width * _lanes(config)
 
 
 def tile_bytes(config: Config, size: int | None = None) -> int:
     """Memory that a tile takes while it is matched, on top of its process; ``size`` in place of the settings' own."""
     size = size or config.tiles.size
-    lanes = -(-config.disparity.count // 32) * 32
+    lanes = _lanes(config)
     patch = size + 2 * config.tiles.overlap
     volume = 2 * (size + 2) ** 2 * lanes
-    if config.cross_check and config.cross_check.method == "accurate":
+    accurate = config.cross_check is not None and config.cross_check.method == "accurate"
+    if accurate:
         volume = 2 * size * (size + config.disparity.count) * lanes  # that of the right view, which is wider
+    if isinstance(config.cost, Mccnn):
+        volume += lanes * patch * (patch + accurate * (patch + config.disparity.count))
+        volume += _NETWORK_BYTES * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes
     return volume + paths + _PATCH_BYTES * patch * (patch + config.disparity.count) + _CORE_BYTES * size**2
 

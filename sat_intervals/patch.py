@@ -1,18 +1,15 @@
-"""One patch of two images to raw products: read, census, match, and what the neighbours need to know."""
+"""One patch of two images to raw products: read, compare, match, and what the neighbours need to know."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config
-from sat_intervals.kernels.cost import Codes, between, census
+from sat_intervals.config import Config, Sgm
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match
+from sat_intervals.normalization import Scales
 from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
+from sat_intervals.similarity import Area, Reader, Similarity, compare
 from sat_intervals.tiling import Window, facing
-
-Reader = Callable[[Window], tuple[np.ndarray, np.ndarray]]
-"""Pixels (float) and states (uint8) of any window of an image; outside the image the state is NO_DATA."""
 
 
 class Patch(NamedTuple):
@@ -35,12 +32,13 @@ class Patch(NamedTuple):
 
 def kernel_settings(config: Config) -> Settings:
     """What the kernels need to know of a configuration."""
+    constant = config.sgm if isinstance(config.sgm, Sgm) else None  # others come with the gradients that they follow
     return Settings(
         minimum=config.disparity.minimum,
         count=config.disparity.count,
-        impossible=config.cost.window**2 + (config.sgm.p2 if config.sgm else 0) + 1,
-        p1=config.sgm.p1 if config.sgm else 0,
-        p2=config.sgm.p2 if config.sgm else 0,
+        impossible=config.impossible_cost,
+        p1=constant.p1 if constant else 0,
+        p2=constant.p2 if constant else 0,
         regularized=config.sgm is not None,
         cut_level=-1 if config.cut_level is None else config.cut_level,
         weights=np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights,
@@ -48,7 +46,15 @@ def kernel_settings(config: Config) -> Settings:
     )
 
 
-def match_patch(left: Reader, right: Reader, core: Window, region: Window, image: Window, config: Config) -> Patch:
+def match_patch(
+    left: Reader,
+    right: Reader,
+    core: Window,
+    region: Window,
+    image: Window,
+    config: Config,
+    scales: Scales | None = None,
+) -> Patch:
     """Match a core with its overlap.
 
     Parameters
@@ -63,49 +69,46 @@ def match_patch(left: Reader, right: Reader, core: Window, region: Window, image
         All left pixels: the overlap goes beyond the region, but not beyond the image.
     config
         Settings.
+    scales
+        Mean and standard deviation of the whole images, which MC-CNN needs.
     """
     settings = kernel_settings(config)
     overlap = config.tiles.overlap
-    window = config.cost.window
-    area = core.grown(overlap, overlap).clipped(image)
     output = core.grown(1, 1).clipped(region)
     method = config.cross_check.method if config.cross_check else None
-    seen = core if method == "fast" else Window(core.row, core.column, 0, 0)
-    raw, right_view, left_state = _match_area(left, right, area, output, seen, settings, window)
-    raw.validity[left_state & MASKED != 0] |= LEFT_MASKED
+    areas = [Area.of(core.grown(overlap, overlap).clipped(image), config)]
     if method == "accurate":
-        right_view = _match_from_right(left, right, core, image, settings, overlap, window)
+        areas.append(_seen_area(core, image, config))
+    similarities = compare(left, right, areas, config, scales)
+    seen = core if method == "fast" else Window(core.row, core.column, 0, 0)
+    raw, right_view = _matched(similarities[0], areas[0], settings, output, seen)
+    inside = output.relative_to(areas[0].base).slices
+    raw.validity[similarities[0].state[inside] & MASKED != 0] |= LEFT_MASKED
+    if method == "accurate":
+        right_view = _match_from_right(similarities[1], areas[1], core, settings)
     return Patch(raw, output, right_view)
 
 
-def _codes(read: Reader, area: Window, window: int) -> tuple[Codes, np.ndarray]:
-    """Census codes of an area, and the states of its pixels."""
-    radius = window // 2
-    pixels, state = read(area.grown(radius, radius))
-    inner = Window(radius, radius, area.height, area.width)
-    return census(pixels, state, window), state[inner.slices]
+def _matched(
+    similarity: Similarity, area: Area, settings: Settings, output: Window, core: Window
+) -> tuple[Raw, RightView]:
+    """Match an area; returns the products of ``output`` and the right view of ``core``."""
+    windows = output.relative_to(area.base), core.relative_to(area.base)
+    return match(similarity.costs, settings, *windows, similarity.gradients)
 
 
-def _match_area(
-    left: Reader, right: Reader, area: Window, output: Window, core: Window, settings: Settings, window: int
-) -> tuple[Raw, RightView, np.ndarray]:
-    """Match the pixels of an area; returns the products of ``output`` and the states of its left pixels."""
-    maximum = settings.minimum + settings.count - 1
-    left_codes, left_state = _codes(left, area, window)
-    right_codes, _ = _codes(right, facing(area, settings.minimum, maximum), window)
-    wanted = output.relative_to(area)
-    raw, right_view = match(between(left_codes, right_codes), settings, wanted, core.relative_to(area))
-    return raw, right_view, left_state[wanted.slices]
+def _seen_area(core: Window, image: Window, config: Config) -> Area:
+    """The right pixels that a core can reach, with their overlap; they may lie outside the right image."""
+    search, overlap = config.disparity, config.tiles.overlap
+    reach = facing(core, search.minimum, search.maximum)
+    rows = Window(image.row, reach.column - overlap, image.height, reach.width + 2 * overlap)
+    return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
 
 
-def _match_from_right(
-    left: Reader, right: Reader, core: Window, image: Window, settings: Settings, overlap: int, window: int
-) -> RightView:
+def _match_from_right(similarity: Similarity, area: Area, core: Window, settings: Settings) -> RightView:
     """The right view from a volume of its own: left and right change places, and disparities their sign."""
     maximum = settings.minimum + settings.count - 1
     mirrored = settings._replace(minimum=-maximum, cut_level=-1, weights=np.zeros(0, np.uint16), refine=False)
     reach = facing(core, settings.minimum, maximum)
-    rows = Window(image.row, reach.column - overlap, image.height, reach.width + 2 * overlap)
-    area = reach.grown(overlap, overlap).clipped(rows)
-    raw, _, _ = _match_area(right, left, area, reach, reach, mirrored, window)
+    raw, _ = _matched(similarity, area, mirrored, reach, reach)
     return RightView(raw.cost, np.where(raw.winner == NO_DISPARITY, NO_DISPARITY, -raw.winner).astype(np.int16))

@@ -114,4 +114,5 @@ def _expected_seconds(left: Image, right: Image, config: Config, workers: int, w
     sampled = _work(Grid(sample, config.tiles.size), whole, config)
     tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / sampled / workers
     files = (seconds["bands"] + seconds["files"]) * (whole.height * whole.width) / (height * width)
-    return float(seconds["start"] + seconds["kernels"] + tiles + files)
+    images = seconds["tiles.images"]  # whole already, whatever the sample
+    return float(seconds["start"] + seconds["kernels"] + images + tiles + files)

@@ -11,10 +11,12 @@ from distributed.client import ClosedClientError
 
 from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
+from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
 from sat_intervals.job import Job, compile_kernels, prepare
+from sat_intervals.normalization import Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
-from sat_intervals.tile import match_tile, timed
+from sat_intervals.tile import match_tile, measure_block, timed
 from sat_intervals.tiling import Tile, Window
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
@@ -75,15 +77,47 @@ def match_pair(
             compile_kernels(job.config)
             progress("kernels", 1, 1)
         with timed(seconds, "tiles"):
-            progress("tiles", len(job.store.grid) - job.waiting, len(job.store.grid))
             if job.waiting:
                 with connected(job.config.cluster) as client:
+                    with timed(seconds, "tiles.images"):
+                        measure_images(client, job, progress)
+                    progress("tiles", len(job.store.grid) - job.waiting, len(job.store.grid))
                     for _, failures in matched(client, [job], progress):
                         check_failures(job, failures)
         report = conclude(job, seconds, progress)
         if not keep_tiles:
             job.store.remove()
     return report
+
+
+def measure_images(client: Client, job: Job, progress: Progress) -> None:
+    """Keep mean and standard deviation of both images in the store, where MC-CNN needs them and they are not there.
+
+    Raises
+    ------
+    RunError
+        An image that cannot be read.
+    """
+    if not isinstance(job.config.cost, Mccnn) or job.store.normalization() is not None:
+        return
+    job.store.write_normalization(
+        Scales(*(_measured(client, image, job, progress) for image in (job.left, job.right))).report()
+    )
+
+
+def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Scale:
+    windows = blocks(image.height, image.width)
+    with _scheduler_needed():
+        futures = client.map(
+            measure_block, [image] * len(windows), windows, pure=False, retries=job.config.cluster.retries
+        )
+    for done, future in enumerate(as_completed(futures), start=1):
+        error = _landed(future)
+        if error is not None:
+            raise RunError(f"{image.path} could not be measured: {_reason(error)}") from error
+        progress("images", done, len(windows))
+    with _scheduler_needed():
+        return scale_of(client.gather(futures))
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:

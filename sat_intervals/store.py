@@ -41,6 +41,7 @@ SIDES = ("top", "bottom", "left", "right")
 SEAM_PRODUCTS = ("winner", "lower", "upper")
 
 _MANIFEST, _LOCK, _RECORDS, _FAILURES = "manifest.json", ".lock", "records", "failures"
+_NORMALIZATION = "normalization.json"
 
 # Rows of a shard that are compressed together, so that strips read no more than they need.
 _ROWS_TOGETHER = 128
@@ -134,6 +135,7 @@ class Store:
                 )
             return
         file.unlink(missing_ok=True)  # first: without it nothing of the rest counts
+        (self.path / _NORMALIZATION).unlink(missing_ok=True)
         for folder in (self._arrays, self.path / _RECORDS, self.path / _FAILURES):
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
@@ -193,6 +195,15 @@ class Store:
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
         _write_whole(self._record_file(tile), json.dumps(record))
+
+    def write_normalization(self, normalization: Mapping[str, Any]) -> None:
+        """Keep what was measured of the whole images, so that all tiles of the run agree on it, whenever matched."""
+        _write_whole(self.path / _NORMALIZATION, json.dumps(normalization))
+
+    def normalization(self) -> dict[str, Any] | None:
+        """What `write_normalization` kept; None where nothing was measured."""
+        file = self.path / _NORMALIZATION
+        return json.loads(file.read_text()) if file.exists() else None
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
@@ -261,7 +272,8 @@ class Store:
         (self.path / _MANIFEST).unlink(missing_ok=True)  # first: without it nothing of the rest counts
         for folder in (self._arrays, self.path / _RECORDS, self.path / _FAILURES):
             shutil.rmtree(folder, ignore_errors=True)
-        (self.path / _LOCK).unlink(missing_ok=True)
+        for name in (_NORMALIZATION, _LOCK):
+            (self.path / name).unlink(missing_ok=True)
         with suppress(OSError):
             self.path.rmdir()
 

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.config import Mccnn
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.inputs import pixels_digest
-from sat_intervals.job import Job
+from sat_intervals.job import Job, weights_identity
 from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.normalization import Moments, Scales, moments
 from sat_intervals.patch import Patch, match_patch
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.raster import Image, read_window
@@ -25,6 +27,15 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     started = time.perf_counter()
     yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
+
+
+def measure_block(image: Image, block: Window) -> Moments:
+    """Look at a block of an image for its mean and standard deviation; runs on a worker."""
+    try:
+        return moments(*read_window(image, block))
+    except SatIntervalsError as error:
+        error.__cause__ = error.__context__ = None
+        raise
 
 
 def match_tile(job: Job, tile: Tile) -> None:
@@ -54,12 +65,26 @@ def _match_tile(job: Job, tile: Tile) -> None:
 
     grid, config = job.store.grid, job.config
     image = Window(0, 0, job.left.height, job.left.width)
+    scales = _checked_scales(job)
     started = time.perf_counter()
-    patch = match_patch(reader(job.left, "left"), reader(job.right, "right"), tile.core, grid.region, image, config)
+    readers = reader(job.left, "left"), reader(job.right, "right")
+    patch = match_patch(*readers, tile.core, grid.region, image, config, scales)
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with timed(seconds, "write"):
         job.store.write_arrays(tile, _left_behind(patch, tile, job))
     job.store.write_record(tile, {"usable_pixels": usable, "pixels_read": pixels_read, "seconds": seconds})
+
+
+def _checked_scales(job: Job) -> Scales | None:
+    """Mean and standard deviation of the images, where MC-CNN needs them; its weights are those of the run."""
+    cost, normalization = job.config.cost, job.store.normalization()
+    if not isinstance(cost, Mccnn) or normalization is None:
+        return None
+    here, wanted = weights_identity(cost), job.inputs["weights"]
+    for key in ("sha256", "onnxruntime"):
+        if here[key] != wanted[key]:
+            raise SatIntervalsError(f"{here['path']} on this worker differs in {key} from {wanted['path']} of the run")
+    return Scales.of_report(normalization)
 
 
 def _left_behind(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:

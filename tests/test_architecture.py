@@ -23,8 +23,8 @@ FLOORS = [
     {"job"},
     {"evaluation", "triangulation", "surface", "surface_evaluation", "export"},
     {"finish", "patch", "demo", "results"},
-    {"store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
-    {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
+    {"similarity", "store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
+    {"config", "features", "kernels", "normalization", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
     {"tiling", "products", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -38,6 +38,7 @@ HOMES = {
     "llvmlite": {"kernels"},
     "matplotlib": {"pictures"},
     "numba": {"kernels"},
+    "onnxruntime": {"features"},
     "pyproj": {"raster"},
     "rasterio": {"raster"},
     "rich": {"cli"},

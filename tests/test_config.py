@@ -72,19 +72,24 @@ def test_default_yaml__holds_every_setting_at_its_default() -> None:
 
 @pytest.mark.parametrize("name", preset_names())
 def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: str) -> None:
+    config = load_config(yaml.safe_load(preset_text(name)))
     section = None
     commented = []
     for line in preset_text(name).splitlines():
         if found := re.fullmatch(r"(\w+):", line):
-            section = type(getattr(settings(), found[1]))
+            section = type(getattr(config, found[1]))
         elif found := re.fullmatch(r"  (\w+): \S+ +# (.*)", line):
             field = section.model_fields[found[1]]
             assert found[2] == f"{field.description} ({allowed(field)})"
             commented.append((section, found[1]))
         else:
             assert not line or line.startswith("#")
-    models = [type(getattr(settings(), name)) for name in Config.model_fields]
+    models = [type(getattr(config, name)) for name in Config.model_fields]
     assert commented == [(model, key) for model in models for key in model.model_fields]
+
+
+def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
+    assert load_config(yaml.safe_load(preset_text("mccnn"))) == settings(cost={"method": "mccnn"})
 
 
 @pytest.mark.parametrize(("name", "p1", "p2"), [("urban", 20, 80), ("mountain", 38, 464), ("homogeneous", 72, 309)])
@@ -94,14 +99,14 @@ def test_preset_text__changes_census_and_penalties_only(name: str, p1: int, p2: 
 
 
 def test_preset_names__are_the_shipped_files() -> None:
-    assert preset_names() == ("default", "homogeneous", "mountain", "urban")
+    assert preset_names() == ("default", "homogeneous", "mccnn", "mountain", "urban")
 
 
 def test_preset_text__unknown_name_tells_the_known_ones() -> None:
     with pytest.raises(ConfigError) as caught:
         preset_text("urbn")
     assert str(caught.value) == (
-        "unknown preset 'urbn', did you mean urban? (known: default, homogeneous, mountain, urban)"
+        "unknown preset 'urbn', did you mean urban? (known: default, homogeneous, mccnn, mountain, urban)"
     )
 
 
@@ -189,7 +194,21 @@ REFUSED = [
     ("disparity", {"maximum": None}, "disparity.maximum is null, allowed: integer >= -16000, <= 16000"),
     ("disparity", None, "disparity is null, allowed: section of minimum, maximum"),
     ("cost", None, "cost is null, allowed: section of method, window"),
-    ("cost", {"method": "mccnn"}, "cost.method is 'mccnn', allowed: census"),
+    ("cost", {"method": "sad"}, "cost.method is 'sad', allowed: census or mccnn"),
+    ("cost", {"method": "mccnn", "window": 5}, "unknown key 'cost.window' (known: method, weights)"),
+    ("cost", {"method": "mccnn", "weights": 3}, "cost.weights is 3, allowed: text or null"),
+    ("sgm", {"penalty": "linear"}, "sgm.penalty is 'linear', allowed: constant or negative or inverse or mc_cnn_fast"),
+    ("sgm", {"penalty": "negative"}, "sgm.alpha is missing, allowed: number >= 0; sgm.gamma is missing"),
+    (
+        "sgm",
+        {"penalty": "mc_cnn_fast"},
+        "sgm.penalty is mc_cnn_fast, allowed: constant, negative or inverse with cost.method census",
+    ),
+    (
+        "sgm",
+        {"penalty": "inverse", "alpha": 9000, "beta": 1, "gamma": 8},
+        "sgm.gamma, the penalty without gradient, is 9008, allowed: <= 8167 with cost.window 5",
+    ),
     ("cost", {"window": 4}, "cost.window is 4, allowed: integer >= 3, <= 11, odd"),
     ("cost", {"window": 1}, "cost.window is 1, allowed: integer >= 3, <= 11, odd"),
     ("cost", {"window": 13}, "cost.window is 13, allowed: integer >= 3, <= 11, odd"),
@@ -198,7 +217,7 @@ REFUSED = [
     ("sgm", {"p2": 0}, "sgm.p2 is 0, allowed: integer >= 1"),
     ("sgm", {"p1": 33}, "sgm: p1 33 is above p2 32, the penalty of a larger step"),
     ("sgm", {"p2": 8168}, "sgm.p2 is 8168, allowed: <= 8167 with cost.window 5, so that costs summed over"),
-    ("sgm", [8, 32], "sgm is [8, 32], allowed: section of p1, p2 or null"),
+    ("sgm", [8, 32], "sgm is [8, 32], allowed: section of penalty, p1, p2 or null"),
     ("ambiguity", {"eta_max": 0}, "ambiguity.eta_max is 0, allowed: number > 0, <= 1"),
     ("ambiguity", {"eta_max": 1.1}, "ambiguity.eta_max is 1.1, allowed: number > 0, <= 1"),
     ("ambiguity", {"eta_max": float("nan")}, "ambiguity.eta_max is NaN, allowed: number > 0, <= 1"),

@@ -92,6 +92,16 @@ def _window_union(state, radius, union):
                 union[r, c] |= across[r + dr, c]
 
 
+def window_state(state: np.ndarray, radius: int) -> np.ndarray:
+    """The union of the states of each window's pixels, 0 = usable.
+
+    ``state`` is ``(rows + 2 radius, columns + 2 radius)`` uint8; returned are ``(rows, columns)``.
+    """
+    union = np.zeros((state.shape[0] - 2 * radius, state.shape[1] - 2 * radius), np.uint8)
+    _window_union(state, radius, union)
+    return union
+
+
 def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     """Census codes: one bit a neighbour, set where the neighbour is greater than the centre.
 
@@ -114,10 +124,9 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     neighbours = window**2 - 1
     dtype = np.uint32 if neighbours <= 32 else np.uint64
     count = -(-neighbours // (8 * np.dtype(dtype).itemsize))
-    codes = Codes(np.zeros((count, *shape), dtype), np.zeros(shape, np.uint8))
-    _census_words(pixels, radius, codes.words)
-    _window_union(state, radius, codes.state)
-    return codes
+    words = np.zeros((count, *shape), dtype)
+    _census_words(pixels, radius, words)
+    return Codes(words, window_state(state, radius))
 
 
 def matching_costs(left, right, r, c, k):

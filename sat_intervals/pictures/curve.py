@@ -1,18 +1,20 @@
 """The cost curve of one pixel, matched again from the images, and how it becomes an interval (paper eq. 5 to 9)."""
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
 from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.normalization import Scales
 from sat_intervals.patch import kernel_settings
 from sat_intervals.products import FLAGS, IMPOSSIBLE_COST
-from sat_intervals.raster import Image, read_window
+from sat_intervals.raster import read_window
 from sat_intervals.results import Results
-from sat_intervals.tiling import Window, facing
+from sat_intervals.similarity import Area, compare
+from sat_intervals.tiling import Window
 
 
 class Curve(NamedTuple):
@@ -62,10 +64,12 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     pixel = Window(results.region.row + row, results.region.column + column, 1, 1)
     area = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
     settings = kernel_settings(config)
-    left = _codes(results.left, area, config.cost.window)
-    there = facing(area, config.disparity.minimum, config.disparity.maximum)
-    right = _codes(results.right, there, config.cost.window)
-    curve = np.ascontiguousarray(cost_volume(between(left, right), settings)[pixel.relative_to(area).slices])
+    readers = partial(read_window, results.left), partial(read_window, results.right)
+    normalization = results.report.get("normalization")
+    scales = Scales.of_report(normalization) if normalization else None
+    (similarity,) = compare(*readers, [Area.of(area, config)], config, scales)
+    volume = cost_volume(similarity.costs, settings, similarity.gradients)
+    curve = np.ascontiguousarray(volume[pixel.relative_to(area).slices])
     possible = curve[0, 0] != IMPOSSIBLE_COST
     if not possible.any():
         raise SatIntervalsError(_explain(results, row, column))
@@ -76,17 +80,12 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     return Curve(
         disparities=np.arange(settings.minimum, settings.minimum + settings.count),
         costs=costs,
-        possibilities=1 - above / config.cost_span,
+        possibilities=np.maximum(1 - above / config.cost_span, 0),
         cut=above <= (-1 if config.cut_level is None else config.cut_level),
         disparity=float(disparity[0, 0]),
         lower=int(lower[0, 0]) if config.interval else None,
         upper=int(upper[0, 0]) if config.interval else None,
     )
-
-
-def _codes(image: Image, area: Window, window: int) -> Codes:
-    radius = window // 2
-    return census(*read_window(image, area.grown(radius, radius)), window)
 
 
 def _explain(results: Results, row: int, column: int) -> str:

@@ -1,0 +1,285 @@
+"""MC-CNN from end to end: networks found and refused, features without padding, tiles, files, figures."""
+
+import json
+import sys
+import warnings
+from importlib import metadata
+
+import numpy as np
+import pytest
+import rasterio
+import reference
+from networks import random_weights, slow_features, trained_network, write_network
+
+from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
+from sat_intervals.features import Network, load_network, weights_file
+from sat_intervals.in_memory import _reader
+from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.normalization import Scale, Scales
+from sat_intervals.patch import kernel_settings
+from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
+from sat_intervals.similarity import Area, compare
+from sat_intervals.tiling import Window
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.fixture(scope="module")
+def weights():
+    return random_weights()
+
+
+@pytest.fixture(scope="module")
+def network_file(weights, tmp_path_factory):
+    return write_network(tmp_path_factory.mktemp("network") / "small.onnx", weights)
+
+
+@pytest.fixture(scope="module")
+def fp32(shared_data, tmp_path_factory):
+    return trained_network(shared_data, tmp_path_factory.mktemp("network") / "mb.onnx")
+
+
+def settings(minimum, maximum, weights=None, **sections):
+    cost = {"method": "mccnn", "weights": None if weights is None else str(weights)}
+    return load_config({"disparity": {"minimum": minimum, "maximum": maximum}, "cost": cost} | sections)
+
+
+def masked_images(rows=34, columns=46, seed=1):
+    """A pair with a hole and without data in a corner of either image."""
+    random = np.random.default_rng(seed)
+    left = random.normal(500, 80, (rows, columns)).astype(np.float32)
+    right = np.roll(left, 3, axis=1) + random.normal(0, 10, left.shape).astype(np.float32)
+    masks = np.zeros((2, rows, columns), bool)
+    masks[0, rows // 2, columns - 6] = masks[1, :4, : columns // 4] = masks[0, -3:, -4:] = True
+    return [np.ma.masked_array(image, mask) for image, mask in zip((left, right), masks, strict=True)]
+
+
+# ---- Networks ----------------------------------------------------------------------------------------------
+def test_weights_file__is_found_without_importing_its_package():
+    file = weights_file(None)
+    assert file.name == "mc_cnn_fast_int8_excl_01.onnx"
+    assert file.is_file()
+    assert "mc_cnn" not in sys.modules
+    assert load_network(file) is load_network(file)
+
+
+def test_weights_file__missing_extra_is_told(monkeypatch):
+    def nowhere(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr("sat_intervals.features.files", nowhere)
+    with pytest.raises(SatIntervalsError, match=r"needs the weights in MCCNN: pip install sat-intervals\[mccnn\]"):
+        weights_file(None)
+
+
+def test_network__missing_onnxruntime_is_told(network_file, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(SatIntervalsError, match=r"needs onnxruntime: pip install sat-intervals\[mccnn\]"):
+        Network(network_file)
+
+
+def test_network__is_a_valid_convolution(network_file, weights):
+    pixels = np.random.default_rng(0).standard_normal((19, 24), np.float32)
+    features = load_network(network_file)(pixels)
+    np.testing.assert_allclose(features, slow_features(weights, pixels), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "layers", "message"),
+    [
+        ({"unit": False}, 5, r"makes vectors of length .*, not 1: needed is a network of MC-CNN fast's form"),
+        ({"pads": 1}, 5, r"makes \(8, 11, 24\) of an image of 11 x 24"),
+        ({}, 3, r"makes \(8, 5, 18\) of an image of 11 x 24"),
+        ({"rank": 4}, 5, r"takes and gives \[\[1, 1, 'height', 'width'\]\]"),
+    ],
+)
+def test_network__another_form_is_refused(tmp_path, options, layers, message):
+    file = write_network(tmp_path / "other.onnx", random_weights(layers=layers), **options)
+    with pytest.raises(SatIntervalsError, match=message) as caught:
+        match_arrays(np.zeros((20, 20)), np.zeros((20, 20)), settings(0, 1, file))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_network__no_network_is_refused(tmp_path):
+    file = tmp_path / "text.onnx"
+    file.write_text("weights")
+    with pytest.raises(SatIntervalsError, match=r"text\.onnx is no ONNX network"):
+        Network(file)
+    with pytest.raises(SatIntervalsError, match=r"cost\.weights .*none\.onnx: no such file"):
+        match_arrays(np.zeros((20, 20)), np.zeros((20, 20)), settings(0, 1, tmp_path / "none.onnx"))
+
+
+# ---- Costs and penalties -----------------------------------------------------------------------------------
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_compare__costs_equal_reference(network_file, weights, mirrored):
+    # Three strips of rows at most; pixels of no data are filled, and windows that meet them are impossible.
+    left, right = masked_images(rows=150)
+    config = settings(-6, 3, network_file, sgm=None)
+    scales = Scales(Scale(490.0, 75.0), Scale(510.0, 85.0))
+    area = Area.mirror(Window(5, 2, 140, 30), config) if mirrored else Area.of(Window(5, 2, 140, 30), config)
+    (found,) = compare(_reader(left), _reader(right), [area], config, scales)
+    volume = cost_volume(found.costs, kernel_settings(config))
+
+    def features(image, scale, window):
+        pixels, state = _reader(image)(window.grown(5, 5))
+        pixels = np.where(state == 0, (pixels - scale.mean) / scale.deviation, 0)
+        return slow_features(weights, pixels), reference.window_state(state, 11)
+
+    images = ((right, scales.right), (left, scales.left)) if mirrored else ((left, scales.left), (right, scales.right))
+    (base, base_state), (there, there_state) = (
+        features(*image, window) for image, window in zip(images, (area.base, area.facing), strict=True)
+    )
+    possible = reference.possible(base_state, there_state)
+    np.testing.assert_array_equal(volume != IMPOSSIBLE_COST, possible)
+    expected = COSINE_STEPS * reference.correlation(base, there)
+    assert np.abs(volume - expected)[possible].max() <= 0.51
+    assert 0.3 < possible.mean() < 0.95
+
+
+def test_compare__penalties_follow_both_images(network_file):
+    # The same penalties by the method's text: edges of normalised images, the right one where a candidate faces it.
+    left, right = masked_images(rows=16, columns=22)
+    config = settings(-2, 2, network_file, sgm={"p1": 0.5, "p2": 4, "q1": 2, "q2": 5, "v": 2, "d": 1.1, "span": 40})
+    scales = Scales(Scale(500.0, 80.0), Scale(500.0, 90.0))
+    whole = Window(0, 0, *left.shape)
+    (found,) = compare(_reader(left), _reader(right), [Area.of(whole, config)], config, scales)
+    cost = found.costs.left[:, :, :5].astype(int)
+    states = found.costs.left_state, found.costs.right_state
+    cost[~reference.possible(*states)] = IMPOSSIBLE_COST
+    # 125 steps: P1 62.5, 31.25, 6.25, half of them on vertical paths; P2 500, 250, 50; halves are rounded up.
+    p1, vertical, p2 = (63, 31, 6), (31, 16, 3), (500, 250, 50)
+    images = found.gradients.left.astype(float), found.gradients.right.astype(float)
+    edges = 1.1 * 80, 1.1 * 90
+
+    def penalties(step):
+        return reference.edge_penalties(*images, 5, step, (vertical if step[1] == 0 else p1, p2), edges)
+
+    expected = reference.aggregate_with(cost, 250 + 500 + 125, penalties)
+    np.testing.assert_array_equal(cost_volume(found.costs, kernel_settings(config), found.gradients), expected)
+
+
+def test_config__span_is_declared_and_held_to_what_can_be():
+    config = settings(-9, 0)
+    assert config.cost_span == round(125 * float(config.sgm.span)) < config.largest_sum
+    assert len(config.ambiguity_weights) == config.largest_sum + 1
+    assert settings(-9, 0, sgm=None).cost_span == 250
+    with pytest.raises(SatIntervalsError, match=r"sgm\.span is 60, allowed: <= 48 with p2 4"):
+        settings(-9, 0, sgm={"p2": 4, "span": 60})
+    with pytest.raises(SatIntervalsError, match=r"sgm\.gradients raw looks at the right image at disparity 0"):
+        settings(1, 9, sgm={"gradients": "raw"})
+    with pytest.raises(SatIntervalsError, match=r"sgm\.p2 is 70, allowed: <= 63 with cost\.method mccnn"):
+        settings(-9, 0, sgm={"p2": 70})
+    with pytest.raises(SatIntervalsError, match=r"sgm\.penalty is constant, allowed: mc_cnn_fast with cost"):
+        settings(-9, 0, sgm={"penalty": "constant"})
+
+
+def test_load_config__another_cost_brings_its_own_penalties():
+    urban = {"disparity": {"minimum": 0, "maximum": 9}, "cost": {"window": 11}, "sgm": {"p1": 20, "p2": 80}}
+    assert load_config(urban, {"cost": {"method": "mccnn"}}) == settings(0, 9)
+    assert load_config(urban, {"cost": {"method": "census"}}) == load_config(urban)
+    back = load_config(settings(0, 9), {"cost": {"method": "census"}})
+    assert back == load_config({"disparity": {"minimum": 0, "maximum": 9}})
+    assert load_config(urban | {"sgm": None}, {"cost": {"method": "mccnn"}}).sgm is None
+
+
+# ---- Runs --------------------------------------------------------------------------------------------------
+def write(path, image, nodata=0):
+    kind = {"height": image.shape[0], "width": image.shape[1], "count": 1, "dtype": "uint16", "nodata": nodata}
+    with rasterio.open(path, "w", driver="GTiff", **kind) as file:
+        file.write(image.filled(0).astype("uint16"), 1)
+    return path
+
+
+def bands(out):
+    with rasterio.open(out / "intervals.tif") as file, rasterio.open(out / "validity.tif") as flags:
+        return file.read(), flags.read(1)
+
+
+@pytest.mark.parametrize("method", ["fast", "accurate"])
+def test_match_pair__equals_match_arrays_and_keeps_what_decides(tmp_path, network_file, method):
+    left, right = (np.ma.masked_array(image.data.astype("uint16"), image.mask) for image in masked_images(70, 90))
+    config = settings(-4, 6, network_file, cross_check={"method": method})
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    run = match_pair(*images, tmp_path / "out", config)
+    found, flags = bands(tmp_path / "out")
+    expected = match_arrays(left, right, config)
+    np.testing.assert_array_equal(flags, expected["validity"])
+    np.testing.assert_array_equal(found[0], expected["disparity"])
+    for band, name in zip(found[1:], ("lower", "upper", "confidence"), strict=True):
+        np.testing.assert_allclose(band, expected[name], atol=1e-6)
+    assert 0.2 < (flags & INVALID == 0).mean() < 1
+    assert run["inputs"]["weights"]["path"] == str(network_file)
+    assert len(run["inputs"]["weights"]["sha256"]) == 64
+    assert run["normalization"]["left"] == pytest.approx({"mean": left.mean(), "deviation": left.std()})
+    assert run["normalization"]["right"] == pytest.approx({"mean": right.mean(), "deviation": right.std()})
+    assert load_config(run["settings"]) == config
+
+
+def test_match_pair__goes_on_with_the_means_that_were_measured(tmp_path, network_file):
+    left, right = masked_images(70, 140)
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    config = settings(-4, 6, network_file, tiles={"size": 64, "overlap": 20})
+    expected = match_pair(*images, tmp_path / "once", config, keep_tiles=True)
+    match_pair(*images, tmp_path / "twice", config, keep_tiles=True)
+    tiles = tmp_path / "twice" / "tiles"
+    for name in ("intervals.tif", "validity.tif", "run.json"):
+        (tmp_path / "twice" / name).unlink()
+    next((tiles / "records").glob("*.json")).unlink()
+    again = match_pair(*images, tmp_path / "twice", config)
+    assert again["normalization"] == expected["normalization"]
+    for one, other in zip(bands(tmp_path / "once"), bands(tmp_path / "twice"), strict=True):
+        np.testing.assert_array_equal(one, other)
+    other = write_network(tmp_path / "other.onnx", random_weights(seed=1))
+    for name in ("intervals.tif", "validity.tif", "run.json"):
+        (tmp_path / "once" / name).unlink()
+    with pytest.raises(SatIntervalsError, match=r"inputs\.weights\.sha256 was"):
+        match_pair(*images, tmp_path / "once", settings(-4, 6, other, tiles=config.tiles.model_dump()))
+
+
+def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, network_file):
+    left, right = masked_images(70, 140)
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    images[1].write_bytes(images[1].read_bytes()[:-4000])
+    with pytest.raises(RunError, match=r"right\.tif could not be measured: .*the file may be cut short"):
+        match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
+
+
+@pytest.mark.parametrize("name", ["int8", "fp32"])
+def test_match_arrays__is_as_accurate_as_asked_on_development_scenes(shared_data, fp32, name):
+    # Share of intervals that hold the truth and median width over that of the search, of all kept pixels of a group.
+    of_2005 = ("art", "books", "dolls", "laundry", "moebius", "reindeer")
+    groups = {
+        ("mb2003_cones", "mb2003_teddy"): (0.954, 0.038),
+        tuple(f"mb2005_{scene}" for scene in of_2005): (0.955, 0.035),
+        ("synth_toulouse_urban",): (0.93, 0.10),
+        ("synth_toulouse_nodata",): (0.93, 0.10),
+    }
+    for scenes, (accuracy, size) in groups.items():
+        inside, sizes = [], []
+        for scene in scenes:
+            folder = shared_data / scene
+            minimum, maximum = json.loads((folder / "meta.json").read_text())["disparity"]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+                left, right, truth = (rasterio.open(folder / f"{layer}.tif") for layer in ("left", "right", "truth"))
+            with left, right, truth:
+                config = settings(minimum, maximum, fp32 if name == "fp32" else None)
+                result = match_arrays(left.read(1, masked=True), right.read(1, masked=True), config)
+                true = truth.read(1)
+            lower, upper = result["lower"].to_numpy(), result["upper"].to_numpy()
+            judged = np.isfinite(lower) & np.isfinite(true)
+            inside.append(((lower <= true) & (true <= upper))[judged])
+            sizes.append((upper - lower)[judged] / (maximum - minimum))
+        assert np.concatenate(inside).mean() >= accuracy
+        assert np.median(np.concatenate(sizes)) <= size
+
+
+def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
+    left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
+    for name, size in (("whole", 1216), ("tiles", 256)):
+        match_pair(left, right, tmp_path / name, settings(-13, 33, tiles={"size": size, "overlap": 100}))
+    (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
+    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
+    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
+    assert differs[0].sum() / judged.sum() <= 0.003
+    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.006

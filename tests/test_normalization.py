@@ -1,0 +1,49 @@
+"""Mean and standard deviation of an image from its blocks."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sat_intervals.normalization import BLOCK, Scale, blocks, measure, moments, scale_of
+from sat_intervals.tiling import Window
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(-1e6, 1e6))
+def test_scale_of__equals_numpy_on_usable_pixels(seed, share, offset):
+    random = np.random.default_rng(seed)
+    pixels = random.normal(offset, 30, (9, 40))
+    state = (random.random(pixels.shape) < share).astype(np.uint8)
+    pixels[state != 0] = 1e9
+    parts = [moments(pixels[r : r + 4], state[r : r + 4]) for r in range(0, 9, 4)]
+    usable = pixels[state == 0]
+    if usable.size > 1:
+        assert scale_of(parts) == pytest.approx(Scale(usable.mean(), usable.std()), rel=1e-9)
+
+
+def test_scale_of__worked_example():
+    # 1 and 3, then 5, 7 and 9: mean 25 / 5 = 5, squares 16 + 4 + 0 + 4 + 16 = 40, deviation sqrt(8).
+    whole, holes = np.zeros(3, np.uint8), np.array([0, 0, 1], np.uint8)
+    parts = [moments(np.array([1.0, 3.0, 1000.0]), holes), moments(np.array([5.0, 7.0, 9.0]), whole)]
+    assert scale_of(parts) == (5.0, 8.0**0.5)
+
+
+@pytest.mark.parametrize(("value", "mean"), [(7.0, 7.0), (None, 0.0)])
+def test_scale_of__divides_by_1_where_there_is_no_deviation(value, mean):
+    state = np.full(4, value is None, np.uint8)
+    assert scale_of([moments(np.full(4, value or 0.0), state)]) == (mean, 1.0)
+
+
+def test_measure__reads_every_pixel_once():
+    height, width = 3, BLOCK + 5
+    image = np.arange(height * width, dtype=np.float64).reshape(height, width)
+    seen = np.zeros(image.shape, int)
+
+    def read(window):
+        seen[window.slices] += 1
+        return image[window.slices], np.zeros((window.height, window.width), np.uint8)
+
+    assert measure(read, height, width) == pytest.approx((image.mean(), image.std()))
+    assert (seen == 1).all()
+    assert blocks(height, width) == [Window(0, 0, 3, BLOCK), Window(0, BLOCK, 3, 5)]
