@@ -4,13 +4,22 @@ from pathlib import Path
 
 import click
 
+from sat_intervals.cli.match import COSTS
 from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 
 @click.command(short_help="Compare the method's parts on pairs of known truth.")
 @click.argument("pairs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
 @judging_options  # type: ignore[untyped-decorator]
-def ablate(pairs: tuple[Path, ...], config_file: Path | None, accurate: bool, tolerance: float, as_json: bool) -> None:
+def ablate(
+    pairs: tuple[Path, ...],
+    cost: str | None,
+    config_file: Path | None,
+    accurate: bool,
+    tolerance: float,
+    as_json: bool,
+) -> None:
     """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS (the paper's table 2).
 
     Every pair is matched once, in memory. Printed is the accuracy, the share of valid pixels whose interval holds the
@@ -29,7 +38,7 @@ def ablate(pairs: tuple[Path, ...], config_file: Path | None, accurate: bool, to
     scenes = []
     for pair in find_pairs(pairs):
         click.echo(f"matching {pair.name}", err=True)
-        config = load_config(config_file, overrides(pair.minimum, pair.maximum, accurate))
+        config = load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, cost))
         scenes.append(Scene(pair.name, pair.group, ablate_pair(pair, config, tolerance=tolerance)))
     if as_json:
         say_json(scenes)

@@ -15,6 +15,7 @@ def batch(
     pairs: Path,
     out: Path,
     config_file: Path | None,
+    cost: str | None,
     tile_size: int | None,
     overlap: int | None,
     workers: int | None,
@@ -33,7 +34,7 @@ def batch(
 
     rows = read_batch(pairs)
     with Console(quiet) as console:
-        given = overrides(None, tile_size, overlap, workers, cluster)
+        given = overrides(None, tile_size, overlap, workers, cluster, cost)
         report = match_batch(
             rows,
             out,

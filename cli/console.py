@@ -14,6 +14,7 @@ from sat_intervals.cli import signals
 STAGES = {
     "scene": "making a scene",
     "kernels": "preparing kernels (compiled once a machine, then about a second)",
+    "images": "measuring images",
     "tiles": "matching tiles",
     "bands": "finishing rows",
     "points": "triangulating rows",

@@ -19,6 +19,7 @@ def demo(
     size: tuple[int, int],
     seed: int,
     config_file: Path | None,
+    cost: str | None,
     tile_size: int | None,
     overlap: int | None,
     workers: int | None,
@@ -54,7 +55,7 @@ def demo(
             write_once(out / f"{name}.tif", layer, nodata, somewhere, overwrite=run["overwrite"])
         console.progress("scene", 1, 1)
         config = load_config(
-            config_file, overrides((scene.minimum, scene.maximum), tile_size, overlap, workers, cluster)
+            config_file, overrides((scene.minimum, scene.maximum), tile_size, overlap, workers, cluster, cost)
         )
         report = match_pair(out / "left.tif", out / "right.tif", out, config, progress=console.progress, **run)
     console.summary(report, out)

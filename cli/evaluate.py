@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.match import COSTS
 from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 if TYPE_CHECKING:
@@ -20,10 +21,11 @@ _FILE = click.Path(path_type=Path)
 
 @dataclass(frozen=True)
 class _Source:
-    """A run in a folder, or a pair to be matched first, and what it is judged by."""
+    """A run in a folder, or a pair to be matched first with a cost, and what it is judged by."""
 
     name: str
     pair: "Pair | None"
+    cost: str | None
     truth: Path | None
     mask: Path | None
 
@@ -36,6 +38,9 @@ class _Source:
 @click.option("--group", metavar="LABEL", help="Count all as one group, whatever meta.json says.")
 @click.option("--dsm", type=_FILE, help="Instead of runs, judge this surface model by --reference.")
 @click.option("--reference", type=_FILE, help="Reference heights above the same datum, in any CRS.")
+@click.option(
+    "--cost", type=click.Choice(COSTS), multiple=True, help="Matching cost of pairs; given twice, both are compared."
+)
 @judging_options  # type: ignore[untyped-decorator]
 def evaluate(
     folders: tuple[Path, ...],
@@ -45,6 +50,7 @@ def evaluate(
     group: str | None,
     dsm: Path | None,
     reference: Path | None,
+    cost: tuple[str, ...],
     config_file: Path | None,
     accurate: bool,
     tolerance: float,
@@ -76,12 +82,12 @@ def evaluate(
     from sat_intervals.tables import Scene, table_1
 
     scenes = []
-    for source in _sources(folders, truth, mask):
+    for source in _sources(folders, truth, mask, cost):
         judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
         if source.pair is None:
             report = judge(source.name, source.truth, source.mask)
         else:
-            click.echo(f"matching {source.name}", err=True)
+            click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
             report = _judge_pair(judge, source, source.pair, config_file, accurate)
         scenes.append(Scene(source.name, group or _group(source), report))
     if as_json:
@@ -108,8 +114,10 @@ def _evaluate_surface(folders: tuple[Path, ...], dsm: Path | None, reference: Pa
         show_surface(str(dsm), report)
 
 
-def _sources(folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...]) -> list[_Source]:
-    """What the arguments name, in their order."""
+def _sources(
+    folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...], costs: tuple[str, ...]
+) -> list[_Source]:
+    """What the arguments name, in their order; pairs once for each cost."""
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.pairs import find_pairs, is_pair
 
@@ -123,9 +131,12 @@ def _sources(folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[P
         if len(given) not in (0, len(found)):
             raise SatIntervalsError(f"{option} is given {len(given)} times for {len(found)} OUT: give it once for each")
     absent = (None,) * len(found)
+    named = list(zip(found, truths or absent, masks or absent, strict=True))
+    several = len(costs) > 1
     return [
-        _Source(name, pair, truth, mask)
-        for (name, pair), truth, mask in zip(found, truths or absent, masks or absent, strict=True)
+        _Source(f"{name} ({cost})" if several and pair else name, pair, cost if pair else None, truth, mask)
+        for (name, pair), truth, mask in named
+        for cost in ((costs if pair else costs[:1]) or (None,))
     ]
 
 
@@ -136,7 +147,7 @@ def _judge_pair(
     from sat_intervals.config import load_config
     from sat_intervals.run import match_pair
 
-    more = overrides(pair.minimum, pair.maximum, accurate) | {"products": {"keep_rejected": True}}
+    more = overrides(pair.minimum, pair.maximum, accurate, source.cost) | {"products": {"keep_rejected": True}}
     with TemporaryDirectory(prefix="sat-intervals-") as out:
         match_pair(pair.left, pair.right, out, load_config(config_file, more))
         return judge(out, source.truth or pair.truth, source.mask)

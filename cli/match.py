@@ -10,6 +10,8 @@ from sat_intervals.cli.options import debug_option, named, path, quiet_option
 
 Number = TypeVar("Number", int, float)
 
+COSTS = ("census", "mccnn")
+
 
 def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options of every command that matches a pair."""
@@ -17,6 +19,7 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
         ),
+        click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it."),
         click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
         click.option("--overlap", type=int, help="Pixels read around a core."),
         click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
@@ -41,12 +44,14 @@ def overrides(
     overlap: int | None = None,
     workers: int | None = None,
     cluster: str | None = None,
+    cost: str | None = None,
 ) -> dict[str, Any]:
     """The settings that the command line gives, as sections."""
     minimum, maximum = disparity or (None, None)
     is_address = cluster is not None and "://" in cluster
     sections: dict[str, dict[str, Any]] = {
         "disparity": {"minimum": minimum, "maximum": maximum},
+        "cost": {"method": cost},
         "tiles": {"size": tile_size, "overlap": overlap},
         "cluster": {
             "workers": workers,
@@ -92,6 +97,7 @@ def match(
     window: tuple[int, int, int, int] | None,
     dry_run: bool,
     config_file: Path | None,
+    cost: str | None,
     tile_size: int | None,
     overlap: int | None,
     workers: int | None,
@@ -115,7 +121,7 @@ def match(
 
     if disparity is None and config_file is None:
         raise click.UsageError("Missing search range: give --disparity MIN MAX, or a --config with it.")
-    config = load_config(config_file, overrides(disparity, tile_size, overlap, workers, cluster))
+    config = load_config(config_file, overrides(disparity, tile_size, overlap, workers, cluster, cost))
     if dry_run:
         from sat_intervals.cluster import job_script
 

@@ -39,9 +39,11 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def overrides(minimum: int, maximum: int, accurate: bool) -> dict[str, Any]:
+def overrides(minimum: int, maximum: int, accurate: bool, cost: str | None = None) -> dict[str, Any]:
     """The settings that a pair and the command line give, as sections."""
     sections: dict[str, Any] = {"disparity": {"minimum": minimum, "maximum": maximum}}
+    if cost is not None:
+        sections["cost"] = {"method": cost}
     return sections | ({"cross_check": {"method": "accurate"}} if accurate else {})
 
 

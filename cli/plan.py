@@ -4,12 +4,15 @@ from pathlib import Path
 
 import click
 
+from sat_intervals.cli.match import COSTS
+
 
 @click.command(short_help="Say what a run will take: tiles, memory, disk, time.")
 @click.argument("left")
 @click.argument("right")
 @click.option("--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels.")
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings (YAML).")
+@click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
 @click.option("--memory", metavar="SIZE", help="What a worker may take, such as 4GB: tiles get smaller until they fit.")
 @click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core.")
 def plan(
@@ -17,6 +20,7 @@ def plan(
     right: str,
     disparity: tuple[int, int] | None,
     config_file: Path | None,
+    cost: str | None,
     memory: str | None,
     workers: int | None,
 ) -> None:
@@ -26,7 +30,7 @@ def plan(
     from sat_intervals.memory import parse_bytes
     from sat_intervals.plan import plan as make_plan
 
-    config = load_config(config_file, overrides(disparity))
+    config = load_config(config_file, overrides(disparity, cost=cost))
     made = make_plan(left, right, config, memory=parse_bytes(memory) if memory else None, workers=workers)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     for name, value in (

@@ -2,7 +2,7 @@
 
 import click
 
-PRESETS = ("default", "homogeneous", "mountain", "urban")
+PRESETS = ("default", "homogeneous", "mccnn", "mountain", "urban")
 
 
 @click.command(short_help="Print a complete, commented file of settings.")

@@ -41,6 +41,8 @@ _REFERENCE_1 = {
     ("census", "middlebury2003"): (0.975, 0.035, None, None, None, None, 0.479, 0.06),
     ("census", "middlebury2005"): (0.959, 0.026, None, None, None, None, 0.637, 0.14),
     ("census", "middlebury2006"): (0.988,),
+    ("mccnn", "middlebury2003"): (0.971, 0.036),
+    ("mccnn", "middlebury2005"): (0.976, 0.040),
 }
 _PAPER_2 = {
     ("census", "middlebury2003"): (0.503, 0.997, 0.985, 0.982, 0.980, 0.973),
@@ -99,10 +101,14 @@ def _table(
     for scene in scenes:
         groups.setdefault((scene.report["cost"], scene.group), []).append(scene.report)
     rows = []
-    for (cost, group), reports in groups.items():
+    places = list(dict.fromkeys(group for _, group in groups))
+    several = len({cost for cost, _ in groups}) > 1
+    # The costs of a group stand one below the other, to be compared.
+    for cost, group in sorted(groups, key=lambda key: places.index(key[1])):
+        reports = groups[cost, group]
         means = {name: _mean([look_up(report, place) for report in reports]) for name, place in columns.items()}
         reached = sum((look_up(report, accuracy) or 0.0) >= OBJECTIVE for report in reports)
-        rows.append(Row(group, means, len(reports), reached))
+        rows.append(Row(f"{group} {cost}" if several else group, means, len(reports), reached))
         for label, table in others.items():
             if (cost, group) in table:
                 known = dict(zip(columns, table[cost, group], strict=False))

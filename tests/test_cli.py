@@ -188,7 +188,7 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
     ("text", "says"),
     [
         ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: disparity, cost, sgm, "),
-        ("sgm: {p3: 8}", "unknown key 'sgm.p3' (known: p1, p2)"),
+        ("sgm: {p3: 8}", "unknown key 'sgm.p3' (known: penalty, p1, p2)"),
         ("sgm: {p1: eight}", "sgm.p1 is 'eight', allowed: integer >= 1"),
         ("sgm: {p1: 40}", "sgm: p1 40 is above p2 32"),
         ("interval: {alpha: 1.5}", "interval.alpha is 1.5, allowed: number > 0, <= 1"),

@@ -9,6 +9,7 @@ import resource
 import sys
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -38,12 +39,12 @@ def search_range(disparities):
     return 8 - disparities // 2, 8 - disparities // 2 + disparities - 1
 
 
-def ours(left, right, disparities):
+def ours(left, right, disparities, cost="census"):
     """The whole chain of this project in memory."""
     from sat_intervals import match_arrays
 
     minimum, maximum = search_range(disparities)
-    settings = {"disparity": {"minimum": minimum, "maximum": maximum}}
+    settings = {"disparity": {"minimum": minimum, "maximum": maximum}, "cost": {"method": cost}}
     left, right = (np.ma.masked_equal(image, 0) for image in (left, right))
     return lambda: match_arrays(left, right, settings)
 
@@ -66,7 +67,32 @@ def opencv(left, right, disparities):
     return lambda: matcher.compute(left, right)
 
 
-def pandora(left, right, disparities):
+def inference(left, right, disparities):
+    """The network alone, of both whole images, as the reference runs it."""
+    import onnxruntime
+
+    from sat_intervals.features import weights_file
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(weights_file(None), options, providers=["CPUExecutionProvider"])
+    images = [((image - image.mean()) / image.std()).astype(np.float32) for image in (left, right)]
+    return lambda: [session.run(None, {"input": image}) for image in images]
+
+
+def inference_in_strips(left, right, disparities):
+    """The network alone as this project runs it."""
+    from sat_intervals.features import RADIUS, load_network, weights_file
+    from sat_intervals.similarity import STRIP
+
+    network = load_network(weights_file(None))
+    images = [((image - image.mean()) / image.std()).astype(np.float32) for image in (left, right)]
+    images = [np.pad(image, RADIUS) for image in images]
+    rows = range(0, left.shape[0], STRIP)
+    return lambda: [network(image[row : row + STRIP + 2 * RADIUS]) for image in images for row in rows]
+
+
+def pandora(left, right, disparities, cost="census"):
     """The same steps of Pandora with libSGM: cost, SGM, confidence, intervals, refinement, fast cross-check, median."""
     import tempfile
 
@@ -87,7 +113,8 @@ def pandora(left, right, disparities):
                 file.write(image, 1)
             sides[side] = {"img": path, "nodata": 0, "disp": sorted(sign * d for d in search_range(disparities))}
         machine = PandoraMachine()
-        settings = check_conf({"input": sides, "pipeline": PIPELINE}, machine)
+        pipeline = PIPELINE | (MCCNN if cost == "mccnn" else {})
+        settings = check_conf({"input": sides, "pipeline": pipeline}, machine)
         images = [create_dataset_from_inputs(input_config=settings["input"][side]) for side in sides]
     return lambda: peer.run(machine, *images, settings)
 
@@ -117,10 +144,26 @@ PIPELINE = {
 }
 
 
+MCCNN = {
+    "matching_cost": {"matching_cost_method": "mc_cnn", "window_size": 11, "subpix": 1},
+    "optimization": PIPELINE["optimization"] | {"penalty": {"penalty_method": "mc_cnn_fast_penalty"}},
+}
+
+CANDIDATES = {
+    "ours": ours,
+    "ours_mccnn": partial(ours, cost="mccnn"),
+    "inference": inference,
+    "inference_in_strips": inference_in_strips,
+    "opencv": opencv,
+    "pandora": pandora,
+    "pandora_mccnn": partial(pandora, cost="mccnn"),
+}
+
+
 def main():
     """Measure what the command line names."""
     name, (rows, columns, disparities, runs) = sys.argv[1], map(int, sys.argv[2:6])
-    task = {"ours": ours, "opencv": opencv, "pandora": pandora}[name](*make_pair(rows, columns), disparities)
+    task = CANDIDATES[name](*make_pair(rows, columns), disparities)
     seconds = []
     for _ in range(runs + 1):
         started = time.perf_counter()

@@ -101,6 +101,25 @@ def in_memory():
         )
 
 
+def mccnn():
+    """The chain with MC-CNN in memory beside the reference's, with the same network."""
+    print()
+    row("MC-CNN in memory, one core", "this project", "Pandora + MC-CNN + libSGM", "ratio")
+    row(*["---"] * 4)
+    for size, disparities in ((1000, 64), (1000, 128)):
+        runs = {"ours_mccnn": 3, "inference_in_strips": 3, "pandora_mccnn": 1, "inference": 3}
+        measured = {name: candidate(name, size, disparities, times) for name, times in runs.items()}
+        (ours, ours_memory), (theirs, memory) = measured["ours_mccnn"], measured["pandora_mccnn"]
+        rest = ours - measured["inference_in_strips"][0], theirs - measured["inference"][0]
+        row(
+            f"{size} x {size} x {disparities}",
+            f"{ours:.2f} s, {ours_memory:.0f} MB",
+            f"{theirs:.2f} s, {memory:.0f} MB",
+            f"{theirs / ours:.1f}x faster, memory 1/{memory / ours_memory:.1f}",
+        )
+        row("outside the network", f"{rest[0]:.2f} s", f"{rest[1]:.2f} s", f"{rest[1] / rest[0]:.1f}x faster")
+
+
 def file_to_file(folder):
     """Whole runs of the command: workers, growth, what tiling and files add, starting up."""
     print()
@@ -136,6 +155,7 @@ def main():
     cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     print(f"{cpu}, {len(CORES)} cores, {datetime.now(UTC):%Y-%m-%d}, Python {platform.python_version()}\n")
     in_memory()
+    mccnn()
     with tempfile.TemporaryDirectory() as folder:
         file_to_file(Path(folder))
 
