@@ -54,7 +54,7 @@ class Network:
         SatIntervalsError
             onnxruntime is not there, or the file is no such network.
         """
-        self._file, self._session = file, _session(file)
+        self._session = _session(file)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         form = f"{[i.shape for i in inputs]} to {[o.shape for o in outputs]}"
         if len(inputs) != 1 or len(inputs[0].shape) != 2 or inputs[0].type != "tensor(float)" or len(outputs) != 1:
@@ -100,7 +100,12 @@ def _wrong(file: Path, what: str) -> SatIntervalsError:
     )
 
 
-@lru_cache(maxsize=4)
 def load_network(file: Path) -> Network:
-    """The network of a file, loaded once a process."""
+    """The network of a file, loaded once a process and again when the file is another."""
+    status = file.stat()
+    return _loaded(file, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=4)
+def _loaded(file: Path, modified: int, size: int) -> Network:
     return Network(file)

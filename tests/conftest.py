@@ -1,6 +1,8 @@
 """What several test modules need."""
 
 import os
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
@@ -18,3 +20,15 @@ def shared_data() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return folder
+
+
+@pytest.fixture(scope="session")
+def mccnn_extra() -> None:
+    """The extra [mccnn]; where it is absent: skip, or fail with SAT_INTERVALS_REQUIRE_SHARED=1."""
+    try:
+        import_module("onnxruntime")
+        version("MCCNN")
+    except (ImportError, PackageNotFoundError) as error:
+        if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1":
+            raise
+        pytest.skip(f"the extra [mccnn] is not installed: {error}")

@@ -651,7 +651,9 @@ def test_match__command_line_wins_over_the_file(folder, tmp_path):
 
 # ---- The other commands -----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("preset", preset_names())
-def test_config__prints_settings_that_match_takes(folder, tmp_path, preset):
+def test_config__prints_settings_that_match_takes(folder, tmp_path, preset, request):
+    if preset == "mccnn":
+        request.getfixturevalue("mccnn_extra")
     result = invoke("config", "--preset", preset)
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == preset_text(preset)

@@ -294,6 +294,14 @@ def test_table_1__means_by_group_beside_the_paper():
     assert rows[2].figures["high acc."] is None
 
 
+def test_table_1__costs_of_a_group_stand_together():
+    names = ("a", "middlebury2003", "census"), ("b", "satellite", "census"), ("a", "middlebury2003", "mccnn")
+    rows = table_1([Scene(name, group, report_of(0.9) | {"cost": cost}) for name, group, cost in names])
+    labels = [row.label for row in rows if row.scenes]
+    assert labels == ["middlebury2003 census", "middlebury2003 mccnn", "satellite census"]
+    assert [row.figures["acc."] for row in rows if row.label == "paper"] == [0.973, 0.954]
+
+
 @pytest.mark.parametrize(
     ("meta", "message"),
     [

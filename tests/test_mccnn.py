@@ -9,19 +9,34 @@ import numpy as np
 import pytest
 import rasterio
 import reference
+from click.testing import CliRunner
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
+from sat_intervals.batch import PairOfBatch, match_batch
+from sat_intervals.cli import main
 from sat_intervals.features import Network, load_network, weights_file
 from sat_intervals.in_memory import _reader
+from sat_intervals.job import prepare
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.normalization import Scale, Scales
 from sat_intervals.patch import kernel_settings
+from sat_intervals.pictures.curve import read_curve
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
+from sat_intervals.raster import north_up, write_layer
+from sat_intervals.results import open_results
+from sat_intervals.scene import make_scene
 from sat_intervals.similarity import Area, compare
+from sat_intervals.tile import match_tile
 from sat_intervals.tiling import Window
 
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),
+    pytest.mark.usefixtures("mccnn_extra"),
+]
+
+
+SEARCH = {"disparity": {"minimum": -4, "maximum": 6}}
 
 
 @pytest.fixture(scope="module")
@@ -242,6 +257,81 @@ def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, ne
     images[1].write_bytes(images[1].read_bytes()[:-4000])
     with pytest.raises(RunError, match=r"right\.tif could not be measured: .*the file may be cut short"):
         match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
+    left, right = masked_images(60, 80)
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    planned = invoke("plan", *images, "--disparity", -4, 6, "--cost", "mccnn")
+    assert planned.exit_code == 0, planned.output
+    matched = invoke("match", *images, tmp_path / "out", "--disparity", -4, 6, "--cost", "mccnn")
+    assert matched.exit_code == 0, matched.output
+    assert "measuring images" in matched.stdout
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert load_config(run["settings"]) == settings(-4, 6)
+    assert run["cost_span"] == settings(-4, 6).cost_span
+    # One tile without seams: the curve of a pixel is that of the run.
+    results = open_results(tmp_path / "out")
+    found, flags = bands(tmp_path / "out")
+    row, column = next((r, c) for r, c in np.argwhere(flags & INVALID == 0) if r > 20)
+    curve = read_curve(results, row, column)
+    raw = match_arrays(left.astype("uint16"), right.astype("uint16"), settings(-4, 6, median=None, regularization=None))
+    assert curve.disparity == pytest.approx(raw["disparity"].to_numpy()[row, column])
+    assert curve.lower <= found[0, row, column] <= curve.upper
+    assert np.nanmin(curve.possibilities) >= 0
+
+
+def test_evaluate__compares_both_costs_in_one_table(tmp_path):
+    scene = make_scene(120, 160)
+    for name, layer in (("left", scene.left), ("right", scene.right), ("truth", scene.truth)):
+        nodata = np.nan if name == "truth" else 0
+        write_layer(tmp_path / f"{name}.tif", layer, nodata, north_up(32631, 0, 0, 0.5))
+    meta = {"disparity": [scene.minimum, scene.maximum], "group": "city"}
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    result = invoke("evaluate", "--cost", "census", "--cost", "mccnn", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert [line.split()[:3] for line in result.stdout.splitlines()[2:4]] == [
+        ["city", "census", "1"],
+        ["city", "mccnn", "1"],
+    ]
+    ablated = invoke("ablate", "--cost", "mccnn", "--json", tmp_path)
+    report = json.loads(ablated.stdout)
+    assert report["cost"] == "mccnn"
+    assert report["baseline"]["accuracy"] < report["0.9 regularised"]["accuracy"]
+
+
+def test_match_batch__measures_each_pair_and_goes_on_after_one_that_it_cannot(tmp_path, network_file):
+    left, right = masked_images(60, 140)
+    write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    (tmp_path / "cut.tif").write_bytes((tmp_path / "right.tif").read_bytes()[:-4000])
+    pairs = [
+        PairOfBatch(name, str(tmp_path / "left.tif"), str(tmp_path / f"{other}.tif"), settings=SEARCH)
+        for name, other in (("broken", "cut"), ("whole", "right"))
+    ]
+    cost = {"cost": {"method": "mccnn", "weights": str(network_file)}}
+    report = match_batch(pairs, tmp_path / "out", cost)
+    assert {name: end["state"] for name, end in report.items()} == {"broken": "failed", "whole": "done"}
+    assert "cut.tif could not be measured" in report["broken"]["error"]
+    match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "alone", SEARCH | cost)
+    for one, other in zip(bands(tmp_path / "out" / "whole"), bands(tmp_path / "alone"), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
+    left, right = masked_images(60, 80)
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    file = write_network(tmp_path / "network.onnx", random_weights())
+    job = prepare(*images, tmp_path / "out", settings(-4, 6, file))
+    with job.store.locked():
+        job.begin()
+    job.store.write_normalization(Scales(Scale(500.0, 80.0), Scale(500.0, 80.0)).report())
+    write_network(file, random_weights(seed=1))
+    with pytest.raises(SatIntervalsError, match=r"network\.onnx on this worker differs in sha256 from .* of the run"):
+        match_tile(job, next(iter(job.store.grid)))
 
 
 @pytest.mark.parametrize("name", ["int8", "fp32"])

@@ -23,7 +23,12 @@ def run_tests(environment, *selection):
 @pytest.mark.parametrize("processor", ["generic", "haswell"])
 def test_kernels__equal_their_twins_on_processors_without_avx512(tmp_path, processor):
     environment = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path)}
-    run_tests(environment, "tests/test_intervals.py::test_match_arrays__equals_reference")
+    run_tests(
+        environment,
+        "tests/test_intervals.py::test_match_arrays__equals_reference",
+        "tests/test_correlation.py::test_correlate__worked_example",
+        "tests/test_sgm.py::test_cost_volume__equals_reference_with_penalties_that_follow_edges",
+    )
 
 
 def test_kernels__plain_ones_equal_their_twins_without_compilation(tmp_path):
