@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import os
 import reprlib
 from collections.abc import Iterable, Mapping
 from decimal import Decimal
@@ -23,6 +24,7 @@ from pydantic import (
     Field,
     PlainSerializer,
     ValidationError,
+    field_validator,
     model_validator,
 )
 from pydantic.fields import FieldInfo
@@ -115,6 +117,11 @@ class Mccnn(Section):
     method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
     weights: str | None = Field(None, description="ONNX file of the network; null: the one of the extra [mccnn]")
 
+    @field_validator("weights")
+    @classmethod
+    def _name_wholly(cls, value: str | None) -> str | None:
+        return None if value is None else os.path.abspath(value)  # wherever a worker stands
+
     @property
     def window(self) -> int:
         """Side of what a feature sees, in pixels."""
@@ -139,11 +146,14 @@ class Mccnn(Section):
 class _Penalties(Section):
     """Semi-global matching over 8 paths (Hirschmuller 2008)."""
 
+    penalty: str
+    p1: Any
+    p2: Any
+
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        p1, p2 = getattr(self, "p1"), getattr(self, "p2")  # noqa: B009 (each kind declares its own)
-        if p1 > p2:
-            raise ValueError(f"p1 {p1} is above p2 {p2}, the penalty of a larger step")
+        if self.p1 > self.p2:
+            raise ValueError(f"p1 {self.p1} is above p2 {self.p2}, the penalty of a larger step")
         return self
 
 

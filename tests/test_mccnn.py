@@ -188,6 +188,11 @@ def test_config__span_is_declared_and_held_to_what_can_be():
         settings(-9, 0, sgm={"penalty": "constant"})
 
 
+def test_load_config__weights_are_named_wholly(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert settings(-9, 0, "some.onnx").cost.weights == str(tmp_path / "some.onnx")
+
+
 def test_load_config__another_cost_brings_its_own_penalties():
     urban = {"disparity": {"minimum": 0, "maximum": 9}, "cost": {"window": 11}, "sgm": {"p1": 20, "p2": 80}}
     assert load_config(urban, {"cost": {"method": "mccnn"}}) == settings(0, 9)
