@@ -173,6 +173,22 @@ def test_compare__penalties_follow_both_images(network_file):
     np.testing.assert_array_equal(cost_volume(found.costs, kernel_settings(config), found.gradients), expected)
 
 
+@pytest.mark.parametrize("gradients", ["normalized", "raw"])
+def test_compare__a_right_area_is_a_left_one_of_swapped_images(network_file, gradients):
+    left, right = masked_images()
+    scales = Scales(Scale(490.0, 75.0), Scale(510.0, 85.0))
+    config, swapped = (settings(*ends, network_file, sgm={"gradients": gradients}) for ends in ((-6, 3), (-3, 6)))
+    window = Window(3, -4, 20, 30)
+    both = [Area.of(Window(3, 1, 20, 25), config), Area.mirror(window, config)]
+    _, found = compare(_reader(left), _reader(right), both, config, scales)
+    images = _reader(right), _reader(left)
+    (expected,) = compare(*images, [Area.of(window, swapped)], swapped, Scales(scales.right, scales.left))
+    for one, other in zip(found.costs[2:], expected.costs[2:], strict=True):
+        np.testing.assert_array_equal(one, other)
+    volumes = (cost_volume(one.costs, kernel_settings(swapped), one.gradients) for one in (found, expected))
+    np.testing.assert_array_equal(*volumes)
+
+
 def test_config__span_is_declared_and_held_to_what_can_be():
     config = settings(-9, 0)
     assert config.cost_span == round(125 * float(config.sgm.span)) < config.largest_sum
