@@ -154,7 +154,8 @@ def _correlations(left: _View, right: _View, areas: Sequence[Area], scales: Scal
             base, there = strips[area.mirrored], strips[not area.mirrored]
             of_base = area.base.relative_to(views[area.mirrored].window).slices[1]
             of_there = area.facing.relative_to(views[not area.mirrored].window).slices[1]
-            correlate(base[:, :, of_base], there[:, :, of_there], costs[rows])
+            base, there = np.ascontiguousarray(base[:, :, of_base]), np.ascontiguousarray(there[:, :, of_there])
+            correlate(base, there, costs[rows])
     nothing = np.zeros((0, 0, 0), np.uint8)
 
     def state_of(side: int, wanted: Window) -> np.ndarray:
@@ -170,13 +171,17 @@ def _features(view: _View, state: np.ndarray, rows: slice, scale: Scale, network
     """Features of rows of a view, ``(features, rows, columns)``; zero beside the columns with a usable window."""
     height, width = rows.stop - rows.start, view.window.width
     usable = np.flatnonzero((state[rows] == 0).any(axis=0))
+    if not usable.size:
+        return np.zeros((network.count, height, width), np.float32)
+    first, last = usable[0], usable[-1] + 1
+    seen = np.s_[rows.start : rows.stop + 2 * view.radius, first : last + 2 * view.radius]
+    pixels = (view.pixels[seen].astype(np.float64) - scale.mean) / scale.deviation
+    pixels[view.state[seen] != 0] = 0
+    inner = network(pixels.astype(np.float32))
+    if inner.shape[2] == width:
+        return inner
     features = np.zeros((network.count, height, width), np.float32)
-    if usable.size:
-        first, last = usable[0], usable[-1] + 1
-        seen = np.s_[rows.start : rows.stop + 2 * view.radius, first : last + 2 * view.radius]
-        pixels = (view.pixels[seen].astype(np.float64) - scale.mean) / scale.deviation
-        pixels[view.state[seen] != 0] = 0
-        features[:, :, first:last] = network(pixels.astype(np.float32))
+    features[:, :, first:last] = inner
     return features
 
 

@@ -1,6 +1,7 @@
 """One thing to measure, in a process of its own: ``python candidates.py NAME ROWS COLUMNS DISPARITIES RUNS``.
 
-Prints JSON: the seconds of each run after a first one that is not counted, and the process's peak memory in MB.
+Prints JSON: the seconds of each run after a first one that is not counted, those of them that went into the network
+of MC-CNN, and the process's peak memory in MB.
 """
 
 import json
@@ -67,29 +68,26 @@ def opencv(left, right, disparities):
     return lambda: matcher.compute(left, right)
 
 
-def inference(left, right, disparities):
-    """The network alone, of both whole images, as the reference runs it."""
-    import onnxruntime
+def watch_network(name):
+    """Let every call of the network, this project's or the reference's, add its seconds to the figure returned."""
+    if name.startswith("pandora"):
+        from mc_cnn.inference_engine.inference_engine_onnx import ONNXEngine as Network
 
-    from sat_intervals.features import weights_file
+        method = "inference_func"
+    else:
+        from sat_intervals.features import Network
 
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(weights_file(None), options, providers=["CPUExecutionProvider"])
-    images = [((image - image.mean()) / image.std()).astype(np.float32) for image in (left, right)]
-    return lambda: [session.run(None, {"input": image}) for image in images]
+        method = "__call__"
+    spent, function = [0.0], getattr(Network, method)
 
+    def watched(self, pixels):
+        started = time.perf_counter()
+        features = function(self, pixels)
+        spent[0] += time.perf_counter() - started
+        return features
 
-def inference_in_strips(left, right, disparities):
-    """The network alone as this project runs it."""
-    from sat_intervals.features import RADIUS, load_network, weights_file
-    from sat_intervals.similarity import STRIP
-
-    network = load_network(weights_file(None))
-    images = [((image - image.mean()) / image.std()).astype(np.float32) for image in (left, right)]
-    images = [np.pad(image, RADIUS) for image in images]
-    rows = range(0, left.shape[0], STRIP)
-    return lambda: [network(image[row : row + STRIP + 2 * RADIUS]) for image in images for row in rows]
+    setattr(Network, method, watched)
+    return spent
 
 
 def pandora(left, right, disparities, cost="census"):
@@ -152,8 +150,6 @@ MCCNN = {
 CANDIDATES = {
     "ours": ours,
     "ours_mccnn": partial(ours, cost="mccnn"),
-    "inference": inference,
-    "inference_in_strips": inference_in_strips,
     "opencv": opencv,
     "pandora": pandora,
     "pandora_mccnn": partial(pandora, cost="mccnn"),
@@ -164,13 +160,15 @@ def main():
     """Measure what the command line names."""
     name, (rows, columns, disparities, runs) = sys.argv[1], map(int, sys.argv[2:6])
     task = CANDIDATES[name](*make_pair(rows, columns), disparities)
-    seconds = []
+    spent = watch_network(name) if name.endswith("mccnn") else [0.0]
+    seconds, network = [], []
     for _ in range(runs + 1):
-        started = time.perf_counter()
+        before, started = spent[0], time.perf_counter()
         task()
         seconds.append(time.perf_counter() - started)
+        network.append(spent[0] - before)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps({"seconds": seconds[1:] or seconds, "megabytes": peak}))
+    print(json.dumps({"seconds": seconds[1:], "network": network[1:], "megabytes": peak}))
 
 
 if __name__ == "__main__":

@@ -43,11 +43,12 @@ def run(command, cores, environment=None):
 
 
 def candidate(name, size, disparities, runs=RUNS):
-    """Median seconds and peak memory of one candidate on one core."""
+    """Median seconds, peak memory and seconds outside the network of MC-CNN of one candidate on one core."""
     command = [sys.executable, HERE / "candidates.py", name, size, size, disparities, runs]
     _, _, printed = run([str(part) for part in command], CORES[:1])
     result = json.loads(printed.splitlines()[-1])
-    return statistics.median(result["seconds"]), result["megabytes"]
+    outside = [whole - network for whole, network in zip(result["seconds"], result["network"], strict=True)]
+    return statistics.median(result["seconds"]), result["megabytes"], statistics.median(outside)
 
 
 def write_pair(folder, size):
@@ -86,7 +87,7 @@ def in_memory():
         runs = {"ours": RUNS, "opencv": RUNS, "pandora": RUNS if small else 1}
         seconds, memory = {}, {}
         for name in names:
-            seconds[name], memory[name] = candidate(name, size, disparities, runs[name])
+            seconds[name], memory[name], _ = candidate(name, size, disparities, runs[name])
         shown = {name: f"{seconds[name]:.2f} s, {memory[name]:.0f} MB" for name in names}
         times = f"{seconds['pandora'] / seconds['ours']:.0f}x faster" if "pandora" in seconds else "-"
         if "pandora" in memory:
@@ -107,17 +108,15 @@ def mccnn():
     row("MC-CNN in memory, one core", "this project", "Pandora + MC-CNN + libSGM", "ratio")
     row(*["---"] * 4)
     for size, disparities in ((1000, 64), (1000, 128)):
-        runs = {"ours_mccnn": 3, "inference_in_strips": 3, "pandora_mccnn": 1, "inference": 3}
-        measured = {name: candidate(name, size, disparities, times) for name, times in runs.items()}
-        (ours, ours_memory), (theirs, memory) = measured["ours_mccnn"], measured["pandora_mccnn"]
-        rest = ours - measured["inference_in_strips"][0], theirs - measured["inference"][0]
+        ours, our_memory, our_rest = candidate("ours_mccnn", size, disparities, 3)
+        theirs, memory, rest = candidate("pandora_mccnn", size, disparities, 1)
         row(
             f"{size} x {size} x {disparities}",
-            f"{ours:.2f} s, {ours_memory:.0f} MB",
+            f"{ours:.2f} s, {our_memory:.0f} MB",
             f"{theirs:.2f} s, {memory:.0f} MB",
-            f"{theirs / ours:.1f}x faster, memory 1/{memory / ours_memory:.1f}",
+            f"{theirs / ours:.1f}x faster, memory 1/{memory / our_memory:.1f}",
         )
-        row("outside the network", f"{rest[0]:.2f} s", f"{rest[1]:.2f} s", f"{rest[1] / rest[0]:.1f}x faster")
+        row("outside the network", f"{our_rest:.2f} s", f"{rest:.2f} s", f"{rest / our_rest:.1f}x faster")
 
 
 def file_to_file(folder):
