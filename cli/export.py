@@ -19,7 +19,8 @@ def export(out: Path, target: Path, form: str) -> None:
     cars   epi_disp.tif, epi_disp_interval_bounds_inf.tif and _sup.tif,
            epi_disp_ambiguity.tif (1 - confidence), epi_disp_mask.tif (255 = valid)
     asp    TARGET-F.tif: horizontal, vertical, valid; TARGET is the prefix
-    s2p    rectified_disp.tif, rectified_mask.png (1 = valid), rectified_disp_confidence.tif
+    s2p    rectified_disp.tif, rectified_mask.png (1 = valid),
+           rectified_disp_confidence.tif
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.export import export

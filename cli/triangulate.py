@@ -21,7 +21,8 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
     """Triangulate the disparity and both bounds of the finished run in the folder OUT.
 
     \b
-    OUT/points.tif   longitude, latitude, height, height_lower, height_upper, residual, where the bounds' points lie
+    OUT/points.tif   longitude, latitude, height, its two bounds, residual,
+                     where the points of the bounds lie
 
     Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files; grids hold the sensor column and row (bands 1 and 2) of
     epipolar positions, as CARS and shareloc write them. Needs shareloc: pip install 'sat-intervals[dsm]'.
