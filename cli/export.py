@@ -17,8 +17,9 @@ def export(out: Path, target: Path, form: str) -> None:
 
     \b
     cars   epi_disp.tif, epi_disp_interval_bounds_inf.tif and _sup.tif,
-           epi_disp_ambiguity.tif (1 - confidence), epi_disp_mask.tif (255 = valid)
-    asp    TARGET-F.tif: horizontal, vertical, valid; TARGET is the prefix
+           epi_disp_ambiguity.tif (1 - confidence),
+           epi_disp_mask.tif (255 = valid)
+    asp    TARGET-F.tif: horizontal, vertical, valid; TARGET is a prefix
     s2p    rectified_disp.tif, rectified_mask.png (1 = valid),
            rectified_disp_confidence.tif
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
