@@ -19,6 +19,7 @@ def batch(
     overlap: int | None,
     workers: int | None,
     cluster: str | None,
+    store: str | None,
     keep_tiles: bool,
     overwrite: bool,
     quiet: bool,
@@ -33,7 +34,7 @@ def batch(
 
     rows = read_batch(pairs)
     with Console(quiet) as console:
-        given = overrides(None, tile_size, overlap, workers, cluster)
+        given = overrides(None, tile_size, overlap, workers, cluster, store)
         report = match_batch(
             rows,
             out,

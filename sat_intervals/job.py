@@ -52,7 +52,7 @@ class Job:
     inputs: dict[str, Any]
 
     def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store for what decides the bytes of a tile; to be called while it is locked.
+        """Open the store for what decides the bytes of a tile; to be called while it is locked by `held`.
 
         With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
         """
@@ -80,7 +80,7 @@ class Job:
     @property
     def waiting(self) -> int:
         """Number of tiles that are not done."""
-        return sum(not self.store.is_done(tile) for tile in self.store.grid)
+        return len(self.store.grid) - len(self.store.done())
 
 
 def prepare(
@@ -102,7 +102,13 @@ def prepare(
     _check_memory(config, region)
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
-    store = Store(out / "tiles", Grid(region, config.tiles.size), config.disparity.count, config.largest_ambiguity)
+    store = Store(
+        out / "tiles",
+        Grid(region, config.tiles.size),
+        config.disparity.count,
+        config.largest_ambiguity,
+        config.cluster.store,
+    )
     inputs = {"left": _described(left), "right": _described(right)}
     return Job(left, right, config, store, out, inputs)
 

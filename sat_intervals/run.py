@@ -4,14 +4,16 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
-from distributed import Client, Future, KilledWorker, as_completed
+from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
 from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
 from sat_intervals.errors import RunError
+from sat_intervals.folders import folder_at
 from sat_intervals.job import Job, compile_kernels, prepare
 from sat_intervals.raster import Image
 from sat_intervals.tile import match_tile, timed
@@ -68,7 +70,7 @@ def match_pair(
     seconds: dict[str, float] = {}
     with timed(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
-    with job.store.locked():
+    with held(job.store.home, progress), held(job.config.cluster.store, progress) as progress:
         job.begin(overwrite=overwrite)
         with timed(seconds, "kernels"):
             progress("kernels", 0, 1)
@@ -84,6 +86,27 @@ def match_pair(
         if not keep_tiles:
             job.store.remove()
     return report
+
+
+@contextmanager
+def held(place: str | Path | None, progress: Progress) -> Iterator[Progress]:
+    """Keep every other run out of a folder or fsspec URL; the progress that it yields raises where that was in vain.
+
+    Raises
+    ------
+    SatIntervalsError
+        When another run is at work there, or the place cannot be used.
+    """
+    if place is None:
+        yield progress
+        return
+    with folder_at(place).locked(lambda: progress("lease", 0, 1)) as check:
+
+        def checked(stage: str, done: int, total: int) -> None:
+            check()
+            progress(stage, done, total)
+
+        yield checked
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
@@ -117,9 +140,13 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
     total = sum(len(job.store.grid) for job in jobs)
     done = total - sum(left)
     yield from ((job, {}) for job, count in zip(jobs, left, strict=True) if count == 0)
-    waiting = ((i, tile) for i, job in enumerate(jobs) for tile in job.store.grid if not job.store.is_done(tile))
+    waiting = ((i, tile) for i, job in enumerate(jobs) for tile in _waiting(job))
     flight = _Flight(client, jobs, waiting)
-    for i, tile, error in flight:
+    for landed in flight:
+        if landed is None:
+            progress("tiles", done, total)
+            continue
+        i, tile, error = landed
         if error is not None:
             failures[i][tile.name] = error
             jobs[i].store.write_failure(tile.name, _reason(error))
@@ -130,8 +157,15 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
             yield jobs[i], failures[i]
 
 
+def _waiting(job: Job) -> Iterator[Tile]:
+    done = job.store.done()
+    return (tile for tile in job.store.grid if tile.name not in done)
+
+
 class _Flight:
     """Tiles on their way through a cluster; iterates over those that land: job number, tile, error or None.
+
+    Where none lands for a while, None comes in its place, so that whoever waits can look around.
 
     dask blames a worker's death on every tile that it held. Those blamed too often are tried again at the end, one at a
     time, so that no tile fails for another.
@@ -139,16 +173,22 @@ class _Flight:
 
     def __init__(self, client: Client, jobs: Sequence[Job], waiting: Iterator[tuple[int, Tile]]) -> None:
         self._client, self._jobs, self._waiting = client, jobs, waiting
-        self._landing = as_completed()
-        self._tiles: dict[str, tuple[int, Tile]] = {}
+        self._landed: SimpleQueue[Future[None]] = SimpleQueue()
+        self._tiles: dict[str, tuple[int, Tile, Future[None]]] = {}
         self._suspects: list[tuple[int, Tile]] = []
         self._width, self._looked = 2, float("-inf")
 
-    def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None]]:
+    def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None] | None]:
         self._fill()
-        for future in self._landing:
-            error, key = _landed(future), str(future.key)
-            i, tile = self._tiles.pop(key)
+        while self._tiles:
+            try:
+                future = self._landed.get(timeout=_LOOK_AGAIN)
+            except Empty:
+                self._fill()
+                yield None
+                continue
+            error, key = _ended_with(future), str(future.key)
+            i, tile, _ = self._tiles.pop(key)
             future.release()
             blamed = isinstance(error, KilledWorker) and not key.endswith(_ALONE)
             if blamed:
@@ -175,11 +215,11 @@ class _Flight:
         job, key = self._jobs[i], f"match-{i}-{tile.name}{suffix}"
         with _scheduler_needed():
             future = self._client.submit(match_tile, job, tile, key=key, retries=job.config.cluster.retries, pure=False)
-        self._tiles[key] = i, tile
-        self._landing.add(future)
+        self._tiles[key] = i, tile, future
+        future.add_done_callback(self._landed.put)
 
 
-def _landed(future: Future[None]) -> BaseException | None:
+def _ended_with(future: Future[None]) -> BaseException | None:
     """What a future ended with."""
     with _scheduler_needed():
         error: BaseException | None = future.exception()

@@ -24,7 +24,7 @@ FLOORS = [
     {"evaluation", "triangulation", "surface", "surface_evaluation", "export"},
     {"finish", "patch", "demo", "results"},
     {"store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
-    {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
+    {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables", "folders"},
     {"tiling", "products", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -35,6 +35,7 @@ HOMES = {
     "dask": {"cluster"},
     "dask_jobqueue": {"cluster"},
     "distributed": {"cluster", "run"},
+    "fsspec": {"folders"},
     "llvmlite": {"kernels"},
     "matplotlib": {"pictures"},
     "numba": {"kernels"},
