@@ -109,7 +109,8 @@ def prepare(
         config.largest_ambiguity,
         config.cluster.store,
     )
-    inputs = {"left": _described(left), "right": _described(right)}
+    known = _known(store.inputs())
+    inputs = {"left": _described(left, known), "right": _described(right, known)}
     return Job(left, right, config, store, out, inputs)
 
 
@@ -178,12 +179,18 @@ def _check_memory(config: Config, region: Window) -> None:
         )
 
 
-def _described(image: Image) -> dict[str, Any]:
+def _known(inputs: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What a manifest says of the files of its inputs, by path."""
+    described = [file for image in inputs.values() for file in (image, *image["files"], image["mask"])]
+    return {file["path"]: file for file in described if file and "sha256" in file}
+
+
+def _described(image: Image, known: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """What run.json and the manifest say of an input."""
     crs = image.georeferencing.crs
     return {
-        **identity(image.path),
-        "files": [identity(file) for file in other_files(image)],
+        **identity(image.path, known),
+        "files": [identity(file, known) for file in other_files(image)],
         "height": image.height,
         "width": image.width,
         "band": image.band,
@@ -192,5 +199,5 @@ def _described(image: Image) -> dict[str, Any]:
         "crs": crs.to_string() if crs else None,
         "use_mask": image.use_mask,
         "alpha": image.alpha,
-        "mask": identity(image.mask) if image.mask else None,
+        "mask": identity(image.mask, known) if image.mask else None,
     }

@@ -359,6 +359,8 @@ def _without_content(manifest: Mapping[str, Any]) -> dict[str, Any]:
             return [without(value) for value in there]
         if not isinstance(there, dict):
             return there
-        return {key: without(value) for key, value in there.items() if key not in ("bytes", "modified", "sha256")}
+        return {
+            key: without(value) for key, value in there.items() if key not in ("bytes", "modified", "sha256", "etag")
+        }
 
     return {**manifest, "inputs": without(manifest["inputs"])}

@@ -24,7 +24,8 @@ FLOORS = [
     {"evaluation", "triangulation", "surface", "surface_evaluation", "export"},
     {"finish", "patch", "demo", "results"},
     {"store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
-    {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables", "folders"},
+    {"config", "kernels", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
+    {"folders"},
     {"tiling", "products", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}

@@ -221,6 +221,22 @@ def test_batch__keeps_the_tiles_of_each_pair_in_a_folder_of_its_own(bucket, pair
     assert "lease.json" not in objects(f"{bucket}/batch")
 
 
+def test_match__reads_images_in_a_bucket_and_knows_them_by_size_and_etag(bucket, pair, tmp_path, monkeypatch):
+    # what GDAL calls the address of the service
+    monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
+    monkeypatch.setenv("AWS_HTTPS", "NO")
+    monkeypatch.setenv("AWS_VIRTUAL_HOSTING", "FALSE")
+    for side in ("left", "right"):
+        s3().upload_file(str(pair / f"{side}.tif"), "bucket", f"images/{side}.tif")
+    command = [COMMAND, "match", f"{bucket}/images/left.tif", "/vsis3/bucket/images/right.tif", tmp_path / "out"]
+    subprocess.run([*command, "--config", pair / "settings.yaml", "--quiet"], check=True)
+    assert_complete(pair, tmp_path / "out")
+    inputs = json.loads((tmp_path / "out" / "run.json").read_text())["inputs"]
+    for side in ("left", "right"):
+        told = s3().head_object(Bucket="bucket", Key=f"images/{side}.tif")
+        assert (inputs[side]["bytes"], inputs[side]["etag"]) == (told["ContentLength"], told["ETag"])
+
+
 @pytest.mark.parametrize(
     ("store", "says"),
     [

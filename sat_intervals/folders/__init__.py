@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Protocol
 
 from sat_intervals.folders.local import LocalFolder
-from sat_intervals.folders.remote import RemoteFolder
+from sat_intervals.folders.remote import RemoteFolder, object_tag
 
-__all__ = ["Folder", "LocalFolder", "RemoteFolder", "folder_at"]
+__all__ = ["Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
 
 
 class Folder(Protocol):

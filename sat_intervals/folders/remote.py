@@ -112,3 +112,14 @@ class RemoteFolder:
     def is_locked(self) -> bool:
         """See `Folder`."""
         return lease.is_fresh(self)
+
+
+def object_tag(url: str) -> dict[str, Any]:
+    """Size in bytes and ETag of an object; nothing where fsspec does not reach it."""
+    try:
+        system, path = fsspec.url_to_fs(url)
+        content = system.info(path)
+    except Exception:  # of many libraries
+        return {}
+    tag = content.get("ETag") or content.get("etag") or content.get("LastModified")
+    return {"bytes": content.get("size"), "etag": None if tag is None else str(tag)}
