@@ -125,7 +125,7 @@ def match(
     if dry_run:
         from sat_intervals.cluster import job_script
 
-        click.echo(job_script(config.cluster))
+        click.echo(job_script(config.cluster, out))
         return
     with Console(quiet) as console:
         from sat_intervals.raster import open_image

@@ -135,7 +135,7 @@ def match_batch(
             else:
                 names[id(job)] = pair.name
                 jobs.append(job)
-        for name, end in _matched(jobs, names, cluster, keep_tiles, progress):
+        for name, end in _matched(jobs, names, out, cluster, keep_tiles, progress):
             ended[name] = end
     report = {pair.name: ended[pair.name] for pair in pairs}
     (out / "batch.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
@@ -172,7 +172,7 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
 
 
 def _matched(
-    jobs: list[Job], names: dict[int, str], cluster: Cluster, keep_tiles: bool, progress: Progress
+    jobs: list[Job], names: dict[int, str], out: Path, cluster: Cluster, keep_tiles: bool, progress: Progress
 ) -> list[tuple[str, Any]]:
     """Match the tiles of all jobs and conclude each, in a thread of its own, while others are being matched."""
     if not jobs:
@@ -180,7 +180,7 @@ def _matched(
     for config in {_kernels(job.config): job.config for job in jobs}.values():
         compile_kernels(config)
     waiting: list[tuple[Job, Future[dict[str, Any]]]] = []
-    with ThreadPoolExecutor(1) as thread, connected(cluster) as client:
+    with ThreadPoolExecutor(1) as thread, connected(cluster, out) as client:
         for job, failures in matched(client, jobs, progress):
             waiting.append((job, thread.submit(_concluded, job, failures, keep_tiles)))
     return [(names[id(job)], future.result()) for job, future in waiting]

@@ -125,7 +125,8 @@ def check_output(out: Path, overwrite: bool) -> None:
     """Make the folder of a run, or tell why it cannot be used."""
     try:
         there = [name for name in OUTPUTS if (out / name).exists()]
-        if there and not overwrite:
+        # run.json is the last: without it, but with tiles, a run was killed between the names of its files
+        if there and not overwrite and ("run.json" in there or not (out / "tiles").exists()):
             raise SatIntervalsError(
                 f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite"
             )

@@ -1,5 +1,6 @@
 """All tiles of a pair, all pairs of a batch, a bounded number of them in flight."""
 
+import errno
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,7 +11,7 @@ from typing import Any
 from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
-from sat_intervals.cluster import connected
+from sat_intervals.cluster import Jobs, connected
 from sat_intervals.conclude import Progress, conclude
 from sat_intervals.errors import RunError
 from sat_intervals.folders import folder_at
@@ -21,6 +22,8 @@ from sat_intervals.tiling import Tile, Window
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
 _LOOK_AGAIN = 2.0
+# Errors of a disk, or of a user's share of it.
+_FULL = errno.ENOSPC, errno.EDQUOT
 # Ends the key of a tile that is tried with no other in flight.
 _ALONE = "-alone"
 
@@ -79,7 +82,7 @@ def match_pair(
         with timed(seconds, "tiles"):
             progress("tiles", len(job.store.grid) - job.waiting, len(job.store.grid))
             if job.waiting:
-                with connected(job.config.cluster) as client:
+                with connected(job.config.cluster, job.out) as client:
                     for _, failures in matched(client, [job], progress):
                         check_failures(job, failures)
         report = conclude(job, seconds, progress)
@@ -147,6 +150,11 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
             progress("tiles", done, total)
             continue
         i, tile, error = landed
+        if isinstance(error, OSError) and error.errno in _FULL:  # no other tile would fare better
+            raise RunError(
+                f"{error.filename or jobs[i].store.folder}: {error.strerror}: make room and run the same command "
+                "again, it goes on from the tiles that are done"
+            )
         if error is not None:
             failures[i][tile.name] = error
             jobs[i].store.write_failure(tile.name, _reason(error))
@@ -176,6 +184,7 @@ class _Flight:
         self._landed: SimpleQueue[Future[None]] = SimpleQueue()
         self._tiles: dict[str, tuple[int, Tile, Future[None]]] = {}
         self._suspects: list[tuple[int, Tile]] = []
+        self._watch = Jobs(client)
         self._width, self._looked = 2, float("-inf")
 
     def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None] | None]:
@@ -185,6 +194,7 @@ class _Flight:
                 future = self._landed.get(timeout=_LOOK_AGAIN)
             except Empty:
                 self._fill()
+                self._watch.check()
                 yield None
                 continue
             error, key = _ended_with(future), str(future.key)
