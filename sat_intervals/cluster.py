@@ -39,7 +39,8 @@ logging.getLogger("asyncio").addFilter(_is_news)
 def connected(settings: Cluster, out: Path) -> Iterator[Client]:
     """A client of the cluster that the settings name; closed, with what it started, at the end.
 
-    Jobs write their logs to ``out/logs``, unless the user's dask configuration names another folder.
+    Jobs write their logs to ``out/logs`` where their tiles lie in ``out`` too, unless the user's dask configuration
+    names another folder.
 
     Raises
     ------
@@ -134,7 +135,7 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
     given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
     if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
         given["scheduler_options"] = {"dashboard_address": f"{_LOOPBACK}:0"}
-    if dask.config.get(f"jobqueue.{settings.kind}.log-directory", None) is None:
+    if _suit_jobs(settings, logs):
         given["log_directory"] = str(logs.absolute())
     refusals: list[str] = []
 
@@ -152,6 +153,13 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
         return batch_system(**given, silence_logs=logging.CRITICAL)
     except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
         raise SatIntervalsError(f"cluster {settings.kind}: {' '.join(str(error).split())}") from error
+
+
+def _suit_jobs(settings: Cluster, logs: Path) -> bool:
+    """Whether jobs can write there: they may not see the folder of a run whose tiles lie elsewhere."""
+    own = dask.config.get(f"jobqueue.{settings.kind}.log-directory", None)
+    in_script = not any(map(str.isspace, str(logs.absolute())))
+    return own is None and settings.store is None and in_script
 
 
 def job_script(settings: Cluster, out: Path) -> str:
@@ -207,7 +215,7 @@ class Jobs:
         elif time.monotonic() - self._seen > patience:
             raise RunError(
                 "no job is in the queue any more: they were cancelled, or ended before their worker came, of which "
-                f"their logs in {next(iter(cluster.workers.values())).log_directory} tell; "
+                f"their logs in {next(iter(cluster.workers.values())).log_directory or os.getcwd()} tell; "
                 "the same command goes on from the tiles that are done"
             )
 

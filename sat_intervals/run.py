@@ -46,14 +46,14 @@ def match_pair(
     left, right
         Paths, or images opened by `open_image` with a band, a no-data value or a mask.
     out
-        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``; tiles that are done are kept there until the
-        run is complete, and an interrupted call goes on from them.
+        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``; tiles that are done are kept there, or in
+        ``cluster.store``, until the run is complete, and an interrupted call goes on from them.
     config
         Settings, or what `load_config` makes them from; ``cluster`` says where tiles are matched.
     window
         Region of the left image; by default all of it.
     keep_tiles
-        Whether the raw products of the tiles stay in ``out``.
+        Whether the raw products of the tiles stay.
     overwrite
         Whether a run in ``out`` is replaced and tiles there are dropped.
     progress

@@ -144,6 +144,17 @@ def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_pat
     assert_complete(pair, tmp_path / "out")
 
 
+def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
+    images, settings = pair
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
+    command = [SCRIPTS / "sat-intervals", "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
+    command += ["--config", tmp_path / "settings.yaml", "--cluster", "slurm", "--dry-run"]
+    script = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert {"#SBATCH --cpus-per-task=2", "#SBATCH --mem=3G"} <= set(script)
+    assert f"#SBATCH -e {tmp_path}/out/logs/dask-worker-%J.err" in script
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.yaml"]
+
+
 def test_match__ends_when_no_worker_can_come(slurm, pair, tmp_path):
     cancelled, broken, refused = (tmp_path / name for name in ("cancelled", "broken", "refused"))
     errors = broken / "out" / "logs"
