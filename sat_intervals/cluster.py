@@ -22,6 +22,8 @@ from sat_intervals.errors import RunError, SatIntervalsError
 
 # Seconds without a job in the queue after which none is waited for.
 JOBS_GONE = 30.0
+# Seconds from one look at the queue to the next, which is shared by many.
+_ASKED_EVERY = 10.0
 
 _LOOPBACK = "127.0.0.1"
 
@@ -186,7 +188,7 @@ class Jobs:
 
     def __init__(self, client: Client) -> None:
         self._client = client
-        self._seen = time.monotonic()
+        self._seen = self._asked = time.monotonic()
 
     def check(self) -> None:
         """Raise where no worker is there and none will come; to be called every few seconds.
@@ -202,17 +204,23 @@ class Jobs:
             When all jobs are gone.
         """
         cluster: Any = self._client.cluster
-        if not isinstance(getattr(cluster, "refusals", None), list) or self._client.nthreads():
-            self._seen = time.monotonic()
+        now = time.monotonic()
+        if not hasattr(cluster, "refusals"):
+            return
+        if self._client.nthreads():
+            self._seen = now
             return
         if cluster.refusals:
             raise SatIntervalsError(
                 f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
             )
         patience = JOBS_GONE + parse_timedelta(dask.config.get("distributed.deploy.lost-worker-timeout"))
+        if now - self._asked < _ASKED_EVERY:
+            return
+        self._asked = now
         if _any_in_queue({job.job_id for job in cluster.workers.values()}):
-            self._seen = time.monotonic()
-        elif time.monotonic() - self._seen > patience:
+            self._seen = now
+        elif now - self._seen > patience:
             raise RunError(
                 "no job is in the queue any more: they were cancelled, or ended before their worker came, of which "
                 f"their logs in {next(iter(cluster.workers.values())).log_directory or os.getcwd()} tell; "

@@ -51,22 +51,26 @@ class Job:
     out: Path
     inputs: dict[str, Any]
 
-    def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store for what decides the bytes of a tile; to be called while it is locked by `held`.
-
-        With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
-        """
-        manifest = {
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """All that decides the bytes of a tile."""
+        return {
             "version": version("sat-intervals"),
             "kernels": FINGERPRINT,
             "settings": self.config.model_dump(mode="json", exclude=_AFTER_THE_TILES),
             "inputs": self.inputs,
             "region": asdict(self.store.grid.region),
         }
+
+    def begin(self, *, overwrite: bool = False) -> None:
+        """Open the store for what decides the bytes of a tile; to be called while it is locked by `held`.
+
+        With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
+        """
         if overwrite:
             for name in OUTPUTS:
                 (self.out / name).unlink(missing_ok=True)
-        self.store.open(manifest, overwrite=overwrite, is_mended=self._reads_what_was_read)
+        self.store.open(self.manifest, overwrite=overwrite, is_mended=self._reads_what_was_read)
 
     def _reads_what_was_read(self) -> bool:
         """Whether every tile that is done would read today the pixels that it was made of."""

@@ -124,6 +124,21 @@ class Store:
         self._create_arrays()
         folder.write(_MANIFEST, text)
 
+    def check(self, manifest: Mapping[str, Any]) -> None:
+        """Hold that the store is that of a run still: a worker may outlive its run and find the next in its place.
+
+        Raises
+        ------
+        StoreError
+            When it is another's.
+        """
+        there = self.folder.read(_MANIFEST)
+        changed = (
+            ["no manifest"] if there is None else _differences(json.loads(there), json.loads(json.dumps(manifest)))
+        )
+        if reasons := "; ".join(changed):
+            raise StoreError(f"{self.folder} holds the tiles of another run: {reasons}")
+
     def _check_place(self, overwrite: bool) -> None:
         """Hold that the tiles of the run do not lie in another place, and note in which they do."""
         home, wanted = folder_at(self.home), str(self.folder)

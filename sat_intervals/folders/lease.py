@@ -6,8 +6,9 @@ never compared. What holds:
 - Where the service creates objects on condition, as S3 does, of several runs that find no lease one gets it. Elsewhere,
   and where several take over the same lease, the last that wrote it, unless one of them halts for longer than SETTLED
   seconds between its look and its writing.
-- A run that halts for longer than TAKEN_OVER seconds, or cannot reach the service, may find another in its place. It
-  asks before it begins a tile, before it publishes and before it deletes, and stops.
+- A run that halts for longer than TAKEN_OVER seconds, or cannot reach the service, may find another in its place, and
+  stops. It looks whenever it signs, and, where its signature is older than TAKEN_OVER seconds, before it goes on with
+  anything.
 """
 
 import json
@@ -51,13 +52,13 @@ class Lease:
     def __init__(self, place: Place) -> None:
         self._place = place
         self._owner = uuid.uuid4().hex
-        self._confirmed = time.time()
+        self._signed = time.time()
         self._lost = False
         self._ended = threading.Event()
         self._signing = threading.Thread(target=self._sign_on, name="lease", daemon=True)
 
-    def signed(self) -> str:
-        """The text of the lease at this moment."""
+    def text(self) -> str:
+        """What the lease says at this moment."""
         who = {"owner": self._owner, "host": socket.gethostname(), "process": os.getpid()}
         return json.dumps(who | {"signed": datetime.now(UTC).isoformat()})
 
@@ -68,26 +69,25 @@ class Lease:
 
     def check(self) -> None:
         """Raise a RunError where another run has taken over."""
-        if not self._lost and time.time() - self._confirmed > TAKEN_OVER:
-            self._confirm()
+        if time.time() - self._signed > TAKEN_OVER:
+            self._look()
         if self._lost:
             raise RunError(
                 f"another run has taken over {self._place}, as it may where one gives no sign of life for "
                 f"{TAKEN_OVER:.0f} s: leave it to that run, or run the same command again after its end"
             )
 
-    def _confirm(self) -> None:
+    def _look(self) -> None:
         self._lost = self._lost or not self.is_mine()
-        self._confirmed = time.time()
 
     def _sign_on(self) -> None:
         while not self._lost and not self._ended.wait(SIGNED_EVERY):
-            try:
-                self._confirm()
+            with suppress(OSError):  # the service may come back in time
+                now = time.time()
+                self._look()
                 if not self._lost:
-                    self._place.write(_LEASE, self.signed())
-            except OSError:
-                continue  # the service may come back in time; `check` asks it otherwise
+                    self._place.write(_LEASE, self.text())
+                    self._signed = now
 
     def __enter__(self) -> Self:
         self._signing.start()
@@ -110,13 +110,13 @@ def taken(place: Place, waiting: Callable[[], None]) -> Lease:
         When another run gives a sign of life.
     """
     lease = Lease(place)
-    while not place.create(_LEASE, lease.signed()):
+    while not place.create(_LEASE, lease.text()):
         there = place.read(_LEASE)
         if there is None:
             continue
         waiting()
         if _is_left(place, there):
-            place.write(_LEASE, lease.signed())
+            place.write(_LEASE, lease.text())
             break
     time.sleep(SETTLED)
     if not lease.is_mine():
@@ -125,7 +125,7 @@ def taken(place: Place, waiting: Callable[[], None]) -> Lease:
 
 
 def _is_left(place: Place, there: str) -> bool:
-    """Whether a lease stays as it is; False where its owner gives it up."""
+    """Whether a lease stays as it is; False where its owner gives it up, an error where it is signed again."""
     seen = time.monotonic()
     while time.monotonic() - seen < TAKEN_OVER:
         time.sleep(1.0)
