@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import signal
 import subprocess
 import threading
@@ -24,6 +25,8 @@ from sat_intervals.errors import RunError, SatIntervalsError
 JOBS_GONE = 30.0
 # Seconds from one look at the queue to the next, which is shared by many.
 _ASKED_EVERY = 10.0
+# Directives that send jobs where squeue does not look.
+_OTHER_CLUSTERS = re.compile(r"^#SBATCH (-M|--cluster)", re.MULTILINE)
 
 _LOOPBACK = "127.0.0.1"
 
@@ -137,7 +140,9 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
     given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
     if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
         given["scheduler_options"] = {"dashboard_address": f"{_LOOPBACK}:0"}
-    if _suit_jobs(settings, logs):
+    own_logs = dask.config.get(f"jobqueue.{settings.kind}.log-directory", None)
+    # Jobs may not see the folder of a run whose tiles lie elsewhere, and their scripts take no spaces.
+    if own_logs is None and settings.store is None and not any(map(str.isspace, str(logs.absolute()))):
         given["log_directory"] = str(logs.absolute())
     refusals: list[str] = []
 
@@ -150,18 +155,12 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
                 self.status = Status.failed  # else it could not be closed
                 raise
 
-    batch_system = type(base.__name__, (base,), {"job_cls": Job, "refusals": refusals})
+    logged = given.get("log_directory") or own_logs or os.getcwd()
+    batch_system = type(base.__name__, (base,), {"job_cls": Job, "refusals": refusals, "logged": logged})
     try:
         return batch_system(**given, silence_logs=logging.CRITICAL)
     except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
         raise SatIntervalsError(f"cluster {settings.kind}: {' '.join(str(error).split())}") from error
-
-
-def _suit_jobs(settings: Cluster, logs: Path) -> bool:
-    """Whether jobs can write there: they may not see the folder of a run whose tiles lie elsewhere."""
-    own = dask.config.get(f"jobqueue.{settings.kind}.log-directory", None)
-    in_script = not any(map(str.isspace, str(logs.absolute())))
-    return own is None and settings.store is None and in_script
 
 
 def job_script(settings: Cluster, out: Path) -> str:
@@ -214,6 +213,8 @@ class Jobs:
             raise SatIntervalsError(
                 f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
             )
+        if cluster.job_cls.config_name != "slurm" or _OTHER_CLUSTERS.search(cluster.job_header):
+            return
         patience = JOBS_GONE + parse_timedelta(dask.config.get("distributed.deploy.lost-worker-timeout"))
         if now - self._asked < _ASKED_EVERY:
             return
@@ -223,8 +224,7 @@ class Jobs:
         elif now - self._seen > patience:
             raise RunError(
                 "no job is in the queue any more: they were cancelled, or ended before their worker came, of which "
-                f"their logs in {next(iter(cluster.workers.values())).log_directory or os.getcwd()} tell; "
-                "the same command goes on from the tiles that are done"
+                f"their logs in {cluster.logged} tell; the same command goes on from the tiles that are done"
             )
 
 

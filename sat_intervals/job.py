@@ -63,7 +63,7 @@ class Job:
         }
 
     def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store for what decides the bytes of a tile; to be called while it is locked by `held`.
+        """Open the store for what decides the bytes of a tile; to be called while its place is locked.
 
         With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
         """

@@ -88,7 +88,7 @@ class Store:
     def open(
         self, manifest: Mapping[str, Any], *, overwrite: bool = False, is_mended: Callable[[], bool] = lambda: False
     ) -> None:
-        """Create the store, or go on with the one that is there; to be called while it is `locked`.
+        """Create the store, or go on with the one that is there; to be called while its place is locked.
 
         Parameters
         ----------
@@ -133,11 +133,10 @@ class Store:
             When it is another's.
         """
         there = self.folder.read(_MANIFEST)
-        changed = (
-            ["no manifest"] if there is None else _differences(json.loads(there), json.loads(json.dumps(manifest)))
-        )
-        if reasons := "; ".join(changed):
-            raise StoreError(f"{self.folder} holds the tiles of another run: {reasons}")
+        if there is None:
+            raise StoreError(f"{self.folder} holds the tiles of no run any more")
+        if changed := list(_differences(json.loads(there), json.loads(json.dumps(manifest)))):
+            raise StoreError(f"{self.folder} holds the tiles of another run: {'; '.join(changed)}")
 
     def _check_place(self, overwrite: bool) -> None:
         """Hold that the tiles of the run do not lie in another place, and note in which they do."""
@@ -150,7 +149,8 @@ class Store:
                 "go on, or none where there was none, --overwrite to start afresh"
             )
         if there != wanted:
-            _drop(folder_at(there))
+            with suppress(OSError):  # what cannot be reached stays
+                _drop(folder_at(there))
         if self.elsewhere:
             home.write(_PLACE, json.dumps(wanted))
         else:

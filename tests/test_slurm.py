@@ -79,7 +79,7 @@ def submitted(pair, folder: Path, status: int = 0, own: dict[str, object] | None
         process = subprocess.Popen(list(map(str, command)), stdout=log, stderr=subprocess.STDOUT, env=environment)
     try:
         yield process
-        assert process.wait(90) == status, (folder / "log").read_text()
+        assert process.wait(150) == status, (folder / "log").read_text()
         if status == 0:
             assert (folder / "log").read_text() == ""
     finally:
