@@ -20,6 +20,7 @@ def batch(
     overlap: int | None,
     workers: int | None,
     cluster: str | None,
+    store: str | None,
     keep_tiles: bool,
     overwrite: bool,
     quiet: bool,
@@ -34,7 +35,7 @@ def batch(
 
     rows = read_batch(pairs)
     with Console(quiet) as console:
-        given = overrides(None, tile_size, overlap, workers, cluster, cost)
+        given = overrides(None, tile_size, overlap, workers, cluster, cost, store)
         report = match_batch(
             rows,
             out,

@@ -24,6 +24,7 @@ def demo(
     overlap: int | None,
     workers: int | None,
     cluster: str | None,
+    store: str | None,
     quiet: bool,
     **run: Any,
 ) -> None:
@@ -54,9 +55,8 @@ def demo(
         ):
             write_once(out / f"{name}.tif", layer, nodata, somewhere, overwrite=run["overwrite"])
         console.progress("scene", 1, 1)
-        config = load_config(
-            config_file, overrides((scene.minimum, scene.maximum), tile_size, overlap, workers, cluster, cost)
-        )
+        given = overrides((scene.minimum, scene.maximum), tile_size, overlap, workers, cluster, cost, store)
+        config = load_config(config_file, given)
         report = match_pair(out / "left.tif", out / "right.tif", out, config, progress=console.progress, **run)
     console.summary(report, out)
     figures = evaluate_run(out, out / "truth.tif")["all"]

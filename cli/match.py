@@ -28,7 +28,10 @@ def run_options(command: Callable[..., Any]) -> Callable[..., Any]:
             metavar="SPEC",
             help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
         ),
-        click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles in OUT/tiles."),
+        click.option(
+            "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles until the run is finished."
+        ),
+        click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
         click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
         quiet_option,
         debug_option,
@@ -45,6 +48,7 @@ def overrides(
     workers: int | None = None,
     cluster: str | None = None,
     cost: str | None = None,
+    store: str | None = None,
 ) -> dict[str, Any]:
     """The settings that the command line gives, as sections."""
     minimum, maximum = disparity or (None, None)
@@ -57,6 +61,7 @@ def overrides(
             "workers": workers,
             "kind": "address" if is_address else cluster,
             "address": cluster if is_address else None,
+            "store": store,
         },
     }
     given = {
@@ -102,6 +107,7 @@ def match(
     overlap: int | None,
     workers: int | None,
     cluster: str | None,
+    store: str | None,
     keep_tiles: bool,
     overwrite: bool,
     quiet: bool,
@@ -121,11 +127,11 @@ def match(
 
     if disparity is None and config_file is None:
         raise click.UsageError("Missing search range: give --disparity MIN MAX, or a --config with it.")
-    config = load_config(config_file, overrides(disparity, tile_size, overlap, workers, cluster, cost))
+    config = load_config(config_file, overrides(disparity, tile_size, overlap, workers, cluster, cost, store))
     if dry_run:
         from sat_intervals.cluster import job_script
 
-        click.echo(job_script(config.cluster))
+        click.echo(job_script(config.cluster, out))
         return
     with Console(quiet) as console:
         from sat_intervals.raster import open_image

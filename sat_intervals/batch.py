@@ -15,13 +15,15 @@ import yaml
 
 from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
-from sat_intervals.config import Config, load_config
+from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.job import OUTPUTS, Job, compile_kernels, prepare
 from sat_intervals.raster import open_image
-from sat_intervals.run import check_failures, matched, measure_images
+from sat_intervals.run import check_failures, held, matched, measure_images
 
 _IMAGES = ("left", "right", "left_mask", "right_mask")
+# Completes settings whose search range the pairs bring.
+_ANY_RANGE = {"disparity": {"minimum": 0, "maximum": 0}}
 
 
 @dataclass(frozen=True)
@@ -118,10 +120,13 @@ def match_batch(
     jobs: list[Job] = []
     names: dict[int, str] = {}
     out.mkdir(parents=True, exist_ok=True)
+    cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
     with ExitStack() as stack:
+        progress = stack.enter_context(held(cluster.store, progress))
         for pair in pairs:
             try:
-                job = _begun(pair, out, config, overrides, overwrite, stack)
+                settings = _settings(pair, config, overrides, cluster)
+                job = _begun(pair, out, settings, overwrite, stack)
             except (SatIntervalsError, OSError) as error:
                 ended[pair.name] = {"state": "failed", "error": str(error)}
                 continue
@@ -130,23 +135,22 @@ def match_batch(
             else:
                 names[id(job)] = pair.name
                 jobs.append(job)
-        for name, end in _matched(jobs, names, keep_tiles, progress):
+        for name, end in _matched(jobs, names, out, cluster, keep_tiles, progress):
             ended[name] = end
     report = {pair.name: ended[pair.name] for pair in pairs}
     (out / "batch.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     return report
 
 
-def _begun(
-    pair: PairOfBatch,
-    out: Path,
-    config: Any,
-    overrides: Mapping[str, Any] | None,
-    overwrite: bool,
-    stack: ExitStack,
-) -> Job | None:
-    """The job of a pair, its store open and locked; None where the pair was matched before with the same settings."""
+def _settings(pair: PairOfBatch, config: Any, overrides: Mapping[str, Any] | None, cluster: Cluster) -> Config:
+    """The settings of a pair, its tiles in a folder of its name where those of the batch lie elsewhere."""
     settings = load_config(config, {**(overrides or {}), **_merged(overrides or {}, pair.settings)})
+    store = cluster.store and f"{cluster.store.rstrip('/')}/{pair.name}"
+    return settings.model_copy(update={"cluster": settings.cluster.model_copy(update={"store": store})})
+
+
+def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job | None:
+    """The job of a pair, its store open and locked; None where the pair was matched before with the same settings."""
     folder = out / pair.name
     if not overwrite and all((folder / name).exists() for name in OUTPUTS):
         before = json.loads((folder / "run.json").read_text())["settings"]
@@ -154,7 +158,7 @@ def _begun(
             return None
     left, right = open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
     job = prepare(left, right, folder, settings, overwrite=overwrite)
-    stack.enter_context(job.store.locked())
+    stack.enter_context(held(job.store.home, lambda stage, done, total: None))
     job.begin(overwrite=overwrite)
     return job
 
@@ -167,7 +171,9 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
     }
 
 
-def _matched(jobs: list[Job], names: dict[int, str], keep_tiles: bool, progress: Progress) -> list[tuple[str, Any]]:
+def _matched(
+    jobs: list[Job], names: dict[int, str], out: Path, cluster: Cluster, keep_tiles: bool, progress: Progress
+) -> list[tuple[str, Any]]:
     """Match the tiles of all jobs and conclude each, in a thread of its own, while others are being matched."""
     if not jobs:
         return []
@@ -175,7 +181,7 @@ def _matched(jobs: list[Job], names: dict[int, str], keep_tiles: bool, progress:
         compile_kernels(config)
     waiting: list[tuple[Job, Future[dict[str, Any]]]] = []
     ended: list[tuple[str, Any]] = []
-    with ThreadPoolExecutor(1) as thread, connected(jobs[0].config.cluster) as client:
+    with ThreadPoolExecutor(1) as thread, connected(cluster, out) as client:
         measured = []
         for job in jobs:
             try:

@@ -2,19 +2,31 @@
 
 import logging
 import os
+import re
 import signal
+import subprocess
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster
+from dask.utils import parse_timedelta
+from distributed import Client, LocalCluster, Status
 from distributed.utils import silence_logging_cmgr
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
+
+# Seconds without a job in the queue after which none is waited for.
+JOBS_GONE = 30.0
+# Seconds from one look at the queue to the next, which is shared by many.
+_ASKED_EVERY = 10.0
+# Directives that send jobs where squeue does not look.
+_OTHER_CLUSTERS = re.compile(r"^#SBATCH (-M|--cluster)", re.MULTILINE)
 
 _LOOPBACK = "127.0.0.1"
 
@@ -29,8 +41,11 @@ logging.getLogger("asyncio").addFilter(_is_news)
 
 
 @contextmanager
-def connected(settings: Cluster) -> Iterator[Client]:
+def connected(settings: Cluster, out: Path) -> Iterator[Client]:
     """A client of the cluster that the settings name; closed, with what it started, at the end.
+
+    Jobs write their logs to ``out/logs`` where their tiles lie in ``out`` too, unless the user's dask configuration
+    names another folder.
 
     Raises
     ------
@@ -48,7 +63,7 @@ def connected(settings: Cluster) -> Iterator[Client]:
             with _undisturbed():
                 stack.close()
     else:
-        with _batch_system(settings) as cluster, Client(cluster) as client:
+        with _batch_system(settings, out / "logs") as cluster, Client(cluster) as client:
             # Adapting, even between equal bounds, submits a job again that ended before the run did; scaling does not.
             cluster.adapt(minimum_jobs=settings.jobs, maximum_jobs=settings.maximum_jobs or settings.jobs)
             yield client
@@ -104,7 +119,7 @@ def _undisturbed() -> Iterator[None]:
             signal.raise_signal(late)
 
 
-def _batch_system(settings: Cluster) -> Any:
+def _batch_system(settings: Cluster, logs: Path) -> Any:
     """The dask-jobqueue cluster of SLURM, PBS, LSF or SGE; what is not set comes from the user's dask configuration."""
     try:
         import dask_jobqueue
@@ -112,6 +127,7 @@ def _batch_system(settings: Cluster) -> Any:
         raise SatIntervalsError(
             f"cluster {settings.kind} needs dask-jobqueue: pip install sat-intervals[cluster]"
         ) from error
+    base: Any = getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")
     options = {
         "queue": settings.queue,
         "account": settings.account,
@@ -124,13 +140,30 @@ def _batch_system(settings: Cluster) -> Any:
     given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
     if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
         given["scheduler_options"] = {"dashboard_address": f"{_LOOPBACK}:0"}
+    own_logs = dask.config.get(f"jobqueue.{settings.kind}.log-directory", None)
+    # Jobs may not see the folder of a run whose tiles lie elsewhere, and their scripts take no spaces.
+    if own_logs is None and settings.store is None and not any(map(str.isspace, str(logs.absolute()))):
+        given["log_directory"] = str(logs.absolute())
+    refusals: list[str] = []
+
+    class Job(base.job_cls):  # type: ignore[misc]
+        async def start(self) -> None:
+            try:
+                await super().start()
+            except RuntimeError as error:  # which dask keeps to itself
+                refusals.append(str(error).rpartition("stderr:")[2])
+                self.status = Status.failed  # else it could not be closed
+                raise
+
+    logged = given.get("log_directory") or own_logs or os.getcwd()
+    batch_system = type(base.__name__, (base,), {"job_cls": Job, "refusals": refusals, "logged": logged})
     try:
-        return getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")(**given, silence_logs=logging.CRITICAL)
+        return batch_system(**given, silence_logs=logging.CRITICAL)
     except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
         raise SatIntervalsError(f"cluster {settings.kind}: {' '.join(str(error).split())}") from error
 
 
-def job_script(settings: Cluster) -> str:
+def job_script(settings: Cluster, out: Path) -> str:
     """The script of one job of a batch system, as it would be submitted.
 
     Raises
@@ -140,5 +173,67 @@ def job_script(settings: Cluster) -> str:
     """
     if settings.kind in ("threads", "processes", "address"):
         raise SatIntervalsError(f"cluster {settings.kind} submits no jobs: name slurm, pbs, lsf or sge")
-    with _batch_system(settings) as cluster:
-        return str(cluster.job_script())
+    new = [folder for folder in (out / "logs", out) if not folder.exists()]  # dask-jobqueue makes them
+    with _batch_system(settings, out / "logs") as cluster:
+        script = str(cluster.job_script())
+    for folder in new:
+        with suppress(OSError):
+            folder.rmdir()
+    return script
+
+
+class Jobs:
+    """The jobs that a client waits for, if it does, so that it does not wait for ever."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._seen = self._asked = time.monotonic()
+
+    def check(self) -> None:
+        """Raise where no worker is there and none will come; to be called every few seconds.
+
+        dask submits a job again that ended after its worker came, and no other. What becomes of jobs in the queue only
+        SLURM is asked.
+
+        Raises
+        ------
+        SatIntervalsError
+            When the batch system took no job.
+        RunError
+            When all jobs are gone.
+        """
+        cluster: Any = self._client.cluster
+        now = time.monotonic()
+        if not hasattr(cluster, "refusals"):
+            return
+        if self._client.nthreads():
+            self._seen = now
+            return
+        if cluster.refusals:
+            raise SatIntervalsError(
+                f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
+            )
+        if cluster.job_cls.config_name != "slurm" or _OTHER_CLUSTERS.search(cluster.job_header):
+            return
+        patience = JOBS_GONE + parse_timedelta(dask.config.get("distributed.deploy.lost-worker-timeout"))
+        if now - self._asked < _ASKED_EVERY:
+            return
+        self._asked = now
+        if _any_in_queue({job.job_id for job in cluster.workers.values()}):
+            self._seen = now
+        elif now - self._seen > patience:
+            raise RunError(
+                "no job is in the queue any more: they were cancelled, or ended before their worker came, of which "
+                f"their logs in {cluster.logged} tell; the same command goes on from the tiles that are done"
+            )
+
+
+def _any_in_queue(jobs: set[str]) -> bool:
+    """Whether SLURM has any of the jobs waiting or running; True where that cannot be told."""
+    try:
+        told = subprocess.run(
+            ["squeue", "--me", "--noheader", "--format=%A"], capture_output=True, text=True, check=True, timeout=60
+        )
+    except (OSError, subprocess.SubprocessError):
+        return True
+    return not jobs.isdisjoint(told.stdout.split())

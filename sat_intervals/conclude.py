@@ -28,7 +28,7 @@ Item = TypeVar("Item")
 STRIP_PIXELS = 1 << 20
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage ("kernels", "images", "tiles", "bands", "files"), how much of it is done, and how much in all."""
+"""Called with a stage ("lease", "kernels", "images", "tiles", "bands", "files"), how much of it is done, and of what."""
 
 
 def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
@@ -69,6 +69,7 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
         with timed(seconds, "files"):
             progress("files", 0, 1)
             writer.build()
+            progress("files", 0, 1)  # so that a run that is to end, or has lost its store, does so before it publishes
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
@@ -101,7 +102,7 @@ def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) 
     """An image without data is the user's mistake, and is told so."""
     missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
-        raise RunError(f"tiles {', '.join(missing)} are missing in {job.store.path}: run the same command again")
+        raise RunError(f"tiles {', '.join(missing)} are missing in {job.store.folder}: run the same command again")
     if searched:
         return
     usable = {side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")}

@@ -313,6 +313,9 @@ class Cluster(Section):
     queue: str | None = Field(None, description="of the batch system")
     account: str | None = Field(None, description="that jobs are charged to")
     directives: list[str] = Field([], description="a list of further directives of the job script, such as --exclusive")
+    store: str | None = Field(
+        None, description="folder or fsspec URL for tiles until the run is finished; null: in the folder of the run"
+    )
     retries: int = Field(2, ge=0, description="how often a tile that fails is tried again")
 
     @model_validator(mode="after")

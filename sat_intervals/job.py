@@ -54,22 +54,26 @@ class Job:
     out: Path
     inputs: dict[str, Any]
 
-    def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store for what decides the bytes of a tile; to be called while it is locked.
-
-        With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
-        """
-        manifest = {
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """All that decides the bytes of a tile."""
+        return {
             "version": version("sat-intervals"),
             "kernels": FINGERPRINT,
             "settings": self.config.model_dump(mode="json", exclude=_AFTER_THE_TILES),
             "inputs": self.inputs,
             "region": asdict(self.store.grid.region),
         }
+
+    def begin(self, *, overwrite: bool = False) -> None:
+        """Open the store for what decides the bytes of a tile; to be called while its place is locked.
+
+        With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
+        """
         if overwrite:
             for name in OUTPUTS:
                 (self.out / name).unlink(missing_ok=True)
-        self.store.open(manifest, overwrite=overwrite, is_mended=self._reads_what_was_read)
+        self.store.open(self.manifest, overwrite=overwrite, is_mended=self._reads_what_was_read)
 
     def _reads_what_was_read(self) -> bool:
         """Whether every tile that is done would read today the pixels that it was made of.
@@ -88,7 +92,7 @@ class Job:
     @property
     def waiting(self) -> int:
         """Number of tiles that are not done."""
-        return sum(not self.store.is_done(tile) for tile in self.store.grid)
+        return len(self.store.grid) - len(self.store.done())
 
 
 def prepare(
@@ -110,8 +114,15 @@ def prepare(
     _check_memory(config, region)
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
-    store = Store(out / "tiles", Grid(region, config.tiles.size), config.disparity.count, config.largest_ambiguity)
-    inputs = {"left": _described(left), "right": _described(right)}
+    store = Store(
+        out / "tiles",
+        Grid(region, config.tiles.size),
+        config.disparity.count,
+        config.largest_ambiguity,
+        config.cluster.store,
+    )
+    known = _known(store.inputs())
+    inputs = {"left": _described(left, known), "right": _described(right, known)}
     if isinstance(config.cost, Mccnn):
         inputs["weights"] = weights_identity(config.cost)
     return Job(left, right, config, store, out, inputs)
@@ -135,7 +146,8 @@ def check_output(out: Path, overwrite: bool) -> None:
     """Make the folder of a run, or tell why it cannot be used."""
     try:
         there = [name for name in OUTPUTS if (out / name).exists()]
-        if there and not overwrite:
+        # run.json is the last: without it, but with tiles, a run was killed between the names of its files
+        if there and not overwrite and ("run.json" in there or not (out / "tiles").exists()):
             raise SatIntervalsError(
                 f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite"
             )
@@ -190,12 +202,18 @@ def _check_memory(config: Config, region: Window) -> None:
         )
 
 
-def _described(image: Image) -> dict[str, Any]:
+def _known(inputs: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What a manifest says of the files of its inputs, by path."""
+    described = [file for image in inputs.values() for file in (image, *image["files"], image["mask"])]
+    return {file["path"]: file for file in described if file and "sha256" in file}
+
+
+def _described(image: Image, known: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """What run.json and the manifest say of an input."""
     crs = image.georeferencing.crs
     return {
-        **identity(image.path),
-        "files": [identity(file) for file in other_files(image)],
+        **identity(image.path, known),
+        "files": [identity(file, known) for file in other_files(image)],
         "height": image.height,
         "width": image.width,
         "band": image.band,
@@ -204,5 +222,5 @@ def _described(image: Image) -> dict[str, Any]:
         "crs": crs.to_string() if crs else None,
         "use_mask": image.use_mask,
         "alpha": image.alpha,
-        "mask": identity(image.mask) if image.mask else None,
+        "mask": identity(image.mask, known) if image.mask else None,
     }

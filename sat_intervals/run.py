@@ -1,18 +1,21 @@
 """All tiles of a pair, all pairs of a batch, a bounded number of them in flight."""
 
+import errno
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
-from distributed import Client, Future, KilledWorker, as_completed
+from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
-from sat_intervals.cluster import connected
+from sat_intervals.cluster import Jobs, connected
 from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
+from sat_intervals.folders import folder_at
 from sat_intervals.job import Job, compile_kernels, prepare
 from sat_intervals.normalization import Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
@@ -21,6 +24,8 @@ from sat_intervals.tiling import Tile, Window
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
 _LOOK_AGAIN = 2.0
+# Errors of a disk, or of a user's share of it.
+_FULL = errno.ENOSPC, errno.EDQUOT
 # Ends the key of a tile that is tried with no other in flight.
 _ALONE = "-alone"
 
@@ -43,14 +48,14 @@ def match_pair(
     left, right
         Paths, or images opened by `open_image` with a band, a no-data value or a mask.
     out
-        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``; tiles that are done are kept there until the
-        run is complete, and an interrupted call goes on from them.
+        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``; tiles that are done are kept there, or in
+        ``cluster.store``, until the run is complete, and an interrupted call goes on from them.
     config
         Settings, or what `load_config` makes them from; ``cluster`` says where tiles are matched.
     window
         Region of the left image; by default all of it.
     keep_tiles
-        Whether the raw products of the tiles stay in ``out``.
+        Whether the raw products of the tiles stay.
     overwrite
         Whether a run in ``out`` is replaced and tiles there are dropped.
     progress
@@ -70,7 +75,7 @@ def match_pair(
     seconds: dict[str, float] = {}
     with timed(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
-    with job.store.locked():
+    with held(job.store.home, progress), held(job.config.cluster.store, progress) as progress:
         job.begin(overwrite=overwrite)
         with timed(seconds, "kernels"):
             progress("kernels", 0, 1)
@@ -78,7 +83,7 @@ def match_pair(
             progress("kernels", 1, 1)
         with timed(seconds, "tiles"):
             if job.waiting:
-                with connected(job.config.cluster) as client:
+                with connected(job.config.cluster, job.out) as client:
                     with timed(seconds, "tiles.images"):
                         measure_images(client, job, progress)
                     progress("tiles", len(job.store.grid) - job.waiting, len(job.store.grid))
@@ -120,6 +125,27 @@ def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Sca
         return scale_of(client.gather(futures))
 
 
+@contextmanager
+def held(place: str | Path | None, progress: Progress) -> Iterator[Progress]:
+    """Keep every other run out of a folder or fsspec URL; the progress that it yields raises where that was in vain.
+
+    Raises
+    ------
+    SatIntervalsError
+        When another run is at work there, or the place cannot be used.
+    """
+    if place is None:
+        yield progress
+        return
+    with folder_at(place).locked(lambda: progress("lease", 0, 1)) as check:
+
+        def checked(stage: str, done: int, total: int) -> None:
+            check()
+            progress(stage, done, total)
+
+        yield checked
+
+
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
     """Raise a RunError that names every tile that failed, if there are any."""
     if failures:
@@ -151,9 +177,18 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
     total = sum(len(job.store.grid) for job in jobs)
     done = total - sum(left)
     yield from ((job, {}) for job, count in zip(jobs, left, strict=True) if count == 0)
-    waiting = ((i, tile) for i, job in enumerate(jobs) for tile in job.store.grid if not job.store.is_done(tile))
+    waiting = ((i, tile) for i, job in enumerate(jobs) for tile in _waiting(job))
     flight = _Flight(client, jobs, waiting)
-    for i, tile, error in flight:
+    for landed in flight:
+        if landed is None:
+            progress("tiles", done, total)
+            continue
+        i, tile, error = landed
+        if isinstance(error, OSError) and error.errno in _FULL:  # no other tile would fare better
+            raise RunError(
+                f"{error.filename or jobs[i].store.folder}: {error.strerror}: make room and run the same command "
+                "again, it goes on from the tiles that are done"
+            )
         if error is not None:
             failures[i][tile.name] = error
             jobs[i].store.write_failure(tile.name, _reason(error))
@@ -164,8 +199,15 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
             yield jobs[i], failures[i]
 
 
+def _waiting(job: Job) -> Iterator[Tile]:
+    done = job.store.done()
+    return (tile for tile in job.store.grid if tile.name not in done)
+
+
 class _Flight:
     """Tiles on their way through a cluster; iterates over those that land: job number, tile, error or None.
+
+    Where none lands for a while, None comes in its place, so that whoever waits can look around.
 
     dask blames a worker's death on every tile that it held. Those blamed too often are tried again at the end, one at a
     time, so that no tile fails for another.
@@ -173,16 +215,24 @@ class _Flight:
 
     def __init__(self, client: Client, jobs: Sequence[Job], waiting: Iterator[tuple[int, Tile]]) -> None:
         self._client, self._jobs, self._waiting = client, jobs, waiting
-        self._landing = as_completed()
-        self._tiles: dict[str, tuple[int, Tile]] = {}
+        self._landed: SimpleQueue[Future[None]] = SimpleQueue()
+        self._tiles: dict[str, tuple[int, Tile, Future[None]]] = {}
         self._suspects: list[tuple[int, Tile]] = []
+        self._watch = Jobs(client)
         self._width, self._looked = 2, float("-inf")
 
-    def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None]]:
+    def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None] | None]:
         self._fill()
-        for future in self._landing:
-            error, key = _landed(future), str(future.key)
-            i, tile = self._tiles.pop(key)
+        while self._tiles:
+            try:
+                future = self._landed.get(timeout=_LOOK_AGAIN)
+            except Empty:
+                self._fill()
+                self._watch.check()
+                yield None
+                continue
+            error, key = _ended_with(future), str(future.key)
+            i, tile, _ = self._tiles.pop(key)
             future.release()
             blamed = isinstance(error, KilledWorker) and not key.endswith(_ALONE)
             if blamed:
@@ -209,11 +259,11 @@ class _Flight:
         job, key = self._jobs[i], f"match-{i}-{tile.name}{suffix}"
         with _scheduler_needed():
             future = self._client.submit(match_tile, job, tile, key=key, retries=job.config.cluster.retries, pure=False)
-        self._tiles[key] = i, tile
-        self._landing.add(future)
+        self._tiles[key] = i, tile, future
+        future.add_done_callback(self._landed.put)
 
 
-def _landed(future: Future[None]) -> BaseException | None:
+def _ended_with(future: Future[None]) -> BaseException | None:
     """What a future ended with."""
     with _scheduler_needed():
         error: BaseException | None = future.exception()

@@ -6,14 +6,11 @@ bytes; a store with another manifest is never mixed in.
 """
 
 import errno
-import fcntl
 import json
 import math
 import os
-import shutil
-import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +21,7 @@ import zarr
 from zarr.codecs import BloscCodec
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.folders import Folder, folder_at
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tiling import Grid, Tile, Window
 
@@ -40,8 +38,10 @@ SIDES = ("top", "bottom", "left", "right")
 # The raw products that neighbours compare along a seam.
 SEAM_PRODUCTS = ("winner", "lower", "upper")
 
-_MANIFEST, _LOCK, _RECORDS, _FAILURES = "manifest.json", ".lock", "records", "failures"
+_MANIFEST, _ARRAYS, _RECORDS, _FAILURES = "manifest.json", "arrays.zarr", "records", "failures"
 _NORMALIZATION = "normalization.json"
+# In the folder of the run where its tiles lie elsewhere: it says where.
+_PLACE = "store.json"
 
 # Rows of a shard that are compressed together, so that strips read no more than they need.
 _ROWS_TOGETHER = 128
@@ -54,53 +54,42 @@ class StoreError(SatIntervalsError):
 
 @dataclass(frozen=True)
 class Store:
-    """The tiles of one run under a folder; picklable, so that every worker writes for itself.
+    """The tiles of one run; picklable, so that every worker writes for itself.
 
     Attributes
     ----------
-    path
-        The folder.
+    home
+        Folder of the run that the tiles belong to.
     grid
         The tiles.
     count
         Number of disparities of the search range.
     ambiguities
         Largest ambiguity a pixel can have.
+    elsewhere
+        Folder or fsspec URL where the tiles lie; by default ``home``.
     """
 
-    path: Path
+    home: Path
     grid: Grid
     count: int
     ambiguities: int
+    elsewhere: str | None = None
+
+    @property
+    def folder(self) -> Folder:
+        """Where the tiles lie."""
+        return folder_at(self.elsewhere or self.home)
 
     @property
     def _reach(self) -> int:
         """Columns of the right view that a core sees."""
         return self.grid.size + self.count - 1
 
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep every other run out of the folder, until the block ends or this process dies.
-
-        Raises
-        ------
-        StoreError
-            When another run is at work there.
-        """
-        self.path.mkdir(parents=True, exist_ok=True)
-        with (self.path / _LOCK).open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise StoreError(
-                    f"another run is at work in {self.path.parent}: wait for its end or choose another folder"
-                ) from error
-            yield
-
     def open(
         self, manifest: Mapping[str, Any], *, overwrite: bool = False, is_mended: Callable[[], bool] = lambda: False
     ) -> None:
-        """Create the store, or go on with the one that is there; to be called while it is `locked`.
+        """Create the store, or go on with the one that is there; to be called while its place is locked.
 
         Parameters
         ----------
@@ -117,36 +106,73 @@ class Store:
         StoreError
             When the store that is there was begun with other settings, inputs or versions.
         """
-        file = self.path / _MANIFEST
-        wanted = json.loads(json.dumps(manifest))
-        if file.exists() and not overwrite:
-            try:
-                there = json.loads(file.read_text())
-            except ValueError as error:
-                raise StoreError(f"{file} cannot be read, {error}: --overwrite starts afresh") from error
-            changed = list(_differences(there, wanted))
-            mendable = bool(self.failures()) and _without_content(there) == _without_content(wanted)
-            if changed and mendable and is_mended():
-                _write_whole(file, json.dumps(manifest, indent=1))
+        self._check_place(overwrite)
+        folder, text = self.folder, json.dumps(manifest, indent=1)
+        before = None if overwrite else folder.read(_MANIFEST)
+        if before is not None:
+            changed = list(_differences(_parsed(before, folder), json.loads(text)))
+            if changed and self._is_mendable(before, text) and is_mended():
+                folder.write(_MANIFEST, text)
             elif changed:
                 raise StoreError(
-                    f"{self.path} holds the tiles of another run: {'; '.join(changed)} "
+                    f"{folder} holds the tiles of another run: {'; '.join(changed)} "
                     "(use the same settings and inputs to go on, --overwrite to start afresh)"
                 )
             return
-        file.unlink(missing_ok=True)  # first: without it nothing of the rest counts
-        (self.path / _NORMALIZATION).unlink(missing_ok=True)
-        for folder in (self._arrays, self.path / _RECORDS, self.path / _FAILURES):
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
+        _drop(folder)
+        folder.make(_RECORDS)
+        folder.make(_FAILURES)
         self._create_arrays()
-        _write_whole(file, json.dumps(manifest, indent=1))
+        folder.write(_MANIFEST, text)
+
+    def check(self, manifest: Mapping[str, Any]) -> None:
+        """Hold that the store is that of a run still: a worker may outlive its run and find the next in its place.
+
+        Raises
+        ------
+        StoreError
+            When it is another's.
+        """
+        there = self.folder.read(_MANIFEST)
+        if there is None:
+            raise StoreError(f"{self.folder} holds the tiles of no run any more")
+        if changed := list(_differences(json.loads(there), json.loads(json.dumps(manifest)))):
+            raise StoreError(f"{self.folder} holds the tiles of another run: {'; '.join(changed)}")
+
+    def _check_place(self, overwrite: bool) -> None:
+        """Hold that the tiles of the run do not lie in another place, and note in which they do."""
+        home, wanted = folder_at(self.home), str(self.folder)
+        noted = home.read(_PLACE)
+        there = json.loads(noted) if noted else str(home) if home.read(_MANIFEST) else wanted
+        if there != wanted and not overwrite:
+            raise StoreError(
+                f"the tiles of the run in {self.home.parent} lie in {there}, not in {wanted}: give the same --store to "
+                "go on, or none where there was none, --overwrite to start afresh"
+            )
+        if there != wanted:
+            with suppress(OSError):  # what cannot be reached stays
+                _drop(folder_at(there))
+        if self.elsewhere:
+            home.write(_PLACE, json.dumps(wanted))
+        else:
+            home.delete(_PLACE)
+
+    def _is_mendable(self, there: str, wanted: str) -> bool:
+        """Whether tiles failed, and nothing but the content of the inputs changed since."""
+        return bool(self.failures()) and _without_content(json.loads(there)) == _without_content(json.loads(wanted))
+
+    def inputs(self) -> dict[str, Any]:
+        """What the manifest that is there says of the inputs; nothing where it cannot be read."""
+        try:
+            return dict(json.loads(self.folder.read(_MANIFEST) or "{}").get("inputs", {}))
+        except (OSError, AttributeError, TypeError, ValueError):
+            return {}
 
     def _create_arrays(self) -> None:
         size, height = self.grid.size, self.grid.rows * self.grid.size
         width = self.grid.columns * size
         together = math.gcd(size, _ROWS_TOGETHER)
-        group = zarr.create_group(self._arrays)
+        group = zarr.create_group(self.folder.place(_ARRAYS), zarr_format=3)
         for name, dtype in PIXEL_ARRAYS.items():
             _create(group, name, (height, width), (size, size), (together, size), dtype)
         right = height, self.grid.columns * self._reach
@@ -158,19 +184,12 @@ class Store:
         counts = self.ambiguities + 1
         _create(group, "histogram", (self.grid.rows, self.grid.columns, counts), None, (1, 1, counts), np.uint32)
 
-    @property
-    def _arrays(self) -> Path:
-        return self.path / "arrays.zarr"
-
     def _array(self, name: str, mode: Literal["r", "r+"] = "r") -> zarr.Array[Any]:
-        return zarr.open_array(self._arrays / name, mode=mode)
+        return zarr.open_array(self.folder.place(f"{_ARRAYS}/{name}"), mode=mode, zarr_format=3)
 
-    def _record_file(self, tile: Tile) -> Path:
-        return self.path / _RECORDS / f"{tile.name}.json"
-
-    def is_done(self, tile: Tile) -> bool:
-        """Whether the tile is complete."""
-        return self._record_file(tile).exists()
+    def done(self) -> set[str]:
+        """Names of the tiles that are complete."""
+        return self.folder.names(_RECORDS)
 
     def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
         """Write what a tile leaves behind.
@@ -194,40 +213,39 @@ class Store:
 
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
-        _write_whole(self._record_file(tile), json.dumps(record))
+        self.folder.write(f"{_RECORDS}/{tile.name}.json", json.dumps(record))
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Keep what was measured of the whole images, so that all tiles of the run agree on it, whenever matched."""
-        _write_whole(self.path / _NORMALIZATION, json.dumps(normalization))
+        self.folder.write(_NORMALIZATION, json.dumps(normalization))
 
     def normalization(self) -> dict[str, Any] | None:
         """What `write_normalization` kept; None where nothing was measured."""
-        file = self.path / _NORMALIZATION
-        return json.loads(file.read_text()) if file.exists() else None
+        kept = self.folder.read(_NORMALIZATION)
+        return None if kept is None else dict(json.loads(kept))
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
         with suppress(OSError):  # a full disk is reason enough for a tile to fail, but not for the run to end at once
-            _write_whole(self.path / _FAILURES / f"{tile}.json", json.dumps(reason))
+            self.folder.write(f"{_FAILURES}/{tile}.json", json.dumps(reason))
 
     def failures(self) -> dict[str, str]:
         """Why tiles failed that are not done since, by name."""
-        files = sorted((self.path / _FAILURES).glob("[0-9]*.json"))
-        return {
-            file.stem: json.loads(file.read_text()) for file in files if not (self.path / _RECORDS / file.name).exists()
-        }
+        reasons, done = self.folder.read_all(_FAILURES), self.done()
+        return {name: json.loads(reasons[name]) for name in sorted(reasons) if name not in done}
 
     def check_space(self, tile: Tile) -> None:
         """Raise an OSError where the disk has no room for what a tile leaves behind, before work is put in."""
         pixel = sum(np.dtype(dtype).itemsize for dtype in PIXEL_ARRAYS.values())
         needed = tile.core.height * (tile.core.width * pixel + (tile.core.width + self.count - 1) * 4)
-        if shutil.disk_usage(self.path).free < needed:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
+        free = self.folder.free_bytes()
+        if free is not None and free < needed:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
 
     def records(self) -> dict[str, dict[str, Any]]:
         """The records of the tiles that are done, by name."""
-        files = ((tile.name, self._record_file(tile)) for tile in self.grid)
-        return {name: json.loads(file.read_text()) for name, file in files if file.exists()}
+        texts = self.folder.read_all(_RECORDS)
+        return {tile.name: json.loads(texts[tile.name]) for tile in self.grid if tile.name in texts}
 
     def histogram(self) -> np.ndarray:
         """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``."""
@@ -268,14 +286,9 @@ class Store:
         return merged
 
     def remove(self) -> None:
-        """Delete the store, and nothing else that may be in its folder."""
-        (self.path / _MANIFEST).unlink(missing_ok=True)  # first: without it nothing of the rest counts
-        for folder in (self._arrays, self.path / _RECORDS, self.path / _FAILURES):
-            shutil.rmtree(folder, ignore_errors=True)
-        for name in (_NORMALIZATION, _LOCK):
-            (self.path / name).unlink(missing_ok=True)
-        with suppress(OSError):
-            self.path.rmdir()
+        """Delete the tiles, and nothing else that may be in their folder."""
+        _drop(self.folder)
+        folder_at(self.home).delete(_PLACE)
 
 
 @dataclass(frozen=True)
@@ -298,26 +311,43 @@ class Status:
     running: bool
 
 
-def read_status(path: Path) -> Status:
+def read_status(home: Path) -> Status:
     """How far a run is, from its store alone.
+
+    Parameters
+    ----------
+    home
+        Folder of the tiles in that of the run, wherever they lie.
 
     Raises
     ------
     StoreError
         Where there is no store.
     """
-    if not (path / _MANIFEST).exists():
-        raise StoreError(f"{path.parent} holds no run that began: name the folder given to match")
-    manifest = json.loads((path / _MANIFEST).read_text())
+    here = folder_at(home)
+    place = here.read(_PLACE)
+    folder = folder_at(json.loads(place)) if place else here
+    text = folder.read(_MANIFEST)
+    if text is None:
+        raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")
+    manifest = _parsed(text, folder)
     grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
-    done = {file.stem for file in (path / _RECORDS).glob("[0-9]*.json")}
-    store = Store(path, grid, 1, 0)
+    store = Store(home, grid, 1, 0, str(folder) if place else None)
+    return Status(len(grid), len(store.done()), store.failures(), here.is_locked() or folder.is_locked())
+
+
+def _parsed(manifest: str, folder: Folder) -> dict[str, Any]:
     try:
-        with store.locked():
-            running = False
-    except StoreError:
-        running = True
-    return Status(len(grid), len(done), store.failures(), running)
+        return dict(json.loads(manifest))
+    except ValueError as error:
+        raise StoreError(f"{folder}/{_MANIFEST} cannot be read, {error}: --overwrite starts afresh") from error
+
+
+def _drop(folder: Folder) -> None:
+    """Delete the tiles in a folder."""
+    # The manifest first: without it nothing of the rest counts.
+    for name in (_MANIFEST, _ARRAYS, _RECORDS, _FAILURES, _NORMALIZATION):
+        folder.delete(name)
 
 
 def _create(
@@ -333,16 +363,6 @@ def _create(
         name, shape=shape, shards=shard, chunks=chunk, dtype=dtype,
         compressors=_COMPRESSOR, fill_value=fill.get(name, NO_DISPARITY),
     )  # fmt: skip
-
-
-def _write_whole(file: Path, text: str) -> None:
-    """Write a file that is either there as a whole or not at all."""
-    temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
-    try:
-        temporary.write_text(text)
-        os.replace(temporary, file)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
@@ -365,6 +385,8 @@ def _without_content(manifest: Mapping[str, Any]) -> dict[str, Any]:
             return [without(value) for value in there]
         if not isinstance(there, dict):
             return there
-        return {key: without(value) for key, value in there.items() if key not in ("bytes", "modified", "sha256")}
+        return {
+            key: without(value) for key, value in there.items() if key not in ("bytes", "modified", "sha256", "etag")
+        }
 
     return {**manifest, "inputs": without(manifest["inputs"])}

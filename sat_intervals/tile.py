@@ -71,7 +71,9 @@ def _match_tile(job: Job, tile: Tile) -> None:
     patch = match_patch(*readers, tile.core, grid.region, image, config, scales)
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with timed(seconds, "write"):
-        job.store.write_arrays(tile, _left_behind(patch, tile, job))
+        left_behind = _left_behind(patch, tile, job)
+        job.store.check(job.manifest)
+        job.store.write_arrays(tile, left_behind)
     job.store.write_record(tile, {"usable_pixels": usable, "pixels_read": pixels_read, "seconds": seconds})
 
 

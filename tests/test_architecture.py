@@ -25,6 +25,7 @@ FLOORS = [
     {"finish", "patch", "demo", "results"},
     {"similarity", "store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
     {"config", "features", "kernels", "normalization", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
+    {"folders"},
     {"tiling", "products", "errors", "configs"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -35,6 +36,7 @@ HOMES = {
     "dask": {"cluster"},
     "dask_jobqueue": {"cluster"},
     "distributed": {"cluster", "run"},
+    "fsspec": {"folders"},
     "llvmlite": {"kernels"},
     "matplotlib": {"pictures"},
     "numba": {"kernels"},

@@ -11,9 +11,11 @@ import rasterio
 from sat_intervals import match_arrays, match_pair, run
 from sat_intervals.config import load_config
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.job import prepare
 from sat_intervals.products import INVALID, NO_DATA
 from sat_intervals.raster import open_image, read_window
 from sat_intervals.scene import make_scene
+from sat_intervals.tile import match_tile
 from sat_intervals.tiling import Window
 
 
@@ -126,7 +128,7 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
     left, right, settings = pair
     settings = in_tiles(settings, 128, overlap=20)
     match_pair(left, right, tmp_path / "undisturbed", settings)
-    log, match_tile = tmp_path / "log", run.match_tile
+    log = tmp_path / "log"
 
     def fail_once(job, tile):
         with log.open("a") as file:
@@ -158,6 +160,37 @@ def test_match_pair__never_mixes_runs(pair, tmp_path):
     with pytest.raises(SatIntervalsError, match=r"settings\.sgm\.p1 was 8, now 7"):
         match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}))
     match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}), overwrite=True)
+
+
+def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_path):
+    left, right, settings = pair
+    before = prepare(left, right, tmp_path, in_tiles(settings, 128))
+    before.begin()
+    tile = next(iter(before.store.grid))
+    match_tile(before, tile)
+    now = prepare(left, right, tmp_path, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}))
+    now.begin(overwrite=True)
+    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: settings\.sgm\.p1 was 7, now 8"):
+        match_tile(before, tile)
+    assert now.store.done() == set()
+    assert not list((tmp_path / "tiles" / "arrays.zarr" / "winner").glob("c/*/*"))
+    now.store.remove()
+    with pytest.raises(SatIntervalsError, match="holds the tiles of no run any more"):
+        match_tile(before, tile)
+    assert not (tmp_path / "tiles" / "arrays.zarr").exists()
+
+
+@pytest.mark.parametrize("store", ["elsewhere", "memory://tiles"])
+def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path, store):
+    left, right, settings = pair
+    settings = in_tiles(settings, 128)
+    match_pair(left, right, tmp_path / "here", settings)
+    store = store if "://" in store else f"file://{tmp_path}/{store}"
+    match_pair(left, right, tmp_path / "out", settings | {"cluster": {"store": store}})
+    for name in ("intervals.tif", "validity.tif"):
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "out"]
 
 
 def test_match_pair__says_which_image_is_empty(pair, tmp_path):

@@ -5,9 +5,7 @@ import shutil
 import signal
 import subprocess
 import sysconfig
-import tempfile
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -63,31 +61,31 @@ def pair(tmp_path_factory):
 
 
 @contextmanager
-def submitted(pair, folder: Path, **cluster: object) -> Iterator[subprocess.Popen]:
-    """``match --cluster slurm`` with one job, under a user's own dask configuration."""
+def submitted(pair, folder: Path, status: int = 0, own: dict[str, object] | None = None, **cluster: object):
+    """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration."""
     images, settings = pair
+    folder.mkdir(exist_ok=True)
     job = {"jobs": 1, "cores": 1, "memory": "2GB", "walltime": "00:05:00"} | cluster
     (folder / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": job}))
     own = {
         "JOBQUEUE__SLURM__INTERFACE": "lo",
-        "JOBQUEUE__SLURM__LOG_DIRECTORY": str(folder),
         "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
         "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
-    }
+    } | (own or {})
     command = [SCRIPTS / "sat-intervals", "match", images / "left.tif", images / "right.tif", folder / "out"]
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
-    with tempfile.TemporaryFile("w+") as log:
-        environment = os.environ | {f"DASK_{name}": value for name, value in own.items()}
+    with (folder / "log").open("w") as log:
+        environment = os.environ | {f"DASK_{name}": str(value) for name, value in own.items()}
         process = subprocess.Popen(list(map(str, command)), stdout=log, stderr=subprocess.STDOUT, env=environment)
-        try:
-            yield process
-            status = process.wait(60)
-            log.seek(0)
-            assert (status, log.read()) == (0, "")
-        finally:
-            process.kill()
-            process.wait()
-            subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
+    try:
+        yield process
+        assert process.wait(150) == status, (folder / "log").read_text()
+        if status == 0:
+            assert (folder / "log").read_text() == ""
+    finally:
+        process.kill()
+        process.wait()
+        subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
 
 
 def wait_until(holds, what: str, seconds: float) -> None:
@@ -103,9 +101,9 @@ def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
     assert process.poll() is None, "ended before it was disturbed"
 
 
-def jobs() -> set[str]:
-    """The jobs that run."""
-    command = ["squeue", "--noheader", "--states", "RUNNING", "--format", "%A"]
+def jobs(state: str = "RUNNING") -> set[str]:
+    """The jobs that run, or wait."""
+    command = ["squeue", "--noheader", "--states", state, "--format", "%A"]
     return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.split())
 
 
@@ -122,14 +120,15 @@ def workers(folder: Path) -> list[psutil.Process]:
 def assert_complete(pair, out: Path) -> None:
     for name in ("intervals.tif", "validity.tif"):
         assert (out / name).read_bytes() == (pair[0] / "undisturbed" / name).read_bytes(), name
-    assert sorted(path.name for path in out.iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+    assert {path.name for path in out.iterdir()} - {"logs"} == {"intervals.tif", "run.json", "validity.tif"}
 
 
 def test_match__goes_on_in_a_new_job_after_scancel(slurm, pair, tmp_path):
-    with submitted(pair, tmp_path) as process:
+    with submitted(pair, tmp_path, own={"JOBQUEUE__SLURM__LOG_DIRECTORY": tmp_path / "own-logs"}) as process:
         wait_for_tiles(process, tmp_path, 5)
         (job,) = jobs()
         subprocess.run(["scancel", job], check=True, timeout=30)
+    assert list((tmp_path / "own-logs").glob("*.err"))
     assert_complete(pair, tmp_path / "out")
     wait_until(lambda: not jobs(), "end of the jobs", 40)
 
@@ -143,3 +142,35 @@ def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_pat
         wait_until(lambda: job not in jobs(), "end of the job's time", 130)
         assert process.poll() is None
     assert_complete(pair, tmp_path / "out")
+
+
+def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
+    images, settings = pair
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
+    command = [SCRIPTS / "sat-intervals", "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
+    command += ["--config", tmp_path / "settings.yaml", "--cluster", "slurm", "--dry-run"]
+    script = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert {"#SBATCH --cpus-per-task=2", "#SBATCH --mem=3G"} <= set(script)
+    assert f"#SBATCH -e {tmp_path}/out/logs/dask-worker-%J.err" in script
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.yaml"]
+
+
+def test_match__ends_when_no_worker_can_come(slurm, pair, tmp_path):
+    cancelled, broken, refused = (tmp_path / name for name in ("cancelled", "broken", "refused"))
+    errors = broken / "out" / "logs"
+    with submitted(pair, broken, 1, {"JOBQUEUE__SLURM__PYTHON": "/no/python"}):
+        wait_until(lambda: any("/no/python" in file.read_text() for file in errors.glob("*.err")), "end of the job", 60)
+        with submitted(pair, refused, 2, queue="nowhere"):
+            pass
+        with submitted(pair, cancelled, 1, directives=["--begin=now+1hour"]):
+            wait_until(lambda: jobs("PENDING"), "job", 60)
+            (job,) = jobs("PENDING")
+            subprocess.run(["scancel", job], check=True, timeout=30)
+    for folder in (cancelled, broken):
+        log = (folder / "log").read_text()
+        assert "no job is in the queue any more: they were cancelled, or ended before their worker came" in log
+        assert str(folder / "out" / "logs") in log
+        assert len(log.splitlines()) == 1
+    log = (refused / "log").read_text()
+    assert log.startswith("sat-intervals: the batch system refuses the job: sbatch: error: invalid partition specified")
+    assert len(log.splitlines()) == 1

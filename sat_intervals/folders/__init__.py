@@ -1,0 +1,62 @@
+"""Places where a run leaves small texts and arrays: folders of this machine, prefixes of any fsspec file system."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Protocol
+
+from sat_intervals.folders.local import LocalFolder
+from sat_intervals.folders.remote import RemoteFolder, object_tag
+
+__all__ = ["Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
+
+
+class Folder(Protocol):
+    """What a store needs of the place where it lies; names are relative to it, with ``/`` between their parts."""
+
+    def read(self, name: str) -> str | None:
+        """Text of a file, None where there is none."""
+
+    def read_all(self, folder: str) -> dict[str, str]:
+        """Texts of the JSON files in a folder, by name without ending."""
+
+    def names(self, folder: str) -> set[str]:
+        """Names, without ending, of the JSON files in a folder."""
+
+    def write(self, name: str, text: str) -> None:
+        """Write a file that is either there as a whole or not at all."""
+
+    def delete(self, name: str) -> None:
+        """Delete a file, or a folder with all that is in it, if it is there."""
+
+    def make(self, folder: str) -> None:
+        """Make a folder, where folders must be made."""
+
+    def place(self, name: str) -> Path | str:
+        """What zarr finds a name by."""
+
+    def free_bytes(self) -> int | None:
+        """Room that is left, None where nobody can tell."""
+
+    def locked(self, waiting: Callable[[], None] = ...) -> AbstractContextManager[Callable[[], None]]:
+        """Keep every other run out until the block ends.
+
+        What is yielded is to be called now and then: it raises a RunError when the lock is no longer this run's.
+        ``waiting`` is called where it must be seen first whether the run that holds the lock lives.
+
+        Raises
+        ------
+        SatIntervalsError
+            When another run is at work there, or the place cannot be used.
+        """
+
+    def is_locked(self) -> bool:
+        """Whether a run is at work there."""
+
+
+def folder_at(place: str | Path) -> Folder:
+    """The folder of a path or a URL."""
+    protocol, _, path = str(place).rpartition("://")
+    if protocol in ("", "file", "local"):
+        return LocalFolder(Path(path).absolute())
+    return RemoteFolder(str(place).rstrip("/"))

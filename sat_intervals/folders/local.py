@@ -1,0 +1,106 @@
+"""A folder of this machine, or of a disk that it shares with others."""
+
+import fcntl
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from sat_intervals.errors import SatIntervalsError
+
+_LOCK = ".lock"
+
+
+@dataclass(frozen=True)
+class LocalFolder:
+    """See `Folder`; files get their names when they are whole, and the lock is the operating system's."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        """How users call it."""
+        return str(self.path)
+
+    def read(self, name: str) -> str | None:
+        """See `Folder`."""
+        try:
+            return (self.path / name).read_text()
+        except FileNotFoundError:
+            return None
+
+    def read_all(self, folder: str) -> dict[str, str]:
+        """See `Folder`."""
+        return {file.stem: file.read_text() for file in self._files(folder)}
+
+    def names(self, folder: str) -> set[str]:
+        """See `Folder`."""
+        return {file.stem for file in self._files(folder)}
+
+    def _files(self, folder: str) -> Iterator[Path]:
+        return (self.path / folder).glob("[!.]*.json")
+
+    def write(self, name: str, text: str) -> None:
+        """See `Folder`."""
+        file = self.path / name
+        temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
+        try:
+            temporary.write_text(text)
+            os.replace(temporary, file)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def delete(self, name: str) -> None:
+        """See `Folder`."""
+        if (self.path / name).is_dir():
+            shutil.rmtree(self.path / name, ignore_errors=True)
+        else:
+            (self.path / name).unlink(missing_ok=True)
+
+    def make(self, folder: str) -> None:
+        """See `Folder`."""
+        (self.path / folder).mkdir(parents=True, exist_ok=True)
+
+    def place(self, name: str) -> Path:
+        """See `Folder`."""
+        return self.path / name
+
+    def free_bytes(self) -> int:
+        """See `Folder`."""
+        return shutil.disk_usage(self.path).free
+
+    @contextmanager
+    def locked(self, waiting: Callable[[], None] = lambda: None) -> Iterator[Callable[[], None]]:
+        """See `Folder`; the lock dies with its process, and a folder that is then empty goes."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock = (self.path / _LOCK).open("w")
+        except OSError as error:
+            raise SatIntervalsError(f"{self} cannot be written: {error.strerror}: choose another folder") from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise SatIntervalsError(
+                    f"another run is at work in {self}: wait for its end or choose another folder"
+                ) from error
+            try:
+                yield lambda: None
+            finally:
+                if os.listdir(self.path) == [_LOCK]:
+                    (self.path / _LOCK).unlink(missing_ok=True)
+                    with suppress(OSError):
+                        self.path.rmdir()
+
+    def is_locked(self) -> bool:
+        """See `Folder`."""
+        try:
+            with (self.path / _LOCK).open() as lock:
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return False
+        except BlockingIOError:
+            return True
+        return False

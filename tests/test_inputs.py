@@ -1,0 +1,157 @@
+"""Which file an input is, and inputs on a web server: read window by window, known by size and ETag."""
+
+import hashlib
+import os
+import re
+import subprocess
+import sysconfig
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+import rasterio
+
+from sat_intervals import match_pair
+from sat_intervals.inputs import identity
+from sat_intervals.scene import make_scene
+from sat_intervals.tiling import Window
+
+COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
+OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
+SIDE = 1024
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Files of the server's folder in byte ranges, with the ETag of their bytes."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def do_GET(self) -> None:
+        file = self.server.folder / self.path[1:]
+        content = file.read_bytes() if file.is_file() else b""
+        asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
+        first, last = (int(asked[1]), int(asked[2] or len(content))) if asked else (0, len(content))
+        body = content[first : last + 1]
+        self.send_response(404 if not content else 206 if asked else 200)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Accept-Ranges", "bytes")
+        self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
+        if asked:
+            self.send_header("Content-Range", f"bytes {first}-{first + len(body) - 1}/{len(content)}")
+        self.end_headers()
+        if self.command == "GET":
+            self.server.sent.append((self.path[1:], len(body)))
+            self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def server(tmp_path) -> Iterator[ThreadingHTTPServer]:
+    """A web server on loopback of the folder ``server.folder``; what it sent of which file is in ``server.sent``."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        server.folder, server.sent = tmp_path / "web", []
+        server.folder.mkdir()
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def images() -> dict[str, bytes]:
+    """Content of left.tif and right.tif, tiled, not compressed."""
+    scene = make_scene(SIDE, SIDE, seed=5)
+    profile = {"driver": "GTiff", "height": SIDE, "width": SIDE, "count": 1, "dtype": "uint16", "nodata": 0}
+    profile |= {"tiled": True, "blockxsize": 128, "blockysize": 128, "crs": "EPSG:32631"}
+    content = {}
+    for side in ("left", "right"):
+        with rasterio.MemoryFile() as memory:
+            with memory.open(**profile, transform=rasterio.Affine(0.5, 0, 0, 0, -0.5, 0)) as file:
+                file.write(getattr(scene, side), 1)
+            content[f"{side}.tif"] = memory.read()
+    return content
+
+
+def put(images: dict[str, bytes], folder: Path) -> None:
+    for name, content in images.items():
+        (folder / name).write_bytes(content)
+
+
+def match(server: ThreadingHTTPServer, out: Path, *options: str, prefix: str = "") -> subprocess.Popen:
+    address = f"{prefix}http://127.0.0.1:{server.server_address[1]}"
+    command = [COMMAND, "match", f"{address}/left.tif", f"{address}/right.tif", out, "--disparity", "-18", "40"]
+    command += ["--overlap", "20", "--quiet", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def ended(process: subprocess.Popen) -> tuple[int, str]:
+    output, _ = process.communicate(timeout=60)
+    return process.returncode, output
+
+
+@pytest.mark.parametrize("prefix", ["", "/vsicurl/"])
+def test_match__reads_windows_of_images_on_a_web_server(server, images, tmp_path, prefix):
+    put(images, server.folder)
+    window = "--window", "512", "384", "128", "128"
+    assert ended(match(server, tmp_path / "remote", *window, prefix=prefix)) == (0, "")
+    for name, content in images.items():
+        sent = [count for file, count in server.sent if file == name]
+        assert max(sent) < len(content) / 8
+        assert sum(sent) < len(content) / 3, name
+    options = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"overlap": 20}}
+    local = server.folder / "left.tif", server.folder / "right.tif", tmp_path / "local", options
+    match_pair(*local, window=Window(512, 384, 128, 128))
+    for name in ("intervals.tif", "validity.tif"):
+        assert (tmp_path / "remote" / name).read_bytes() == (tmp_path / "local" / name).read_bytes(), name
+
+
+def test_match__never_goes_on_with_an_image_of_another_etag(server, images, tmp_path):
+    put(images, server.folder)
+    out, tiles = tmp_path / "out", ("--tile-size", "128")
+    first = match(server, out, *tiles)
+    while first.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
+        time.sleep(0.02)
+    first.terminate()
+    assert ended(first)[0] == 143
+    changed = bytearray(images["right.tif"])
+    changed[-1] ^= 1
+    put({"right.tif": bytes(changed)}, server.folder)
+    status, output = ended(match(server, out, *tiles))
+    assert status == 2
+    tags = [hashlib.sha256(content).hexdigest() for content in (images["right.tif"], changed)]
+    assert "holds the tiles of another run: inputs.right.etag was " in output
+    assert output.index(tags[0]) < output.index(tags[1])
+    put(images, server.folder)
+    assert ended(match(server, out, *tiles)) == (0, "")
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+def test_identity__hashes_again_only_when_size_or_time_changed(tmp_path):
+    file = tmp_path / "image.tif"
+    file.write_bytes(b"one")
+    before = identity(str(file))
+    assert before["sha256"] == hashlib.sha256(b"one").hexdigest()
+    times = file.stat().st_atime_ns, file.stat().st_mtime_ns
+    file.write_bytes(b"two")
+    os.utime(file, ns=times)
+    assert identity(str(file), {str(file): before}) == before
+    assert identity(str(file))["sha256"] == hashlib.sha256(b"two").hexdigest()
+    os.utime(file, ns=(times[0], times[1] + 10**6))
+    assert identity(str(file), {str(file): before})["sha256"] == hashlib.sha256(b"two").hexdigest()
+    file.write_bytes(b"four")
+    os.utime(file, ns=times)
+    assert identity(str(file), {str(file): before})["sha256"] == hashlib.sha256(b"four").hexdigest()
+
+
+@pytest.mark.parametrize("path", ["http://127.0.0.1:1/image.tif", "/vsimem/image.tif", "nowhere://image.tif"])
+def test_identity__of_what_nobody_tells_more_of_is_its_name(path):
+    assert identity(path) == {"path": path}

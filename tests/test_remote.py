@@ -1,0 +1,267 @@
+"""Tiles in a bucket of a real S3 server: the same bytes, one run at a time, nothing lost when something dies."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+
+import boto3
+import psutil
+import pytest
+import yaml
+
+from sat_intervals import match_pair
+from sat_intervals.raster import north_up, write_layer
+from sat_intervals.scene import make_scene
+
+COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
+OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
+TILES = 16
+PATIENCE = 60.0
+
+
+def wait_until(holds, what: str, seconds: float = PATIENCE) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, f"{what}: not within {seconds:.0f} s"
+        time.sleep(0.02)
+
+
+@contextmanager
+def server(log) -> Iterator[str]:
+    """An S3 server on loopback: its address."""
+    command = [sys.executable, "-m", "moto.server", "--host", "127.0.0.1", "--port", "0"]
+    process = subprocess.Popen(
+        command, stdout=log, stderr=subprocess.STDOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+    )
+    try:
+
+        def address():
+            log.seek(0)
+            return [word for word in log.read().split() if word.startswith("http://127.0.0.1:")]
+
+        wait_until(address, "server")
+        yield address()[0]
+    finally:
+        process.kill()
+        process.wait()
+
+
+def s3():
+    """A client other than the one that is tried."""
+    return boto3.client("s3")
+
+
+@pytest.fixture(scope="module")
+def bucket() -> Iterator[str]:
+    """URL of a bucket that this process and those it starts can reach."""
+    service = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
+    with tempfile.TemporaryFile("w+") as log, server(log) as address, pytest.MonkeyPatch.context() as patch:
+        for name, value in {**service, "AWS_ENDPOINT_URL": address}.items():
+            patch.setenv(name, value)
+        s3().create_bucket(Bucket="bucket")
+        yield "s3://bucket"
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> Path:
+    """A folder with left.tif, right.tif, settings.yaml of 4 x 4 tiles, and the run with its tiles on the disk."""
+    folder = tmp_path_factory.mktemp("pair")
+    scene = make_scene(400, 500, seed=3)
+    for side in ("left", "right"):
+        write_layer(folder / f"{side}.tif", getattr(scene, side), 0, north_up(32631, 0, 0, 0.5))
+    settings = {
+        "disparity": {"minimum": scene.minimum, "maximum": scene.maximum},
+        "tiles": {"size": 128, "overlap": 20},
+    }
+    (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    return folder
+
+
+@contextmanager
+def started(pair: Path, out: Path, store: str | Path, *options: str) -> Iterator[subprocess.Popen]:
+    """``match`` as a process of its own that does not outlive the test."""
+    command = [COMMAND, "match", pair / "left.tif", pair / "right.tif", out, "--config", pair / "settings.yaml"]
+    command += ["--store", store, "--quiet", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended(process: subprocess.Popen) -> tuple[int, str]:
+    output, _ = process.communicate(timeout=PATIENCE)
+    return process.returncode, output
+
+
+def objects(store: str) -> dict[str, datetime]:
+    """Names under a store, and when they were written."""
+    prefix = store.removeprefix("s3://bucket/") + "/"
+    pages = s3().get_paginator("list_objects_v2").paginate(Bucket="bucket", Prefix=prefix)
+    found = (item for page in pages for item in page.get("Contents", []))
+    return {item["Key"].removeprefix(prefix): item["LastModified"] for item in found}
+
+
+def records(store: str) -> dict[str, datetime]:
+    return {name: when for name, when in objects(store).items() if name.startswith("records/")}
+
+
+def wait_for_tiles(process: subprocess.Popen, store: str, count: int) -> None:
+    wait_until(lambda: len(records(store)) >= count or process.poll() is not None, f"{count} tiles")
+    assert process.poll() is None, process.stdout.read()
+
+
+@contextmanager
+def halted(process: subprocess.Popen) -> Iterator[None]:
+    """The run alive, its two workers halted, and killed at the end."""
+    workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+    for worker in workers:
+        worker.suspend()
+    try:
+        yield
+    finally:
+        process.kill()
+        for worker in workers:
+            with suppress(psutil.NoSuchProcess):
+                worker.kill()
+        psutil.wait_procs(workers, 10)
+
+
+def assert_complete(pair: Path, out: Path, *others: str) -> None:
+    for name in ("intervals.tif", "validity.tif"):
+        assert (out / name).read_bytes() == (pair / "undisturbed" / name).read_bytes(), name
+    assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, *others])
+
+
+def status_of(out: Path) -> str:
+    return subprocess.run([COMMAND, "status", out], capture_output=True, text=True, check=True).stdout
+
+
+def test_match__in_a_bucket_refuses_a_second_run_and_goes_on_after_kill_9(bucket, pair, tmp_path):
+    store, out = f"{bucket}/killed", tmp_path / "out"
+    with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
+        wait_for_tiles(first, store, 3)
+        with halted(first), started(pair, tmp_path / "other", store) as second:
+            status, output = ended(second)
+            assert status == 2
+            assert f"process {first.pid} on {socket.gethostname()}, is at work in {store}" in output
+            assert "a run that gives no sign of life for 20 s is taken over" in output
+            assert not (tmp_path / "other" / "tiles").exists()
+            assert "a run is at work" in status_of(out)
+    done = records(store)
+    assert f"{len(done)} of {TILES} tiles done, 0 failed" in status_of(out)
+    with started(pair, out, store, "--keep-tiles") as again:
+        assert ended(again) == (0, "")
+    after = records(store)
+    assert {name: after[name] for name in done} == done, "tiles done twice"
+    assert len(after) == TILES
+    assert_complete(pair, out, "tiles")
+
+
+def test_match__ends_when_another_run_took_over_its_bucket(bucket, pair, tmp_path):
+    store, out = f"{bucket}/lost", tmp_path / "out"
+    with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
+        wait_for_tiles(first, store, 3)
+        with halted(first):
+            s3().put_object(Bucket="bucket", Key="lost/lease.json", Body=b'{"owner": "another"}')
+            status, output = ended(first)
+    assert status == 1
+    assert output.startswith(f"sat-intervals: another run has taken over {store}")  # then Python, of halted workers
+    assert "Traceback" not in output
+    assert s3().get_object(Bucket="bucket", Key="lost/lease.json")["Body"].read() == b'{"owner": "another"}'
+    assert [path.name for path in out.iterdir()] == ["tiles"]
+
+
+def test_match__never_forgets_where_tiles_lie_and_leaves_none_behind(bucket, pair, tmp_path):
+    first, second, out = f"{bucket}/first", tmp_path / "second", tmp_path / "out"
+    with started(pair, out, first) as run:
+        wait_for_tiles(run, first, 2)
+        run.terminate()
+        assert ended(run)[0] == 143
+    assert "lease.json" not in objects(first)
+    with started(pair, out, second) as run:
+        status, output = ended(run)
+    assert status == 2
+    assert f"lie in {first}, not in {second}: give the same --store" in output
+    with started(pair, out, second, "--overwrite") as run:
+        wait_until(lambda: list((second / "records").glob("[0-9]*")) or run.poll() is not None, "tiles")
+        run.terminate()
+        assert ended(run)[0] == 143
+    assert objects(first) == {}
+    with started(pair, out, second) as run:
+        assert ended(run) == (0, "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    assert_complete(pair, out)
+    with started(pair, out, first, "--overwrite") as run:
+        assert ended(run) == (0, "")
+    assert objects(first) == {}
+    assert_complete(pair, out)
+
+
+def test_batch__keeps_the_tiles_of_each_pair_in_a_folder_of_its_own(bucket, pair, tmp_path):
+    rows = [{"name": name, "left": "left.tif", "right": "right.tif"} for name in ("one", "two")]
+    (pair / "pairs.json").write_text(json.dumps(rows))
+    command = [COMMAND, "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml", "--quiet"]
+    command += ["--store", f"{bucket}/batch/", "--keep-tiles", "--tile-size", "512"]
+    subprocess.run(command, check=True)
+    assert set(records(f"{bucket}/batch")) == set()
+    for name in ("one", "two"):
+        assert set(records(f"{bucket}/batch/{name}")) == {"records/0_0.json"}
+        assert sorted(path.name for path in (tmp_path / name).iterdir()) == sorted([*OUTPUTS, "tiles"])
+    assert "lease.json" not in objects(f"{bucket}/batch")
+
+
+def test_match__reads_images_in_a_bucket_and_knows_them_by_size_and_etag(bucket, pair, tmp_path, monkeypatch):
+    # what GDAL calls the address of the service
+    monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
+    monkeypatch.setenv("AWS_HTTPS", "NO")
+    monkeypatch.setenv("AWS_VIRTUAL_HOSTING", "FALSE")
+    for side in ("left", "right"):
+        s3().upload_file(str(pair / f"{side}.tif"), "bucket", f"images/{side}.tif")
+    command = [COMMAND, "match", f"{bucket}/images/left.tif", "/vsis3/bucket/images/right.tif", tmp_path / "out"]
+    subprocess.run([*command, "--config", pair / "settings.yaml", "--quiet"], check=True)
+    assert_complete(pair, tmp_path / "out")
+    inputs = json.loads((tmp_path / "out" / "run.json").read_text())["inputs"]
+    for side in ("left", "right"):
+        told = s3().head_object(Bucket="bucket", Key=f"images/{side}.tif")
+        assert (inputs[side]["bytes"], inputs[side]["etag"]) == (told["ContentLength"], told["ETag"])
+
+
+@pytest.mark.parametrize(
+    ("store", "says"),
+    [
+        ("s3://no-such-bucket/tiles", "The specified bucket does not exist"),
+        ("nothing://bucket/tiles", "Protocol not known: nothing"),
+    ],
+)
+def test_match__refuses_a_store_that_cannot_be_used(bucket, pair, tmp_path, store, says):
+    with started(pair, tmp_path / "out", store) as process:
+        status, output = ended(process)
+    assert status == 2
+    assert output.startswith(f"sat-intervals: {store} cannot be used: {says}")
+    assert len(output.splitlines()) == 1
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_lease__goes_to_one_of_many(bucket):
+    code = """if True:
+        from concurrent.futures import ThreadPoolExecutor
+        from sat_intervals.folders import RemoteFolder
+        folder = RemoteFolder("s3://bucket/contested")
+        with ThreadPoolExecutor(8) as threads:
+            taken = list(threads.map(lambda number: folder.create("lease.json", str(number)), range(8)))
+        print(*taken, folder.read("lease.json"))
+    """
+    *taken, owner = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
+    assert taken.count("True") == 1
+    assert taken[int(owner)] == "True"
