@@ -204,7 +204,7 @@ def _check_memory(config: Config, region: Window) -> None:
 
 def _known(inputs: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """What a manifest says of the files of its inputs, by path."""
-    described = [file for image in inputs.values() for file in (image, *image["files"], image["mask"])]
+    described = [file for one in inputs.values() for file in (one, *one.get("files", ()), one.get("mask"))]
     return {file["path"]: file for file in described if file and "sha256" in file}
 
 

@@ -3,12 +3,12 @@
 import errno
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from distributed import Client, Future, KilledWorker
+from distributed import Client, Future, KilledWorker, wait
 from distributed.client import ClosedClientError
 
 from sat_intervals.cluster import Jobs, connected
@@ -116,11 +116,16 @@ def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Sca
         futures = client.map(
             measure_block, [image] * len(windows), windows, pure=False, retries=job.config.cluster.retries
         )
-    for done, future in enumerate(as_completed(futures), start=1):
-        error = _landed(future)
-        if error is not None:
-            raise RunError(f"{image.path} could not be measured: {_reason(error)}") from error
-        progress("images", done, len(windows))
+    watch, left = Jobs(client), set(futures)
+    while left:
+        with suppress(TimeoutError):
+            ended, left = wait(left, timeout=_LOOK_AGAIN, return_when="FIRST_COMPLETED")
+            for future in ended:
+                error = _ended_with(future)
+                if error is not None:
+                    raise RunError(f"{image.path} could not be measured: {_reason(error)}") from error
+        watch.check()
+        progress("images", len(windows) - len(left), len(windows))
     with _scheduler_needed():
         return scale_of(client.gather(futures))
 
