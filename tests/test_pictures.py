@@ -2,11 +2,13 @@
 
 import re
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from finished import PLACE, no_bands, random_bands, write_run
+from matplotlib.axes import Axes
 from PIL import Image
 
 from sat_intervals import match_pair
@@ -168,6 +170,33 @@ def test_draw_errors__judges_every_pixel_of_a_thinned_map(tmp_path, monkeypatch)
     missed = valid & ((truth < bands[1]) | (truth > bands[2]))
     share = 100 * missed.sum() / valid.sum()
     assert titles[-1] == f"The interval misses the truth at {share:.1f} % of {valid.sum():,} valid pixels"
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The arrays that pictures draw as images, in their order."""
+    arrays = []
+    show = Axes.imshow
+    monkeypatch.setattr(Axes, "imshow", lambda self, x, **options: arrays.append(x) or show(self, x, **options))
+    return arrays
+
+
+def test_draw_errors__holds_a_strip_at_a_time(tmp_path):
+    height, width = 12_000, 200
+    results = open_results(write_run(tmp_path, *random_bands(height, width)))
+    tracemalloc.start()
+    draw_errors(results, tmp_path / "errors.png", dpi=50)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * height * width  # less than the left image in floats, or where it is missed
+
+
+def test_maps__of_a_thin_image_show_every_pixel_of_its_short_side(tmp_path, drawn):
+    results = open_results(write_run(tmp_path, *random_bands(12, 3000)))
+    draw_errors(results, tmp_path / "errors.png")
+    draw_overview(results, tmp_path / "overview.png")
+    assert len(drawn) == 2 + 5
+    assert all(array.shape[0] == 12 and 400 < array.shape[1] < 900 for array in drawn)
 
 
 def test_draw_errors__without_truth_asks_for_it(tmp_path):

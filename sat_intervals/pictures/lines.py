@@ -14,7 +14,7 @@ from sat_intervals.products import INVALID
 from sat_intervals.results import Bands, Results
 from sat_intervals.tiling import Window
 
-_WIDTH = 12.0  # inches
+_WIDTH, _STRIP = 12.0, 1.0  # inches: of the page, and height of the image above a profile
 _KEYS = 4  # entries in a row of a legend
 _LOW = "#d4d4d4"
 
@@ -46,7 +46,7 @@ def draw_profile(
     title = f"Row {row}, columns {first} to {last}; where there is no band, no pixel is valid"
     with page(path, (_WIDTH, 5.4), dpi, title) as figure:
         strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
-        _draw_strip(strip, results, row, first, last, round(_WIDTH * dpi))
+        _draw_strip(strip, results, row, first, last, dpi)
         if low.any():
             over = chart.get_xaxis_transform()
             chart.fill_between(edges, 0, 1, where=low, transform=over, color=_LOW, lw=0, label="low confidence")
@@ -125,13 +125,13 @@ def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] 
         chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_KEYS, frameon=False, borderaxespad=0.2)
 
 
-def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, longest: int) -> None:
+def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, dpi: int) -> None:
     """The left image around a part of a row, which is a dashed line."""
     columns = last - first + 1
     reach = max(1, round(columns / 26))
     top, bottom = max(0, row - reach), min(results.region.height, row + reach + 1)
     window = Window(top, first, bottom - top, columns)
-    image = results.read_small_left(window, fitting((window.height, window.width), longest))
+    image = results.read_small_left(window, fitting((window.height, window.width), (_STRIP, _WIDTH), dpi))
     low, high = limits(image, (0, 1))
     extent = (first - 0.5, last + 0.5, bottom - 0.5, top - 0.5)
     panel.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, aspect="auto", interpolation="nearest")

@@ -26,14 +26,13 @@ _EDGE = "#888888"
 def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
     """Draw left image, disparity, interval width, confidence and validity side by side, read through overviews."""
     rows, columns = _arrangement(results.shape)
-    longest = _PANEL if columns > 1 else _LARGE
-    shape = fitting(results.shape, round(longest * dpi))
+    width, height = _inches(results.shape, _PANEL if columns > 1 else _LARGE)
+    shape = fitting(results.shape, (height, width), dpi)
     bands = results.read_small(shape)
     valid = bands.validity & INVALID == 0
     disparity = np.where(valid, bands.disparity, np.nan)
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
     search = results.config.disparity
-    width, height = _inches(results.shape, longest)
     thinned = shape if shape != results.shape else None
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
     with page(path, size, dpi, _caption(results, thinned)) as figure:
@@ -53,7 +52,9 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
     """
     if results.truth is None:
         raise SatIntervalsError(f"{results.out}: errors need a truth: give --truth")
-    step = max(1, -(-max(results.shape) // round(_LARGE * dpi)))
+    width, height = _inches(results.shape, _LARGE)
+    drawn = fitting(results.shape, (height, width), dpi)
+    down, across = (-(-size // dots) for size, dots in zip(results.shape, drawn, strict=True))
     judged, missed = 0, np.zeros(2, np.int64)
     images, kinds = [], []
     for row, bands in results.strips():
@@ -61,13 +62,14 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
         above, below = valid & (bands.truth > bands.upper), valid & (bands.truth < bands.lower)
         judged += int((valid & np.isfinite(bands.truth) & np.isfinite(bands.lower)).sum())
         missed += above.sum(), below.sum()
-        chosen = np.s_[-row % step :: step, ::step]
-        images.append(bands.image[chosen])
-        kinds.append(np.where(above, 0.0, np.where(below, 1.0, np.nan))[chosen])
-    width, height = _inches(results.shape, _LARGE)
+        chosen = np.s_[-row % down :: down, ::across]
+        images.append(bands.image[chosen].copy())  # a view would keep all of the strip
+        kinds.append(np.where(above, 0.0, np.where(below, 1.0, np.nan))[chosen].copy())
     image, kind = np.concatenate(images), np.concatenate(kinds)
     low, high = limits(image, (0, 1))
-    title = _caption(results, None) + (f", one row and column in {step} shown" if step > 1 else "")
+    title = _caption(results, None) + (
+        f", one row in {down} and one column in {across} shown" if max(down, across) > 1 else ""
+    )
     with page(path, (max(_TEXT, width + 0.9), height + 1.4), dpi, title) as figure:
         panel = figure.subplots()
         # Paler than the overview's: the colours are to be seen, not the white roofs.
