@@ -13,15 +13,29 @@ def identity(path: str) -> dict[str, Any]:
     file = Path(path)
     if not file.is_file():
         return {"path": path}
+    size, modified = _size_and_time(file)
+    return {"path": str(file.resolve()), "bytes": size, "modified": modified, "sha256": _digest(file)}
+
+
+def is_changed(told: dict[str, Any]) -> bool:
+    """Whether a local file is no longer what `identity` told; it is read only where its time differs, not its size."""
+    if "sha256" not in told:
+        return False
+    file = Path(told["path"])
+    if not file.is_file():
+        return True
+    size, modified = _size_and_time(file)
+    return size != told["bytes"] or (modified != told["modified"] and _digest(file) != told["sha256"])
+
+
+def _size_and_time(file: Path) -> tuple[int, str]:
     status = file.stat()
+    return status.st_size, datetime.fromtimestamp(status.st_mtime, UTC).isoformat()
+
+
+def _digest(file: Path) -> str:
     with file.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return {
-        "path": str(file.resolve()),
-        "bytes": status.st_size,
-        "modified": datetime.fromtimestamp(status.st_mtime, UTC).isoformat(),
-        "sha256": digest,
-    }
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def pixels_digest(pixels: np.ndarray, state: np.ndarray) -> str:

@@ -1,8 +1,12 @@
 """Pictures: made, of the right size, not blank, showing what they claim, whatever the results."""
 
+import json
+import os
 import re
 import sys
 import tracemalloc
+from functools import reduce
+from operator import getitem
 
 import numpy as np
 import pytest
@@ -18,7 +22,7 @@ from sat_intervals.kinds import KINDS, SKY, VERMILION, classify
 from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
 from sat_intervals.pictures.curve import read_curve
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
-from sat_intervals.raster import write_layer
+from sat_intervals.raster import open_image, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.scene import make_scene
 from sat_intervals.tiling import Window
@@ -268,6 +272,59 @@ def test_open_results__says_what_is_not_a_finished_run(tmp_path):
         open_results(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (["inputs"], None),
+        (["inputs"], {}),
+        (["inputs"], []),
+        (["inputs", "left", "mask"], {}),
+        (["inputs", "left", "nodata"], "x"),
+        (["inputs", "right", "height"], "x"),
+        (["inputs", "right", "path"], 3),
+        (["tiles", "region", "height"], "x"),
+        (["tiles", "region", "row"], 0.5),
+        (["settings"], 3),
+    ],
+)
+@pytest.mark.parametrize("command", ["plot", "report", "evaluate"])
+def test_commands__refuse_a_report_that_is_none(tmp_path, command, place, value):
+    out = write_run(tmp_path, *random_bands(4, 5))
+    report = json.loads((out / "run.json").read_text())
+    *sections, last = place
+    reduce(getitem, sections, report)[last] = value
+    (out / "run.json").write_text(json.dumps(report))
+    done = CliRunner().invoke(main, [command, str(out), "--debug"])
+    assert done.exit_code == 2
+    assert re.match(rf"sat-intervals: {out}/run.json(:| is not the report of a run)", done.output.splitlines()[-1])
+
+
+def test_open_results__refuses_what_is_no_report(tmp_path):
+    out = write_run(tmp_path, *random_bands(4, 5))
+    for content in (b'{"\xff": 1}', b"[]", b"3", b"{"):
+        (out / "run.json").write_bytes(content)
+        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: run match again"):
+            open_results(out)
+
+
+def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
+    bands, validity, _ = random_bands(4, 5)
+    out = write_run(tmp_path, bands, validity)
+    report = json.loads((out / "run.json").read_text())
+    report["tiles"]["region"]["height"] = 99999
+    (out / "run.json").write_text(json.dumps(report))
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of 4 x 5 .* run.json 4 of 99999 x 5: run"):
+        open_results(out)
+    write_run(tmp_path, bands, validity)
+    write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of 4 x 5 pixels, by run.json 4 of 4 x 5"):
+        open_results(out)
+    write_run(tmp_path, bands, validity)
+    (out / "validity.tif").unlink()
+    with pytest.raises(SatIntervalsError, match=r"validity.tif is missing: "):
+        open_results(out)
+
+
 def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
     bands, validity, truth = random_bands(40, 50)
     out = write_run(tmp_path, bands, validity)
@@ -277,6 +334,24 @@ def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
     write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
     with pytest.raises(SatIntervalsError, match="41 x 50 pixels, when it was matched it had 40 x 50"):
         open_results(out)
+
+
+@pytest.mark.parametrize("name", ["right.tif", "mask.tif"])
+def test_open_results__refuses_other_pixels_than_those_of_the_run(tmp_path, name):
+    random = np.random.default_rng(0)
+    for image, largest in (("left", 99), ("right", 99), ("mask", 1)):
+        write_layer(tmp_path / f"{image}.tif", random.integers(0, largest, (40, 50)).astype(np.uint16), 99, PLACE)
+    right = open_image(tmp_path / "right.tif", mask=tmp_path / "mask.tif")
+    match_pair(tmp_path / "left.tif", right, tmp_path / "out", {"disparity": {"minimum": -3, "maximum": 3}})
+    file, kept = tmp_path / name, (tmp_path / name).read_bytes()
+    os.utime(file, (0, 0))
+    open_results(tmp_path / "out")  # the same file, copied
+    write_layer(file, np.ones((40, 50), np.uint16), 0, PLACE)
+    with pytest.raises(SatIntervalsError, match=f"{name} is not the file that was matched: put that image back"):
+        open_results(tmp_path / "out")
+    file.write_bytes(kept[:-1] + b"x")  # of the same size
+    with pytest.raises(SatIntervalsError, match=f"{name} is not the file that was matched: put that image back"):
+        open_results(tmp_path / "out")
 
 
 def test_classify__takes_the_first_reason():
