@@ -43,6 +43,10 @@ def plot(
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} are those of a profile: give its --row too")
     results = open_results(out, truth)
+    if row is not None:
+        results.check_part(row, columns)
+    if pixel is not None:
+        results.check_pixel(*pixel)
     draw_overview(results, out / "overview.png", dpi)
     click.echo(out / "overview.png")
     if results.truth is not None:

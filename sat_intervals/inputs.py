@@ -25,7 +25,7 @@ def is_changed(told: dict[str, Any]) -> bool:
     if not file.is_file():
         return True
     size, modified = _size_and_time(file)
-    return size != told["bytes"] or (modified != told["modified"] and _digest(file) != told["sha256"])
+    return bool(size != told["bytes"] or (modified != told["modified"] and _digest(file) != told["sha256"]))
 
 
 def _size_and_time(file: Path) -> tuple[int, str]:

@@ -189,6 +189,15 @@ class Results(Run):
                 f"rows are 0 to {height - 1}, columns 0 to {width - 1}"
             )
 
+    def check_part(self, row: int, columns: tuple[int, int] | None) -> tuple[int, int]:
+        """Hold that a part of a row is one of the results; returns its first and last column, None being all."""
+        first, last = columns or (0, self.region.width - 1)
+        self.check_pixel(row, first)
+        self.check_pixel(row, last)
+        if first > last:
+            raise SatIntervalsError(f"columns {first} to {last} are the wrong way round: give the first one first")
+        return first, last
+
 
 def open_run(out: str | Path) -> Run:
     """Look at the folder of a finished run: ``intervals.tif``, ``validity.tif`` and ``run.json``; no image is needed.

@@ -95,7 +95,8 @@ def test_plot__says_in_one_line_what_is_wrong(tmp_path, arguments, message):
     out = write_run(tmp_path, *random_bands(40, 50)[:2])
     done = CliRunner().invoke(main, ["plot", str(out), *arguments])
     assert done.exit_code == 2
-    assert re.fullmatch(f"sat-intervals: .*{message}.*", done.output.strip().splitlines()[-1])
+    assert re.fullmatch(f"sat-intervals: .*{message}.*\n", done.output)
+    assert list(out.glob("*.png")) == []  # nothing is drawn before
 
 
 def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):

@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kinds import BLUE, ORANGE, SKY, VERMILION
 from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.pictures.curve import Curve, read_curve
@@ -31,11 +30,7 @@ def draw_profile(
     columns
         First and last column drawn; by default all.
     """
-    first, last = columns or (0, results.region.width - 1)
-    results.check_pixel(row, first)
-    results.check_pixel(row, last)
-    if first > last:
-        raise SatIntervalsError(f"columns {first} to {last} are the wrong way round: give the first one first")
+    first, last = results.check_part(row, columns)
     bands = results.read(Window(row, 0, 1, results.region.width))
     valid = bands.validity & INVALID == 0
     lines = [np.where(valid, band, np.nan) for band in (bands.lower, bands.upper, bands.disparity)]
