@@ -29,7 +29,7 @@ def plot(
 
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
-    OUT/errors.png     with a truth: where the interval misses it
+    OUT/errors.png     with a truth and intervals: where these miss it
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
 
@@ -49,7 +49,7 @@ def plot(
         results.check_pixel(*pixel)
     draw_overview(results, out / "overview.png", dpi)
     click.echo(out / "overview.png")
-    if results.truth is not None:
+    if results.truth is not None and results.config.interval is not None:
         draw_errors(results, out / "errors.png", dpi)
         click.echo(out / "errors.png")
     if row is not None:

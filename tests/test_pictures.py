@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import sys
 import tracemalloc
 from functools import reduce
@@ -12,17 +13,20 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from finished import PLACE, no_bands, random_bands, write_run
+from matplotlib import colormaps
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from PIL import Image
 
 from sat_intervals import match_pair
 from sat_intervals.cli import main
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kinds import KINDS, SKY, VERMILION, classify
+from sat_intervals.kinds import KINDS, ORANGE, SKY, VERMILION, classify
 from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
 from sat_intervals.pictures.curve import read_curve
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
-from sat_intervals.raster import open_image, write_layer
+from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.scene import make_scene
 from sat_intervals.tiling import Window
@@ -220,6 +224,72 @@ def test_draw_profile__shows_a_pixel_that_stands_alone(tmp_path):
         pictures.append(pixels_of(tmp_path / "profile.png"))
     difference = (pictures[0] != pictures[1]).any(axis=-1).mean()
     assert 1 / 21 / 3 < difference < 0.4
+
+
+@pytest.fixture
+def words(monkeypatch):
+    """Labels of legends, titles of pages and maps, and names of axes, as they are given."""
+    told = []
+
+    def noting(thing, name):
+        told_to = getattr(thing, name)
+        monkeypatch.setattr(thing, name, lambda self, *a, **more: told.append(str(a[0])) or told_to(self, *a, **more))
+
+    for thing, name in (
+        (Artist, "set_label"),
+        (Figure, "suptitle"),
+        *((Axes, name) for name in ("set_title", "set_xlabel", "set_ylabel")),
+    ):
+        noting(thing, name)
+    return told
+
+
+def without_intervals(folder):
+    """A run without intervals, with a truth."""
+    bands, validity, truth = random_bands(40, 50)
+    bands[1:3] = np.nan
+    out = write_run(folder, bands, validity, truth)
+    report = json.loads((out / "run.json").read_text())
+    report["settings"] |= {"interval": None, "regularization": None}
+    (out / "run.json").write_text(json.dumps(report))
+    return out
+
+
+def test_plot__without_intervals_claims_none(tmp_path, words):
+    out = without_intervals(tmp_path)
+    done = CliRunner().invoke(main, ["plot", str(out), "--row", "20"])
+    assert done.output.split() == [str(out / "overview.png"), str(out / "profile.png")]
+    assert {"truth", "disparity"} < set(words)
+    assert "interval" not in words
+    assert "Row 20, columns 0 to 49; where there is no black line, no pixel is valid" in words
+    with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: none can be wrong"):
+        draw_errors(open_results(out), tmp_path / "errors.png")
+
+
+def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run, tmp_path, words):
+    out = shutil.copytree(run, tmp_path / "out")
+    bands = read_layers(out / "intervals.tif")
+    bands[1:3, 60, 90] = 1.0
+    with OutputWriter(out, RUN_FILES, 130, 170, PLACE, {}) as writer:
+        writer.write(0, bands, read_layers(out / "validity.tif")[0])
+        writer.publish({"run.json": (out / "run.json").read_text()})
+    write_layer(tmp_path / "far.tif", np.full((130, 170), 999.5, np.float32), np.nan, PLACE)
+    draw_curve(open_results(out, tmp_path / "far.tif"), tmp_path / "curve.png", 60, 90)
+    assert "truth 999.50 px, outside the range shown" in words
+    assert "interval written, 1 to 1 px" in words
+    orange = (pixels_of(tmp_path / "curve.png") == tuple(bytes.fromhex(ORANGE[1:]))).all(axis=-1)
+    assert orange[400:].sum() > 5  # in the lower chart, not only in its legend
+
+
+def test_draw_overview__of_a_few_wide_intervals_is_not_dark(tmp_path, words):
+    bands, validity = no_bands(200, 200)
+    bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
+    bands[1, :10] = -20  # 5 % of the rows
+    draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
+    assert "px, square-root scale" in words
+    assert {"row", "column"} < set(words)
+    dark = np.rint(255 * np.array(colormaps["magma"](2 / 21)[:3])).astype(int)
+    assert share_of(pixels_of(tmp_path / "overview.png"), tuple(dark)) < 0.01
 
 
 def test_read_curve__is_the_curve_of_the_run(run):

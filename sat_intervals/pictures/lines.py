@@ -38,14 +38,17 @@ def draw_profile(
     lines += [bands.truth, bands.low(results.config)]
     lower, upper, disparity, truth, low = (np.repeat(line[0, first : last + 1], 2) for line in lines)
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
-    title = f"Row {row}, columns {first} to {last}; where there is no band, no pixel is valid"
+    has_intervals = results.config.interval is not None
+    mark = "band" if has_intervals else "black line"
+    title = f"Row {row}, columns {first} to {last}; where there is no {mark}, no pixel is valid"
     with page(path, (_WIDTH, 5.4), dpi, title) as figure:
         strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
         _draw_strip(strip, results, row, first, last, dpi)
         if low.any():
             over = chart.get_xaxis_transform()
             chart.fill_between(edges, 0, 1, where=low, transform=over, color=_LOW, lw=0, label="low confidence")
-        chart.fill_between(edges, lower, upper, color=SKY, alpha=0.7, lw=0.8, label="interval")
+        if has_intervals:
+            chart.fill_between(edges, lower, upper, color=SKY, alpha=0.7, lw=0.8, label="interval")
         if np.isfinite(truth).any():
             chart.plot(edges, truth, color=VERMILION, lw=1.2, label="truth")
         chart.plot(edges, disparity, color="black", lw=0.9, label="disparity")
@@ -74,14 +77,17 @@ def draw_curve(results: Results, path: Path, row: int, column: int, dpi: int = D
         if curve.lower is not None:
             _draw_cut(below, curve, results)
         if np.isfinite(pixel.lower):
-            text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"
-            bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "label": text}
+            text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"  # seen though it may have no width
+            bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "marker": "|", "ms": 9, "mew": 3, "label": text}
             below.plot([pixel.lower, pixel.upper], [-0.08, -0.08], **bar)
-        for chart, label in ((above, "{} {:.2f} px"), (below, None)):
-            lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
-            for name, place, colour, style in lines:
-                if np.isfinite(place):
-                    chart.axvline(place, color=colour, lw=1, ls=style, label=label and label.format(name, place))
+        lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
+        for name, place, colour, style in lines:
+            if not np.isfinite(place):
+                continue
+            shown = across[0] <= place <= across[1]
+            label = f"{name} {place:.2f} px" + ("" if shown else ", outside the range shown")
+            above.axvline(place, color=colour, lw=1, ls=style, label=label)
+            below.axvline(place, color=colour, lw=1, ls=style)
         below.set_ylim(-0.14, 1.06)
         unit = "aggregated by SGM" if results.config.sgm else "not aggregated"
         _finish_chart(above, "", f"cost, {unit}", across)
@@ -100,10 +106,12 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     assert curve.upper is not None
     assert results.config.interval is not None
     level = float(results.config.interval.alpha)
-    chart.axhline(level, color=INK, lw=0.8, ls="--", label=f"alpha = {level:g}")
+    chart.axhline(level, color=INK, lw=0.8, ls="--")
+    right = chart.get_yaxis_transform()
+    chart.text(1, level, f"alpha = {level:g}", transform=right, ha="right", va="bottom", color=INK)
     cut = curve.cut
     chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
-    text = f"its interval, {curve.lower} to {curve.upper} px"
+    text = f"interval of the cut, {curve.lower} to {curve.upper} px"
     chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)
     arrow = {"arrowstyle": "<->", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
     chart.annotate("", (curve.lower, 0.05), (curve.upper, 0.05), arrowprops=arrow)

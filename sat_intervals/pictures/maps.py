@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -40,7 +40,7 @@ def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
         _draw_grey(panels[0], results, bands.image, limits(bands.image, (0, 1)))
         fitted = limits(disparity, (search.minimum, search.maximum))
         _draw_map(panels[1], results, disparity, ("Disparity", "px"), "viridis", fitted)
-        _draw_map(panels[2], results, widths, ("Interval width", "px"), "magma", (0, limits(widths, (0, 1))[1]))
+        _draw_map(panels[2], results, widths, ("Interval width", "px"), "magma", (0, limits(widths, (0, 1))[1]), 0.5)
         _draw_map(panels[3], results, bands.confidence, ("Confidence", "0 to 1"), "cividis", (0, 1))
         _draw_validity(panels[4], panels[5], results, bands.validity)
 
@@ -52,6 +52,8 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
     """
     if results.truth is None:
         raise SatIntervalsError(f"{results.out}: errors need a truth: give --truth")
+    if results.config.interval is None:
+        raise SatIntervalsError(f"{results.out} has no intervals, its setting interval is null: none can be wrong")
     width, height = _inches(results.shape, _LARGE)
     drawn = fitting(results.shape, (height, width), dpi)
     down, across = (-(-size // dots) for size, dots in zip(results.shape, drawn, strict=True))
@@ -108,6 +110,8 @@ def _show(panel: Axes, results: Results, pixels: np.ndarray, **options: Any) -> 
     panel.xaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
     panel.yaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
     panel.tick_params(labelsize=8, colors=INK)
+    panel.set_xlabel("column", fontsize=8, color=INK)
+    panel.set_ylabel("row", fontsize=8, color=INK)
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     aspect: Literal["equal", "auto"] = "equal" if max(height / width, width / height) <= _STRETCHED else "auto"
     return panel.imshow(pixels, extent=extent, aspect=aspect, interpolation="nearest", **options)
@@ -120,17 +124,26 @@ def _draw_grey(panel: Axes, results: Results, image: np.ndarray, shown: tuple[fl
 
 
 def _draw_map(
-    panel: Axes, results: Results, values: np.ndarray, name: tuple[str, str], colours: str, shown: tuple[float, float]
+    panel: Axes,
+    results: Results,
+    values: np.ndarray,
+    name: tuple[str, str],
+    colours: str,
+    shown: tuple[float, float],
+    power: float = 1.0,
 ) -> None:
-    """A layer, its title and unit in ``name``, with a colour bar; pointed ends tell of values beyond those shown."""
-    drawn = _show(panel, results, values, cmap=colours, vmin=shown[0], vmax=shown[1])
+    """A layer, its title and unit in ``name``, with a colour bar; pointed ends tell of values beyond those shown.
+
+    With a ``power`` of 1/2 a few large values do not make all others dark.
+    """
+    drawn = _show(panel, results, values, cmap=colours, norm=PowerNorm(power, *shown))
     panel.set_title(name[0])
     known = values[np.isfinite(values)]
     beyond = bool((known < shown[0]).any()), bool((known > shown[1]).any())
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
     assert panel.figure is not None
     bar = panel.figure.colorbar(drawn, ax=panel, extend=extend, shrink=0.9, aspect=25, pad=0.02)
-    bar.set_label(name[1])
+    bar.set_label(name[1] if power == 1 else f"{name[1]}, square-root scale")
     bar.ax.tick_params(labelsize=8)
     say_empty(panel, values, "no value")
 
