@@ -12,7 +12,7 @@ from operator import getitem
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from finished import PLACE, no_bands, random_bands, write_run
+from finished import PLACE, no_bands, random_bands, without_intervals, write_run
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -242,17 +242,6 @@ def words(monkeypatch):
     ):
         noting(thing, name)
     return told
-
-
-def without_intervals(folder):
-    """A run without intervals, with a truth."""
-    bands, validity, truth = random_bands(40, 50)
-    bands[1:3] = np.nan
-    out = write_run(folder, bands, validity, truth)
-    report = json.loads((out / "run.json").read_text())
-    report["settings"] |= {"interval": None, "regularization": None}
-    (out / "run.json").write_text(json.dumps(report))
-    return out
 
 
 def test_plot__without_intervals_claims_none(tmp_path, words):
