@@ -89,7 +89,7 @@ def _check_memory(whole: Window, config: Config) -> None:
     """Hold that the machine has room for the volume, the right view's own if there is one, and the bands."""
     pixels, count = whole.height * whole.width, config.disparity.count
     beyond = count - 1 if config.cross_check and config.cross_check.method == "accurate" else 0
-    needed = PROCESS_BYTES + volume_bytes(whole.height, whole.width + beyond, count) + _PIXEL_BYTES * pixels
+    needed = PROCESS_BYTES + volume_bytes(whole.height, whole.width + beyond, config) + _PIXEL_BYTES * pixels
     memory = machine_bytes()
     if needed > memory:
         raise SatIntervalsError(

@@ -163,7 +163,7 @@ def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
     files = {"left": pair.left, "right": pair.right, "truth": folder / "short.tif"}
     with pytest.raises(SatIntervalsError, match=r"short.tif has 89 x 110 pixels, .*left.tif 90 x 110"):
         ablate_pair(Pair("short", "all", **files, **search))
-    volume = volume_bytes(90, 110, pair.maximum - pair.minimum + 1)
+    volume = volume_bytes(90, 110, load_config({"disparity": search}))
     monkeypatch.setattr(ablation, "machine_bytes", lambda: PROCESS_BYTES + volume)  # none for the bands
     with pytest.raises(SatIntervalsError, match=r"90 x 110 pixels x .* the machine has 0.3 GB: cut the pair"):
         ablate_pair(pair)

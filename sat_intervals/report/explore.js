@@ -195,7 +195,7 @@ function showMap() {
   if (tall > 1.6) map.style.width = `${160 / tall}%`;
   find("thinned").textContent =
     (pixels.step > 1 ? `This page holds one row in ${pixels.step} and one column in ${pixels.step}. ` : "") +
-    "Click on the map or move the sliders to see the intervals along another row.";
+    "Click on the map or move the sliders to see another row.";
   const layers = makeLayers();
   for (const layer of layers) {
     const input = element("input", { type: "radio", name: "layer", ...(layer === layers[0] && { checked: "" }) });
