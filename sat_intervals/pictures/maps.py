@@ -18,7 +18,7 @@ from sat_intervals.products import INVALID
 from sat_intervals.results import Results
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map: more pixels than its dots are thinned out
-_TEXT = 7.5  # inches that the words over a map take
+_TEXT = 8.5  # inches that the words over a map take
 _STRETCHED = 5.0  # ratio of sides beyond which a map's pixels are no longer square
 _EDGE = "#888888"
 
@@ -69,9 +69,8 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
         kinds.append(np.where(above, 0.0, np.where(below, 1.0, np.nan))[chosen].copy())
     image, kind = np.concatenate(images), np.concatenate(kinds)
     low, high = limits(image, (0, 1))
-    title = _caption(results, None) + (
-        f", one row in {down} and one column in {across} shown" if max(down, across) > 1 else ""
-    )
+    thinned = [f"one {name} in {step}" for name, step in (("row", down), ("column", across)) if step > 1]
+    title = ", ".join([_caption(results, None), *thinned]) + (" shown" if thinned else "")
     with page(path, (max(_TEXT, width + 0.9), height + 1.4), dpi, title) as figure:
         panel = figure.subplots()
         # Paler than the overview's: the colours are to be seen, not the white roofs.
