@@ -35,10 +35,11 @@ def ablate(
     from sat_intervals.pairs import find_pairs
     from sat_intervals.tables import Scene, table_2
 
+    found = find_pairs(pairs)
+    configs = [load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, cost)) for pair in found]
     scenes = []
-    for pair in find_pairs(pairs):
+    for pair, config in zip(found, configs, strict=True):
         click.echo(f"matching {pair.name}", err=True)
-        config = load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, cost))
         scenes.append(Scene(pair.name, pair.group, ablate_pair(pair, config, tolerance=tolerance)))
     if as_json:
         say_json(scenes)

@@ -1,6 +1,7 @@
 """``sat-intervals evaluate``: how often intervals hold the truth, and how wide they are for it."""
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +15,7 @@ from sat_intervals.cli.match import COSTS
 from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 if TYPE_CHECKING:
+    from sat_intervals.config import Config
     from sat_intervals.pairs import Pair
 
 _FILE = click.Path(path_type=Path)
@@ -81,14 +83,16 @@ def evaluate(
     from sat_intervals.evaluation import evaluate_run
     from sat_intervals.tables import Scene, table_1
 
+    sources = _sources(folders, truth, mask, cost)
+    configs = _configs(sources, config_file, accurate, cost)
     scenes = []
-    for source in _sources(folders, truth, mask, cost):
+    for source, config in zip(sources, configs, strict=True):
         judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
-        if source.pair is None:
+        if source.pair is None or config is None:
             report = judge(source.name, source.truth, source.mask)
         else:
             click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
-            report = _judge_pair(judge, source, source.pair, config_file, accurate)
+            report = _judge_pair(judge, source, source.pair, config)
         scenes.append(Scene(source.name, group or _group(source), report))
     if as_json:
         say_json(scenes)
@@ -119,14 +123,21 @@ def _sources(
 ) -> list[_Source]:
     """What the arguments name, in their order; pairs once for each cost."""
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.pairs import find_pairs, is_pair
+    from sat_intervals.pairs import check_names, find_pairs, is_pair
 
+    pairs = [folder for folder in folders if is_pair(folder) and not (folder / "run.json").exists()]
+    find_pairs(pairs)  # all at once, so that none is given twice
+    runs = [folder.resolve() for folder in folders if folder not in pairs]
+    for run, count in Counter(runs).items():
+        if count > 1:
+            raise SatIntervalsError(f"the run in {run} is given {count} times: give it once")
     found: list[tuple[str, Pair | None]] = []
     for folder in folders:
-        if is_pair(folder) and not (folder / "run.json").exists():
+        if folder in pairs:
             found += [(pair.name, pair) for pair in find_pairs([folder])]
         else:
             found.append((str(folder), None))
+    check_names(name for name, _ in found)
     for option, given in (("--truth", truths), ("--mask", masks)):
         if len(given) not in (0, len(found)):
             raise SatIntervalsError(f"{option} is given {len(given)} times for {len(found)} OUT: give it once for each")
@@ -140,16 +151,37 @@ def _sources(
     ]
 
 
+def _configs(
+    sources: list[_Source], config_file: Path | None, accurate: bool, costs: tuple[str, ...]
+) -> "list[Config | None]":
+    """The settings to match each pair with, None for a run, which has its own."""
+    from sat_intervals.config import load_config
+    from sat_intervals.errors import SatIntervalsError
+
+    given = {"--accurate": accurate, f"--config {config_file}": config_file, f"--cost {' '.join(costs)}": costs}
+    option = next((name for name, value in given.items() if value), None)
+    if option and not any(source.pair for source in sources):
+        raise SatIntervalsError(f"{option} is for pairs to be matched, every OUT is a run that was: leave it out")
+    configs: list[Config | None] = []
+    for source in sources:
+        config = None
+        if source.pair:
+            more = overrides(source.pair.minimum, source.pair.maximum, accurate, source.cost)
+            config = load_config(config_file, more | {"products": {"keep_rejected": True}})
+            if config.interval is None:
+                raise SatIntervalsError(f"{config_file}: interval is null, but intervals are to be judged: leave it on")
+        configs.append(config)
+    return configs
+
+
 def _judge_pair(
-    judge: Callable[..., dict[str, Any]], source: _Source, pair: "Pair", config_file: Path | None, accurate: bool
+    judge: Callable[..., dict[str, Any]], source: _Source, pair: "Pair", config: "Config"
 ) -> dict[str, Any]:
     """Match a pair to files, as anyone would, and judge them."""
-    from sat_intervals.config import load_config
     from sat_intervals.run import match_pair
 
-    more = overrides(pair.minimum, pair.maximum, accurate, source.cost) | {"products": {"keep_rejected": True}}
     with TemporaryDirectory(prefix="sat-intervals-") as out:
-        match_pair(pair.left, pair.right, out, load_config(config_file, more))
+        match_pair(pair.left, pair.right, out, config)
         return judge(out, source.truth or pair.truth, source.mask)
 
 

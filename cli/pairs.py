@@ -1,6 +1,7 @@
 """What the commands that judge pairs of known truth have in common."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,12 @@ from sat_intervals.cli.options import debug_option
 
 if TYPE_CHECKING:
     from sat_intervals.tables import Scene
+
+
+def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
+    if not math.isfinite(value):
+        raise click.BadParameter(f"{value} is no number of pixels")
+    return value
 
 
 def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -28,6 +35,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--tolerance",
             type=click.FloatRange(min=0),
             default=0.0,
+            callback=_finite,
             metavar="PX",
             help="Truth so far outside an interval still counts as inside; for truth given in steps, half a step.",
         ),

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from sat_intervals.cli.options import debug_option
+
 _FILE = click.Path(path_type=Path)
 
 
@@ -14,6 +16,7 @@ _FILE = click.Path(path_type=Path)
 @click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
 @click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
 @click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots an inch: larger files.")
+@debug_option  # type: ignore[untyped-decorator]
 def plot(
     out: Path,
     truth: Path | None,
@@ -26,7 +29,7 @@ def plot(
 
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
-    OUT/errors.png     with a truth: where the interval misses it
+    OUT/errors.png     with a truth and intervals: where these miss it
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
 
@@ -40,9 +43,13 @@ def plot(
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} are those of a profile: give its --row too")
     results = open_results(out, truth)
+    if row is not None:
+        results.check_part(row, columns)
+    if pixel is not None:
+        results.check_pixel(*pixel)
     draw_overview(results, out / "overview.png", dpi)
     click.echo(out / "overview.png")
-    if results.truth is not None:
+    if results.truth is not None and results.config.interval is not None:
         draw_errors(results, out / "errors.png", dpi)
         click.echo(out / "errors.png")
     if row is not None:

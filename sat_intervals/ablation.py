@@ -1,6 +1,6 @@
 """What each part of the method is worth: the paper's ablation, in one matching pass a pair (paper, table 2)."""
 
-import os
+from collections.abc import Iterator
 from decimal import Decimal
 from functools import partial
 from typing import Any
@@ -11,11 +11,11 @@ from sat_intervals.config import Config, Interval, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows as Judgeable
 from sat_intervals.evaluation import evaluate, rules_of
-from sat_intervals.finish import Final, Rows, Scale, confidence_scale, finish_rows
+from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.memory import PROCESS_BYTES, machine_bytes, volume_bytes
 from sat_intervals.normalization import Scales, measure
 from sat_intervals.pairs import Pair
 from sat_intervals.patch import kernel_settings, match_patch
@@ -27,6 +27,9 @@ from sat_intervals.tiling import Window, facing
 
 # The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).
 _BASELINE = 1, 10
+# Beside the volume: images on their way, codes, and the raw products of all methods; of the final bands only a strip.
+_PIXEL_BYTES = 100
+_STRIP_PIXELS = 1 << 18
 
 
 def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> dict[str, Any]:
@@ -66,15 +69,12 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
     readers = partial(read_window, left), partial(read_window, right)
-    finals = _all_methods(*readers, whole, config, _scales(*readers, left, right, config))
-    pixels, state = read_window(truth, whole)
-    true = np.where(state == 0, pixels.astype(np.float64), np.nan)
+    methods, scale = _all_methods(*readers, whole, config, _scales(*readers, left, right, config))
     report: dict[str, Any] = {"cost": config.cost.method}
     rules = rules_of(config, tolerance)
-    for method, final in finals.items():
-        disparity, lower, upper, confidence = final.intervals
-        rows = Judgeable(disparity, lower, upper, confidence, final.validity, true)
-        report[method] = evaluate(partial(list, [rows]), rules)["all"]
+    for method in METHODS:
+        strips = partial(_judgeable, *_settled(methods[method], method, config), scale, truth)
+        report[method] = evaluate(strips, rules)["all"]
     return report
 
 
@@ -86,17 +86,22 @@ def _scales(left: Reader, right: Reader, left_image: Image, right_image: Image, 
 
 
 def _check_memory(whole: Window, config: Config) -> None:
-    volume = 2 * whole.height * whole.width * padded_to_lanes(config.disparity.count)
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if volume > memory:
+    """Hold that the machine has room for the volume, the right view's own if there is one, and the bands."""
+    pixels, count = whole.height * whole.width, config.disparity.count
+    beyond = count - 1 if config.cross_check and config.cross_check.method == "accurate" else 0
+    needed = PROCESS_BYTES + volume_bytes(whole.height, whole.width + beyond, config) + _PIXEL_BYTES * pixels
+    memory = machine_bytes()
+    if needed > memory:
         raise SatIntervalsError(
-            f"{whole.height} x {whole.width} pixels x {config.disparity.count} disparities need {volume / 1e9:.1f} GB, "
+            f"{whole.height} x {whole.width} pixels x {count} disparities need {needed / 1e9:.1f} GB, "
             f"the machine has {memory / 1e9:.1f} GB: cut the pair"
         )
 
 
-def _all_methods(left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None) -> dict[str, Final]:
-    """Final bands by every one of METHODS."""
+def _all_methods(
+    left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None
+) -> tuple[dict[str, Rows], Scale]:
+    """Raw products of every one of METHODS, and what their confidence is relative to."""
     search = config.disparity
     volume = _volume(left, right, whole, config, scales)
     refine = config.refinement is not None
@@ -106,26 +111,41 @@ def _all_methods(left: Reader, right: Reader, whole: Window, config: Config, sca
     for method in METHODS[1:]:
         level = config.model_copy(update={"interval": Interval(alpha=Decimal(method.split()[0]))}).cut_level
         bounds[method] = read_alpha_cuts(volume, search.minimum, level, refine)
+    seen = np.asarray(read_right_winners(volume, search.minimum))
+    del volume  # before the right view has one of its own
+    if config.cross_check and config.cross_check.method == "accurate":
+        seen = _right_winners(left, right, whole, config, scales)
     histogram = ambiguity_histogram(ambiguity, winner != NO_DISPARITY, config.largest_ambiguity)
     assert config.ambiguity is not None  # regularisation needs it
-    scale = confidence_scale(config.ambiguity, histogram)
     validity = np.where(winner == NO_DISPARITY, NO_CANDIDATE, 0).astype(np.uint16)
-    seen = _right_winners(left, right, whole, volume, config, scales)
-    finals = {}
-    for method, (lower, upper) in bounds.items():
-        rows = Rows(winner, lower, upper, disparity, ambiguity, validity, seen)
-        finals[method] = _finished(rows, method, scale, config)
-    return finals
+    methods = {
+        method: Rows(winner, lower, upper, disparity, ambiguity, validity, seen)
+        for method, (lower, upper) in bounds.items()
+    }
+    return methods, confidence_scale(config.ambiguity, histogram)
 
 
-def _finished(rows: Rows, method: str, scale: Scale, config: Config) -> Final:
-    """Final bands by one method: only the last has its intervals regularised, the baseline not even filtered."""
+def _settled(rows: Rows, method: str, config: Config) -> tuple[Rows, Config]:
+    """What one method finishes: only the last has its intervals regularised, the baseline not even filtered."""
     if method != METHODS[-1]:
         config = config.model_copy(update={"regularization": None})
     if method == "baseline":
         config = config.model_copy(update={"median": None})
         rows = rows._replace(disparity=rows.winner.astype(np.float32))  # no refinement that bounds had to follow
-    return finish_rows(rows, 0, rows.winner.shape[0], scale, config)
+    return rows, config
+
+
+def _judgeable(rows: Rows, config: Config, scale: Scale, truth: Image) -> Iterator[Judgeable]:
+    """Final bands and truth, strip by strip: whole they would take as much as the volume."""
+    height, width = rows.winner.shape
+    step = max(1, _STRIP_PIXELS // width)
+    row = 0
+    for final in finish_strips((rows.cut(first, first + step) for first in range(0, height, step)), scale, config):
+        pixels, state = read_window(truth, Window(row, 0, final.validity.shape[0], width))
+        true = np.where(state == 0, pixels.astype(np.float64), np.nan)
+        disparity, lower, upper, confidence = final.intervals
+        yield Judgeable(disparity, lower, upper, confidence, final.validity, true)
+        row += final.validity.shape[0]
 
 
 def _volume(left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None) -> np.ndarray:
@@ -134,14 +154,9 @@ def _volume(left: Reader, right: Reader, whole: Window, config: Config, scales: 
     return cost_volume(similarity.costs, kernel_settings(config), similarity.gradients)
 
 
-def _right_winners(
-    left: Reader, right: Reader, whole: Window, volume: np.ndarray, config: Config, scales: Scales | None
-) -> np.ndarray:
-    """The right view's winners, as the run's way of cross-checking finds them."""
+def _right_winners(left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None) -> np.ndarray:
+    """The winners of the right view, matched on its own: left and right change places, and disparities their sign."""
     search = config.disparity
-    if config.cross_check is None or config.cross_check.method == "fast":
-        return np.asarray(read_right_winners(volume, search.minimum))
-    # The right view has a volume of its own: left and right change places, and disparities their sign.
     mirrored = load_config(
         config, {"disparity": {"minimum": -search.maximum, "maximum": -search.minimum}, "cross_check": None}
     )

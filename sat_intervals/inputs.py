@@ -69,6 +69,14 @@ def _of_url(url: str) -> dict[str, Any]:
     return {"bytes": int(size) if size.isdigit() else None, "etag": tag}
 
 
+def is_changed(told: Mapping[str, Any]) -> bool:
+    """Whether a file is no longer what `identity` told of it; where a server does not answer, it is not."""
+    now = identity(told["path"], {told["path"]: told})
+    if "sha256" in told:
+        return bool(now.get("sha256") != told["sha256"])
+    return bool(now.get("etag", told.get("etag")) != told.get("etag"))
+
+
 def pixels_digest(pixels: np.ndarray, state: np.ndarray) -> str:
     """Tells the pixels that a tile was made of from any others."""
     digest = hashlib.sha256()

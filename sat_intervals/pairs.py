@@ -4,7 +4,7 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,24 @@ def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
     pairs = []
     for path in map(Path, paths):
         pairs += _of_table(path) if path.suffix == ".csv" else [_of_folder(path)]
-    for name, count in Counter(pair.name for pair in pairs).items():
+    check_names(pair.name for pair in pairs)
+    for pair, count in Counter(map(_unnamed, pairs)).items():
         if count > 1:
-            raise SatIntervalsError(f"{count} pairs are called {name}: give each its own name")
+            raise SatIntervalsError(f"the pair of {pair.left} is given {count} times: give it once")
     return pairs
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Hold that what is judged can be told apart."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise SatIntervalsError(f"{count} pairs or runs are called {name}: give each its own name")
+
+
+def _unnamed(pair: Pair) -> Pair:
+    """What a pair is, whatever it is called and from wherever its files are named."""
+    left, right, truth = (path.resolve() for path in (pair.left, pair.right, pair.truth))
+    return replace(pair, name="", group="", left=left, right=right, truth=truth)
 
 
 def group_beside(image: str | Path) -> str:
@@ -64,7 +78,9 @@ def group_beside(image: str | Path) -> str:
 def _meta(file: Path) -> dict[str, Any]:
     try:
         meta = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}") from error
+    except ValueError as error:
         raise SatIntervalsError(f"{file} cannot be read: {error}: it must be a JSON object") from error
     if not isinstance(meta, dict):
         raise SatIntervalsError(f"{file} holds {type(meta).__name__}, it must be a JSON object")
@@ -91,13 +107,17 @@ def _of_table(file: Path) -> list[Pair]:
         with file.open(newline="", encoding="utf-8") as stream:
             reader = csv.DictReader(stream)
             rows, columns = list(reader), reader.fieldnames or []
-    except (OSError, ValueError, csv.Error) as error:
-        raise SatIntervalsError(f"{file} cannot be read: {error}") from error
+    except OSError as error:
+        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: give a CSV file of pairs") from error
+    except (ValueError, csv.Error) as error:
+        raise SatIntervalsError(f"{file} cannot be read: {error}: give a CSV file in UTF-8") from error
     missing = [column for column in _COLUMNS if column not in columns]
     if missing:
         raise SatIntervalsError(
             f"{file}: no column {', '.join(missing)}; needed: {', '.join(_COLUMNS)}, known: {', '.join(_OPTIONAL)}"
         )
+    if not rows:
+        raise SatIntervalsError(f"{file} has a header but no rows: give a row a pair")
     return [_of_row(file, number, row) for number, row in enumerate(rows, start=2)]
 
 

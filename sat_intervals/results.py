@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import index
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,12 +11,24 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.inputs import is_changed
 from sat_intervals.kernels.confidence import low_confidence
-from sat_intervals.raster import Image, open_image, read_layers, read_small_image, read_small_layers, read_window
+from sat_intervals.products import BANDS
+from sat_intervals.raster import (
+    Image,
+    open_image,
+    read_layers,
+    read_shape,
+    read_small_image,
+    read_small_layers,
+    read_window,
+)
 from sat_intervals.tiling import Window
 
-# Rows of the blocks that runs write.
+# Rows of the blocks that runs write, and bands of the files.
 _BLOCK_ROWS = 512
+_BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
+_REGION = ("row", "column", "height", "width")
 
 
 class Bands(NamedTuple):
@@ -176,6 +189,15 @@ class Results(Run):
                 f"rows are 0 to {height - 1}, columns 0 to {width - 1}"
             )
 
+    def check_part(self, row: int, columns: tuple[int, int] | None) -> tuple[int, int]:
+        """Hold that a part of a row is one of the results; returns its first and last column, None being all."""
+        first, last = columns or (0, self.region.width - 1)
+        self.check_pixel(row, first)
+        self.check_pixel(row, last)
+        if first > last:
+            raise SatIntervalsError(f"columns {first} to {last} are the wrong way round: give the first one first")
+        return first, last
+
 
 def open_run(out: str | Path) -> Run:
     """Look at the folder of a finished run: ``intervals.tif``, ``validity.tif`` and ``run.json``; no image is needed.
@@ -183,17 +205,51 @@ def open_run(out: str | Path) -> Run:
     Raises
     ------
     SatIntervalsError
-        No finished run.
+        No finished run, or files that do not belong together.
     """
     out = Path(out)
     file = out / "run.json"
     try:
         report = json.loads(file.read_text(encoding="utf-8"))
-        return Run(out, report, load_config(report["settings"]), Window(**report["tiles"]["region"]))
+        config = load_config(report["settings"])
+        for side in ("left", "right"):
+            _check_input(report["inputs"][side])
+        region = Window(**{name: index(report["tiles"]["region"][name]) for name in _REGION})
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except SatIntervalsError as error:
+        raise SatIntervalsError(f"{file}: {error}") from error
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
+    for name, bands in _BANDS.items():
+        _check_raster(out / name, bands, region)
+    return Run(out, report, config, region)
+
+
+def _check_input(told: dict[str, Any]) -> None:
+    """Hold that a report tells of an image what is needed to open it again."""
+    Path(told["path"])
+    for name in ("band", "height", "width"):
+        index(told[name])
+    _nodata(told)
+    if told["mask"] is not None:
+        Path(told["mask"]["path"])
+
+
+def _nodata(told: dict[str, Any]) -> float | None:
+    return None if told["nodata"] is None else float(told["nodata"])
+
+
+def _check_raster(file: Path, bands: int, region: Window) -> None:
+    """Hold that a raster is there, and what the report of its run tells."""
+    if not file.exists():
+        raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or run match again")
+    found, needed = read_shape(file), (bands, region.height, region.width)
+    if found != needed:
+        raise SatIntervalsError(
+            f"{file} has {found[0]} bands of {found[1]} x {found[2]} pixels, by run.json {needed[0]} of {needed[1]} x "
+            f"{needed[2]}: run match again with --overwrite"
+        )
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
@@ -210,7 +266,7 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     Raises
     ------
     SatIntervalsError
-        No finished run, images that are no longer there, or a truth of another size.
+        No finished run, images that are no longer those it matched, or a truth of another size.
     """
     run = open_run(out)
     left, right = (_opened(run.report["inputs"][side]) for side in ("left", "right"))
@@ -220,18 +276,18 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     return Results(run.out, run.report, run.config, run.region, left, right, layer)
 
 
-def _opened(described: dict[str, Any]) -> Image:
+def _opened(told: dict[str, Any]) -> Image:
     """An input again, as the run read it."""
-    mask, nodata = described["mask"], described["nodata"]
-    image = open_image(
-        described["path"],
-        band=described["band"],
-        nodata=None if nodata is None else float(nodata),
-        mask=mask and mask["path"],
-    )
-    if (image.height, image.width) != (described["height"], described["width"]):
+    mask = told["mask"]
+    image = open_image(told["path"], band=told["band"], nodata=_nodata(told), mask=mask and mask["path"])
+    if (image.height, image.width) != (told["height"], told["width"]):
         raise SatIntervalsError(
             f"{image.path} has {image.height} x {image.width} pixels, when it was matched it had "
-            f"{described['height']} x {described['width']}: put that image back or match again"
+            f"{told['height']} x {told['width']}: put that image back or match again"
         )
+    for file in (told, *told.get("files", ()), *([mask] if mask else [])):
+        if is_changed(file):
+            raise SatIntervalsError(
+                f"{file['path']} is not the file that was matched: put that image back or match again"
+            )
     return image

@@ -19,7 +19,7 @@ TABLE_1 = {
     "low acc.": ("low", "accuracy"),
     "low size": ("low", "relative_size"),
     "overest.": ("low", "relative_overestimation"),
-    "with rejected": ("with_rejected", "low", "relative_overestimation"),
+    "overest. with rejected": ("with_rejected", "low", "relative_overestimation"),
 }
 METHODS = ("baseline", "0.5", "0.8", "0.9", "0.98", "0.9 regularised")
 TABLE_2 = {method: (method, "accuracy") for method in METHODS}

@@ -80,6 +80,17 @@ def random_bands(height, width, seed=0):
     return bands, validity, truth.astype(np.float32)
 
 
+def without_intervals(folder):
+    """A run without intervals, with a truth."""
+    bands, validity, truth = random_bands(40, 50)
+    bands[1:3] = np.nan
+    out = write_run(folder, bands, validity, truth)
+    report = json.loads((out / "run.json").read_text())
+    report["settings"] |= {"interval": None, "regularization": None}
+    (out / "run.json").write_text(json.dumps(report))
+    return out
+
+
 def no_bands(height, width):
     """Bands and validity of a run in which cross-checking rejected every pixel."""
     return np.full((4, height, width), np.nan, np.float32), np.full((height, width), OCCLUSION, np.uint16)

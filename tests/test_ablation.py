@@ -18,6 +18,7 @@ from sat_intervals.config import load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows, evaluate, rules_of
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
+from sat_intervals.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.pairs import Pair, find_pairs
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.scene import make_scene
@@ -124,7 +125,8 @@ def judged(scene, config):
 
 
 @pytest.mark.parametrize("method", ["fast", "accurate"])
-def test_ablate_pair__equals_runs_with_those_settings(scene, folder, method):
+def test_ablate_pair__equals_runs_with_those_settings(scene, folder, method, monkeypatch):
+    monkeypatch.setattr(ablation, "_STRIP_PIXELS", 7 * 110)
     (pair,) = find_pairs([folder])
     search = {"minimum": scene.minimum, "maximum": scene.maximum}
     config = load_config({"disparity": search, "cross_check": {"method": method}})
@@ -161,8 +163,9 @@ def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
     files = {"left": pair.left, "right": pair.right, "truth": folder / "short.tif"}
     with pytest.raises(SatIntervalsError, match=r"short.tif has 89 x 110 pixels, .*left.tif 90 x 110"):
         ablate_pair(Pair("short", "all", **files, **search))
-    monkeypatch.setattr(ablation.os, "sysconf", lambda name: 100)
-    with pytest.raises(SatIntervalsError, match=r"90 x 110 pixels x .* the machine has 0.0 GB: cut the pair"):
+    volume = volume_bytes(90, 110, load_config({"disparity": search}))
+    monkeypatch.setattr(ablation, "machine_bytes", lambda: PROCESS_BYTES + volume)  # none for the bands
+    with pytest.raises(SatIntervalsError, match=r"90 x 110 pixels x .* the machine has 0.3 GB: cut the pair"):
         ablate_pair(pair)
 
 

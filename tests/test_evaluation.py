@@ -1,6 +1,7 @@
 """Figures of merit against a slow twin, of maps, of runs on disk, of real pairs, and as the command prints them."""
 
 import json
+import re
 import shutil
 from itertools import pairwise
 from types import SimpleNamespace
@@ -324,8 +325,13 @@ def test_find_pairs__says_what_is_wrong_with_a_folder(tmp_path, meta, message):
     ("text", "message"),
     [
         ("left,right,minimum,maximum\n", "no column truth; needed: left, right, truth, minimum, maximum, known: name"),
+        ("left,right,truth,minimum,maximum\n", "pairs.csv has a header but no rows: give a row a pair"),
+        ("left,right,truth,minimum,maximum,name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
         ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "line 2: minimum '1', maximum 'x', needed: integers"),
-        ("left,right,truth,minimum,maximum\na,b,c,1,2\na,d,e,3,4\n", "2 pairs are called a: give each its own name"),
+        (
+            "left,right,truth,minimum,maximum\na,b,c,1,2\na,d,e,3,4\n",
+            "2 pairs or runs are called a: give each its own name",
+        ),
     ],
 )
 def test_find_pairs__says_what_is_wrong_with_a_table(tmp_path, text, message):
@@ -406,7 +412,39 @@ def test_command__errors_are_one_line(run, tmp_path):
         2,
         f"sat-intervals: {tmp_path}/run.json: No such file or directory: give the folder of a finished run\n",
     )
-    assert "--truth is given 1 times for 2 OUT" in command("evaluate", run, run, "--truth", "x.tif")[2]
+    assert "--truth is given 1 times for 2 OUT" in command("evaluate", run, tmp_path, "--truth", "x.tif")[2]
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1"])
+@pytest.mark.parametrize("name", ["evaluate", "ablate"])
+def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
+    status, _, told = command(name, run, "--tolerance", value)
+    assert (status, told.count("\n")) == (2, 1)
+    assert "Invalid value for '--tolerance'" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["RUN", "--accurate"], "--accurate is for pairs to be matched, every OUT is a run that was: leave it out"),
+        (["RUN", "--config", "nope.yaml"], "--config nope.yaml is for pairs to be matched"),
+        (["RUN", "--cost", "census"], "--cost census is for pairs to be matched"),
+        (["RUN", "OTHER/../out"], "out is given 2 times: give it once"),
+        (["PAIR", "PAIR/../one"], "2 pairs or runs are called|/one/left.tif is given 2 times: give it once"),
+        (["PAIR", "PAIR"], "2 pairs or runs are called .*/one: give each its own name"),
+        (["PAIR", "--config", "OFF"], "off.yaml: interval is null, but intervals are to be judged: leave it on"),
+        (["PAIR", "--config", "nope.yaml"], "nope.yaml"),
+        (["nothere.csv"], "nothere.csv cannot be read: No such file or directory: give a CSV file of pairs$"),
+    ],
+)
+def test_command__refuses_before_it_matches(run, pair, tmp_path, arguments, says):
+    (tmp_path / "off.yaml").write_text("interval: null\nregularization: null\n")
+    names = {"RUN": run, "OTHER/": f"{run}/", "PAIR": pair, "OFF": tmp_path / "off.yaml"}
+    for name, place in names.items():
+        arguments = [argument.replace(name, str(place)) for argument in arguments]
+    status, _, told = command("evaluate", *arguments)
+    assert (status, told.count("\n")) == (2, 1)
+    assert re.search(says, told.strip())
 
 
 # ---- Real pairs --------------------------------------------------------------------------------------------

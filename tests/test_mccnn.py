@@ -347,8 +347,7 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
     file = write_network(tmp_path / "network.onnx", random_weights())
     job = prepare(*images, tmp_path / "out", settings(-4, 6, file))
-    with job.store.locked():
-        job.begin()
+    job.begin()
     job.store.write_normalization(Scales(Scale(500.0, 80.0), Scale(500.0, 80.0)).report())
     write_network(file, random_weights(seed=1))
     with pytest.raises(SatIntervalsError, match=r"network\.onnx on this worker differs in sha256 from .* of the run"):

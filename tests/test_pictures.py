@@ -1,22 +1,32 @@
 """Pictures: made, of the right size, not blank, showing what they claim, whatever the results."""
 
+import json
+import os
 import re
+import shutil
 import sys
+import tracemalloc
+from functools import reduce
+from operator import getitem
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from finished import PLACE, no_bands, random_bands, write_run
+from finished import PLACE, no_bands, random_bands, without_intervals, write_run
+from matplotlib import colormaps
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from PIL import Image
 
 from sat_intervals import match_pair
 from sat_intervals.cli import main
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kinds import KINDS, SKY, VERMILION, classify
+from sat_intervals.kinds import KINDS, ORANGE, SKY, VERMILION, classify
 from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
 from sat_intervals.pictures.curve import read_curve
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
-from sat_intervals.raster import write_layer
+from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.scene import make_scene
 from sat_intervals.tiling import Window
@@ -89,7 +99,8 @@ def test_plot__says_in_one_line_what_is_wrong(tmp_path, arguments, message):
     out = write_run(tmp_path, *random_bands(40, 50)[:2])
     done = CliRunner().invoke(main, ["plot", str(out), *arguments])
     assert done.exit_code == 2
-    assert re.fullmatch(f"sat-intervals: .*{message}.*", done.output.strip().splitlines()[-1])
+    assert re.fullmatch(f"sat-intervals: .*{message}.*\n", done.output)
+    assert list(out.glob("*.png")) == []  # nothing is drawn before
 
 
 def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
@@ -170,6 +181,33 @@ def test_draw_errors__judges_every_pixel_of_a_thinned_map(tmp_path, monkeypatch)
     assert titles[-1] == f"The interval misses the truth at {share:.1f} % of {valid.sum():,} valid pixels"
 
 
+@pytest.fixture
+def drawn(monkeypatch):
+    """The arrays that pictures draw as images, in their order."""
+    arrays = []
+    show = Axes.imshow
+    monkeypatch.setattr(Axes, "imshow", lambda self, x, **options: arrays.append(x) or show(self, x, **options))
+    return arrays
+
+
+def test_draw_errors__holds_a_strip_at_a_time(tmp_path):
+    height, width = 12_000, 200
+    results = open_results(write_run(tmp_path, *random_bands(height, width)))
+    tracemalloc.start()
+    draw_errors(results, tmp_path / "errors.png", dpi=50)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * height * width  # less than the left image in floats, or where it is missed
+
+
+def test_maps__of_a_thin_image_show_every_pixel_of_its_short_side(tmp_path, drawn):
+    results = open_results(write_run(tmp_path, *random_bands(12, 3000)))
+    draw_errors(results, tmp_path / "errors.png")
+    draw_overview(results, tmp_path / "overview.png")
+    assert len(drawn) == 2 + 5
+    assert all(array.shape[0] == 12 and 400 < array.shape[1] < 900 for array in drawn)
+
+
 def test_draw_errors__without_truth_asks_for_it(tmp_path):
     results = open_results(write_run(tmp_path, *random_bands(40, 50)[:2]))
     with pytest.raises(SatIntervalsError, match="give --truth"):
@@ -186,6 +224,61 @@ def test_draw_profile__shows_a_pixel_that_stands_alone(tmp_path):
         pictures.append(pixels_of(tmp_path / "profile.png"))
     difference = (pictures[0] != pictures[1]).any(axis=-1).mean()
     assert 1 / 21 / 3 < difference < 0.4
+
+
+@pytest.fixture
+def words(monkeypatch):
+    """Labels of legends, titles of pages and maps, and names of axes, as they are given."""
+    told = []
+
+    def noting(thing, name):
+        told_to = getattr(thing, name)
+        monkeypatch.setattr(thing, name, lambda self, *a, **more: told.append(str(a[0])) or told_to(self, *a, **more))
+
+    for thing, name in (
+        (Artist, "set_label"),
+        (Figure, "suptitle"),
+        *((Axes, name) for name in ("set_title", "set_xlabel", "set_ylabel")),
+    ):
+        noting(thing, name)
+    return told
+
+
+def test_plot__without_intervals_claims_none(tmp_path, words):
+    out = without_intervals(tmp_path)
+    done = CliRunner().invoke(main, ["plot", str(out), "--row", "20"])
+    assert done.output.split() == [str(out / "overview.png"), str(out / "profile.png")]
+    assert {"truth", "disparity"} < set(words)
+    assert "interval" not in words
+    assert "Row 20, columns 0 to 49; where there is no black line, no pixel is valid" in words
+    with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: none can be wrong"):
+        draw_errors(open_results(out), tmp_path / "errors.png")
+
+
+def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run, tmp_path, words):
+    out = shutil.copytree(run, tmp_path / "out")
+    bands = read_layers(out / "intervals.tif")
+    bands[1:3, 60, 90] = 1.0
+    with OutputWriter(out, RUN_FILES, 130, 170, PLACE, {}) as writer:
+        writer.write(0, bands, read_layers(out / "validity.tif")[0])
+        writer.publish({"run.json": (out / "run.json").read_text()})
+    write_layer(tmp_path / "far.tif", np.full((130, 170), 999.5, np.float32), np.nan, PLACE)
+    draw_curve(open_results(out, tmp_path / "far.tif"), tmp_path / "curve.png", 60, 90)
+    assert "truth 999.50 px, outside the range shown" in words
+    assert "interval written, 1 to 1 px" in words
+    orange = (pixels_of(tmp_path / "curve.png") == tuple(bytes.fromhex(ORANGE[1:]))).all(axis=-1)
+    assert orange[400:].sum() > 5  # in the lower chart, not only in its legend
+
+
+def test_draw_overview__of_a_few_wide_intervals_is_not_dark(tmp_path, words):
+    bands, validity = no_bands(200, 200)
+    bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
+    bands[1, :10] = -20  # 5 % of the rows
+    draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
+    assert "px, square-root scale" in words
+    assert {"row", "column"} < set(words)
+    dark = np.rint(255 * np.array(colormaps["magma"](2 / 21)[:3])).astype(int)
+    assert share_of(pixels_of(tmp_path / "overview.png"), tuple(dark)) < 0.01
 
 
 def test_read_curve__is_the_curve_of_the_run(run):
@@ -239,6 +332,59 @@ def test_open_results__says_what_is_not_a_finished_run(tmp_path):
         open_results(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (["inputs"], None),
+        (["inputs"], {}),
+        (["inputs"], []),
+        (["inputs", "left", "mask"], {}),
+        (["inputs", "left", "nodata"], "x"),
+        (["inputs", "right", "height"], "x"),
+        (["inputs", "right", "path"], 3),
+        (["tiles", "region", "height"], "x"),
+        (["tiles", "region", "row"], 0.5),
+        (["settings"], 3),
+    ],
+)
+@pytest.mark.parametrize("command", ["plot", "report", "evaluate"])
+def test_commands__refuse_a_report_that_is_none(tmp_path, command, place, value):
+    out = write_run(tmp_path, *random_bands(4, 5))
+    report = json.loads((out / "run.json").read_text())
+    *sections, last = place
+    reduce(getitem, sections, report)[last] = value
+    (out / "run.json").write_text(json.dumps(report))
+    done = CliRunner().invoke(main, [command, str(out), "--debug"])
+    assert done.exit_code == 2
+    assert re.match(rf"sat-intervals: {out}/run.json(:| is not the report of a run)", done.output.splitlines()[-1])
+
+
+def test_open_results__refuses_what_is_no_report(tmp_path):
+    out = write_run(tmp_path, *random_bands(4, 5))
+    for content in (b'{"\xff": 1}', b"[]", b"3", b"{"):
+        (out / "run.json").write_bytes(content)
+        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: run match again"):
+            open_results(out)
+
+
+def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
+    bands, validity, _ = random_bands(4, 5)
+    out = write_run(tmp_path, bands, validity)
+    report = json.loads((out / "run.json").read_text())
+    report["tiles"]["region"]["height"] = 99999
+    (out / "run.json").write_text(json.dumps(report))
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of 4 x 5 .* run.json 4 of 99999 x 5: run"):
+        open_results(out)
+    write_run(tmp_path, bands, validity)
+    write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of 4 x 5 pixels, by run.json 4 of 4 x 5"):
+        open_results(out)
+    write_run(tmp_path, bands, validity)
+    (out / "validity.tif").unlink()
+    with pytest.raises(SatIntervalsError, match=r"validity.tif is missing: "):
+        open_results(out)
+
+
 def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
     bands, validity, truth = random_bands(40, 50)
     out = write_run(tmp_path, bands, validity)
@@ -248,6 +394,24 @@ def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
     write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
     with pytest.raises(SatIntervalsError, match="41 x 50 pixels, when it was matched it had 40 x 50"):
         open_results(out)
+
+
+@pytest.mark.parametrize("name", ["right.tif", "mask.tif"])
+def test_open_results__refuses_other_pixels_than_those_of_the_run(tmp_path, name):
+    random = np.random.default_rng(0)
+    for image, largest in (("left", 99), ("right", 99), ("mask", 1)):
+        write_layer(tmp_path / f"{image}.tif", random.integers(0, largest, (40, 50)).astype(np.uint16), 99, PLACE)
+    right = open_image(tmp_path / "right.tif", mask=tmp_path / "mask.tif")
+    match_pair(tmp_path / "left.tif", right, tmp_path / "out", {"disparity": {"minimum": -3, "maximum": 3}})
+    file, kept = tmp_path / name, (tmp_path / name).read_bytes()
+    os.utime(file, (0, 0))
+    open_results(tmp_path / "out")  # the same file, copied
+    write_layer(file, np.ones((40, 50), np.uint16), 0, PLACE)
+    with pytest.raises(SatIntervalsError, match=f"{name} is not the file that was matched: put that image back"):
+        open_results(tmp_path / "out")
+    file.write_bytes(kept[:-1] + b"x")  # of the same size
+    with pytest.raises(SatIntervalsError, match=f"{name} is not the file that was matched: put that image back"):
+        open_results(tmp_path / "out")
 
 
 def test_classify__takes_the_first_reason():

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from finished import MAXIMUM, MINIMUM, no_bands, random_bands, write_run
+from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run
 from selenium.webdriver import ActionChains, Chrome, ChromeOptions
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
@@ -23,6 +23,8 @@ from sat_intervals.cli import main
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.kinds import classify
+from sat_intervals.products import INVALID
+from sat_intervals.raster import read_layers
 from sat_intervals.report import contents, write_report
 from sat_intervals.results import open_results
 
@@ -273,6 +275,38 @@ def test_page__of_no_valid_pixel_says_so(browser, tmp_path, shape):
     page.find("#layers label:nth-of-type(2)").click()
     assert page.text("#key").endswith("No pixel has a value.")
     assert not page.find("#evaluation").is_displayed()
+    assert page.complaints() == []
+
+
+def test_page__of_a_run_without_intervals_claims_none(browser, tmp_path):
+    page = Page(browser, write_report(open_results(without_intervals(tmp_path))))
+    line, box = page.browser.execute_script("""
+        const chart = document.querySelector("#profile svg").getBoundingClientRect();
+        const line = [...document.querySelectorAll("#profile path")].at(-1);
+        return [line.getBoundingClientRect().toJSON(), chart.toJSON()];""")
+    assert box["top"] <= line["top"] < line["bottom"] <= box["bottom"]
+    assert "no valid pixel in this row" not in page.text("#profile")
+    assert page.text("#profile-key").splitlines()[0].startswith("disparity")
+    assert "band" not in page.text("#profile-key")
+    layers = [label.text for label in page.browser.find_elements(By.CSS_SELECTOR, "#layers label")]
+    assert layers == ["Left image", "Disparity", "Confidence", "Validity"]
+    bands = read_layers(tmp_path / "out" / "intervals.tif")
+    disparity = np.where(read_layers(tmp_path / "out" / "validity.tif")[0] & INVALID == 0, bands[0], np.nan)
+    column = int(np.flatnonzero(np.isfinite(disparity[20]))[0])
+    for name, steps in (("row", 0), ("column", column)):
+        page.find(f"#{name}").send_keys(Keys.HOME if name == "column" else "", *[Keys.ARROW_RIGHT] * steps)
+    words = page.text("#pixel").replace("\u2212", "-")
+    assert f"disparity {disparity[20, column]:.1f}"[:-1] in words
+    assert "interval " not in words.replace("interval regularised", "")
+    assert page.complaints() == []
+
+
+@pytest.mark.parametrize("shape", [(3000, 12), (12, 3000)])
+def test_page__of_a_thin_image_has_a_map_to_click_on(browser, tmp_path, shape):
+    path, _ = reported(tmp_path, *random_bands(*shape))
+    page = Page(browser, path)
+    size = page.find("#map canvas").size
+    assert 100 < min(size.values()) < max(size.values()) < 1300
     assert page.complaints() == []
 
 

@@ -33,10 +33,10 @@ def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterato
             raise SatIntervalsError(f"{path} cannot be written: {reason}: make room or check its rights") from error
 
 
-def fitting(shape: tuple[int, int], longest: int) -> tuple[int, int]:
-    """The shape of a picture of so many pixels, its longer side at most ``longest``."""
-    scale = min(1.0, longest / max(shape))
-    return max(1, round(shape[0] * scale)), max(1, round(shape[1] * scale))
+def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:
+    """Rows and columns of so many pixels that a picture, ``(height, width)`` inches, has the dots for."""
+    rows, columns = (max(1, min(size, round(length * dpi))) for size, length in zip(shape, inches, strict=True))
+    return rows, columns
 
 
 def limits(values: np.ndarray, otherwise: tuple[float, float]) -> tuple[float, float]:

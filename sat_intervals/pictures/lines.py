@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kinds import BLUE, ORANGE, SKY, VERMILION
 from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.pictures.curve import Curve, read_curve
@@ -14,7 +13,7 @@ from sat_intervals.products import INVALID
 from sat_intervals.results import Bands, Results
 from sat_intervals.tiling import Window
 
-_WIDTH = 12.0  # inches
+_WIDTH, _STRIP = 12.0, 1.0  # inches: of the page, and height of the image above a profile
 _KEYS = 4  # entries in a row of a legend
 _LOW = "#d4d4d4"
 
@@ -31,11 +30,7 @@ def draw_profile(
     columns
         First and last column drawn; by default all.
     """
-    first, last = columns or (0, results.region.width - 1)
-    results.check_pixel(row, first)
-    results.check_pixel(row, last)
-    if first > last:
-        raise SatIntervalsError(f"columns {first} to {last} are the wrong way round: give the first one first")
+    first, last = results.check_part(row, columns)
     bands = results.read(Window(row, 0, 1, results.region.width))
     valid = bands.validity & INVALID == 0
     lines = [np.where(valid, band, np.nan) for band in (bands.lower, bands.upper, bands.disparity)]
@@ -43,14 +38,17 @@ def draw_profile(
     lines += [bands.truth, bands.low(results.config)]
     lower, upper, disparity, truth, low = (np.repeat(line[0, first : last + 1], 2) for line in lines)
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
-    title = f"Row {row}, columns {first} to {last}; where there is no band, no pixel is valid"
+    has_intervals = results.config.interval is not None
+    mark = "band" if has_intervals else "black line"
+    title = f"Row {row}, columns {first} to {last}; where there is no {mark}, no pixel is valid"
     with page(path, (_WIDTH, 5.4), dpi, title) as figure:
         strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
-        _draw_strip(strip, results, row, first, last, round(_WIDTH * dpi))
+        _draw_strip(strip, results, row, first, last, dpi)
         if low.any():
             over = chart.get_xaxis_transform()
             chart.fill_between(edges, 0, 1, where=low, transform=over, color=_LOW, lw=0, label="low confidence")
-        chart.fill_between(edges, lower, upper, color=SKY, alpha=0.7, lw=0.8, label="interval")
+        if has_intervals:
+            chart.fill_between(edges, lower, upper, color=SKY, alpha=0.7, lw=0.8, label="interval")
         if np.isfinite(truth).any():
             chart.plot(edges, truth, color=VERMILION, lw=1.2, label="truth")
         chart.plot(edges, disparity, color="black", lw=0.9, label="disparity")
@@ -79,14 +77,17 @@ def draw_curve(results: Results, path: Path, row: int, column: int, dpi: int = D
         if curve.lower is not None:
             _draw_cut(below, curve, results)
         if np.isfinite(pixel.lower):
-            text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"
-            bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "label": text}
+            text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"  # seen though it may have no width
+            bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "marker": "|", "ms": 9, "mew": 3, "label": text}
             below.plot([pixel.lower, pixel.upper], [-0.08, -0.08], **bar)
-        for chart, label in ((above, "{} {:.2f} px"), (below, None)):
-            lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
-            for name, place, colour, style in lines:
-                if np.isfinite(place):
-                    chart.axvline(place, color=colour, lw=1, ls=style, label=label and label.format(name, place))
+        lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
+        for name, place, colour, style in lines:
+            if not np.isfinite(place):
+                continue
+            shown = across[0] <= place <= across[1]
+            label = f"{name} {place:.2f} px" + ("" if shown else ", outside the range shown")
+            above.axvline(place, color=colour, lw=1, ls=style, label=label)
+            below.axvline(place, color=colour, lw=1, ls=style)
         below.set_ylim(-0.14, 1.06)
         unit = "aggregated by SGM" if results.config.sgm else "not aggregated"
         _finish_chart(above, "", f"cost, {unit}", across)
@@ -105,10 +106,12 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     assert curve.upper is not None
     assert results.config.interval is not None
     level = float(results.config.interval.alpha)
-    chart.axhline(level, color=INK, lw=0.8, ls="--", label=f"alpha = {level:g}")
+    chart.axhline(level, color=INK, lw=0.8, ls="--")
+    right = chart.get_yaxis_transform()
+    chart.text(1, level, f"alpha = {level:g}", transform=right, ha="right", va="bottom", color=INK)
     cut = curve.cut
     chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
-    text = f"its interval, {curve.lower} to {curve.upper} px"
+    text = f"interval of the cut, {curve.lower} to {curve.upper} px"
     chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)
     arrow = {"arrowstyle": "<->", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
     chart.annotate("", (curve.lower, 0.05), (curve.upper, 0.05), arrowprops=arrow)
@@ -125,13 +128,13 @@ def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] 
         chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_KEYS, frameon=False, borderaxespad=0.2)
 
 
-def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, longest: int) -> None:
+def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, dpi: int) -> None:
     """The left image around a part of a row, which is a dashed line."""
     columns = last - first + 1
     reach = max(1, round(columns / 26))
     top, bottom = max(0, row - reach), min(results.region.height, row + reach + 1)
     window = Window(top, first, bottom - top, columns)
-    image = results.read_small_left(window, fitting((window.height, window.width), longest))
+    image = results.read_small_left(window, fitting((window.height, window.width), (_STRIP, _WIDTH), dpi))
     low, high = limits(image, (0, 1))
     extent = (first - 0.5, last + 0.5, bottom - 0.5, top - 0.5)
     panel.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, aspect="auto", interpolation="nearest")

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -18,7 +18,7 @@ from sat_intervals.products import INVALID
 from sat_intervals.results import Results
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map: more pixels than its dots are thinned out
-_TEXT = 7.5  # inches that the words over a map take
+_TEXT = 8.5  # inches that the words over a map take
 _STRETCHED = 5.0  # ratio of sides beyond which a map's pixels are no longer square
 _EDGE = "#888888"
 
@@ -26,14 +26,13 @@ _EDGE = "#888888"
 def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
     """Draw left image, disparity, interval width, confidence and validity side by side, read through overviews."""
     rows, columns = _arrangement(results.shape)
-    longest = _PANEL if columns > 1 else _LARGE
-    shape = fitting(results.shape, round(longest * dpi))
+    width, height = _inches(results.shape, _PANEL if columns > 1 else _LARGE)
+    shape = fitting(results.shape, (height, width), dpi)
     bands = results.read_small(shape)
     valid = bands.validity & INVALID == 0
     disparity = np.where(valid, bands.disparity, np.nan)
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
     search = results.config.disparity
-    width, height = _inches(results.shape, longest)
     thinned = shape if shape != results.shape else None
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
     with page(path, size, dpi, _caption(results, thinned)) as figure:
@@ -41,7 +40,7 @@ def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
         _draw_grey(panels[0], results, bands.image, limits(bands.image, (0, 1)))
         fitted = limits(disparity, (search.minimum, search.maximum))
         _draw_map(panels[1], results, disparity, ("Disparity", "px"), "viridis", fitted)
-        _draw_map(panels[2], results, widths, ("Interval width", "px"), "magma", (0, limits(widths, (0, 1))[1]))
+        _draw_map(panels[2], results, widths, ("Interval width", "px"), "magma", (0, limits(widths, (0, 1))[1]), 0.5)
         _draw_map(panels[3], results, bands.confidence, ("Confidence", "0 to 1"), "cividis", (0, 1))
         _draw_validity(panels[4], panels[5], results, bands.validity)
 
@@ -53,7 +52,11 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
     """
     if results.truth is None:
         raise SatIntervalsError(f"{results.out}: errors need a truth: give --truth")
-    step = max(1, -(-max(results.shape) // round(_LARGE * dpi)))
+    if results.config.interval is None:
+        raise SatIntervalsError(f"{results.out} has no intervals, its setting interval is null: none can be wrong")
+    width, height = _inches(results.shape, _LARGE)
+    drawn = fitting(results.shape, (height, width), dpi)
+    down, across = (-(-size // dots) for size, dots in zip(results.shape, drawn, strict=True))
     judged, missed = 0, np.zeros(2, np.int64)
     images, kinds = [], []
     for row, bands in results.strips():
@@ -61,13 +64,13 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
         above, below = valid & (bands.truth > bands.upper), valid & (bands.truth < bands.lower)
         judged += int((valid & np.isfinite(bands.truth) & np.isfinite(bands.lower)).sum())
         missed += above.sum(), below.sum()
-        chosen = np.s_[-row % step :: step, ::step]
-        images.append(bands.image[chosen])
-        kinds.append(np.where(above, 0.0, np.where(below, 1.0, np.nan))[chosen])
-    width, height = _inches(results.shape, _LARGE)
+        chosen = np.s_[-row % down :: down, ::across]
+        images.append(bands.image[chosen].copy())  # a view would keep all of the strip
+        kinds.append(np.where(above, 0.0, np.where(below, 1.0, np.nan))[chosen].copy())
     image, kind = np.concatenate(images), np.concatenate(kinds)
     low, high = limits(image, (0, 1))
-    title = _caption(results, None) + (f", one row and column in {step} shown" if step > 1 else "")
+    thinned = [f"one {name} in {step}" for name, step in (("row", down), ("column", across)) if step > 1]
+    title = ", ".join([_caption(results, None), *thinned]) + (" shown" if thinned else "")
     with page(path, (max(_TEXT, width + 0.9), height + 1.4), dpi, title) as figure:
         panel = figure.subplots()
         # Paler than the overview's: the colours are to be seen, not the white roofs.
@@ -106,6 +109,8 @@ def _show(panel: Axes, results: Results, pixels: np.ndarray, **options: Any) -> 
     panel.xaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
     panel.yaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
     panel.tick_params(labelsize=8, colors=INK)
+    panel.set_xlabel("column", fontsize=8, color=INK)
+    panel.set_ylabel("row", fontsize=8, color=INK)
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
     aspect: Literal["equal", "auto"] = "equal" if max(height / width, width / height) <= _STRETCHED else "auto"
     return panel.imshow(pixels, extent=extent, aspect=aspect, interpolation="nearest", **options)
@@ -118,17 +123,26 @@ def _draw_grey(panel: Axes, results: Results, image: np.ndarray, shown: tuple[fl
 
 
 def _draw_map(
-    panel: Axes, results: Results, values: np.ndarray, name: tuple[str, str], colours: str, shown: tuple[float, float]
+    panel: Axes,
+    results: Results,
+    values: np.ndarray,
+    name: tuple[str, str],
+    colours: str,
+    shown: tuple[float, float],
+    power: float = 1.0,
 ) -> None:
-    """A layer, its title and unit in ``name``, with a colour bar; pointed ends tell of values beyond those shown."""
-    drawn = _show(panel, results, values, cmap=colours, vmin=shown[0], vmax=shown[1])
+    """A layer, its title and unit in ``name``, with a colour bar; pointed ends tell of values beyond those shown.
+
+    With a ``power`` of 1/2 a few large values do not make all others dark.
+    """
+    drawn = _show(panel, results, values, cmap=colours, norm=PowerNorm(power, *shown))
     panel.set_title(name[0])
     known = values[np.isfinite(values)]
     beyond = bool((known < shown[0]).any()), bool((known > shown[1]).any())
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
     assert panel.figure is not None
     bar = panel.figure.colorbar(drawn, ax=panel, extend=extend, shrink=0.9, aspect=25, pad=0.02)
-    bar.set_label(name[1])
+    bar.set_label(name[1] if power == 1 else f"{name[1]}, square-root scale")
     bar.ax.tick_params(labelsize=8)
     say_empty(panel, values, "no value")
 

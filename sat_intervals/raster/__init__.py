@@ -3,7 +3,7 @@
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
-from sat_intervals.raster.layers import north_up, read_layers, read_tags, write_layer, write_once
+from sat_intervals.raster.layers import north_up, read_layers, read_shape, read_tags, write_layer, write_once
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
 from sat_intervals.raster.surfaces import read_heights, read_place
@@ -29,6 +29,7 @@ __all__ = [
     "read_heights",
     "read_layers",
     "read_place",
+    "read_shape",
     "read_small_image",
     "read_small_layers",
     "read_tags",

@@ -60,6 +60,12 @@ def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> n
         return np.asarray(dataset.read(window=area))
 
 
+def read_shape(path: str | os.PathLike[str]) -> tuple[int, int, int]:
+    """Bands, rows and columns of a file."""
+    with opened(str(path)) as dataset:
+        return dataset.count, dataset.height, dataset.width
+
+
 def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:
     """What a file says of itself as a whole."""
     with opened(str(path)) as dataset:

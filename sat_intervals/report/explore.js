@@ -8,8 +8,10 @@ const COLOURS = {
   magma: ["#000004", "#1d1147", "#51127c", "#832681", "#b73779", "#e75263", "#fc8961", "#fec488", "#fcfdbf"],
   cividis: ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#e1cc55", "#fee838"],
 };
+const STRETCHED = 5; // ratio of sides beyond which the map's pixels are no longer square
 const NOTHING = "#dedede";
 const MISSES = [["truth above the interval", "#d55e00"], ["truth below the interval", "#56b4e9"]];
+const hasIntervals = contents.run.settings.interval !== null;
 const data = {}; // values of every layer, row by row
 const chosen = { row: 0, column: 0 };
 
@@ -52,11 +54,14 @@ function makeLayers() {
     { name: "Left image", values: data.image, colours: COLOURS.grey, shown: [first, first + 254 * step] },
     { name: "Disparity", unit: "px", values: data.disparity, colours: COLOURS.viridis,
       shown: limits(data.disparity, [search.minimum, search.maximum]) },
-    { name: "Interval width", unit: "px", values: width, colours: COLOURS.magma, shown: [0, limits(width, [0, 1])[1]] },
     { name: "Confidence", values: data.confidence, colours: COLOURS.cividis, shown: [0, 1] },
     { name: "Validity", values: data.kind, kinds: pixels.kinds.map((kind) => [kind.meaning, kind.colour]) },
   ];
-  if (data.truth) layers.push({ name: "Misses", values: data.missed, kinds: [null, ...MISSES] });
+  if (hasIntervals) {
+    const shown = [0, limits(width, [0, 1])[1]];
+    layers.splice(2, 0, { name: "Interval width", unit: "px, square-root scale", values: width, colours: COLOURS.magma, shown, power: 0.5 });
+  }
+  if (data.truth && hasIntervals) layers.push({ name: "Misses", values: data.missed, kinds: [null, ...MISSES] });
   return layers;
 }
 
@@ -64,7 +69,8 @@ function makeLayers() {
 function painter(layer) {
   if (!layer.kinds) {
     const scale = scaleOf(layer.colours);
-    return (value) => scale((value - layer.shown[0]) / (layer.shown[1] - layer.shown[0]));
+    const place = (value) => Math.max(0, (value - layer.shown[0]) / (layer.shown[1] - layer.shown[0]));
+    return (value) => scale(place(value) ** (layer.power ?? 1));
   }
   const kinds = layer.kinds.map((kind) => kind && rgb(kind[1]));
   const pale = scaleOf(["#333333", "#bbbbbb"]); // the left image, where there is no kind
@@ -130,7 +136,7 @@ function steps(values, back, edge, y) {
 function drawProfile(width) {
   const [lower, upper, disparity, low] = [data.lower, data.upper, data.disparity, data.low].map(rowOf);
   const truth = data.truth ? rowOf(data.truth) : new Float32Array();
-  const known = [...lower, ...upper, ...truth].filter(Number.isFinite);
+  const known = [...lower, ...upper, ...disparity, ...truth].filter(Number.isFinite);
   const up = known.length ? [Math.min(...known) - 1, Math.max(...known) + 1] : [search.minimum - 1, search.maximum + 1];
   const across = [-0.5 * pixels.step, (pixels.columns - 0.5) * pixels.step];
   const { x, y, box, parts } = chart(width, 320, across, up, { across: "column", up: "disparity (px)" });
@@ -147,7 +153,7 @@ function drawProfile(width) {
     line(truth, "var(--truth)"),
     line(disparity, "var(--ink)"),
     svg("line", { x1: mark, x2: mark, y1: box.top, y2: box.bottom, stroke: "var(--quiet)", "stroke-dasharray": "3 3" }),
-    ...(lower.some(Number.isFinite) ? [] : [none]),
+    ...(disparity.some(Number.isFinite) ? [] : [none]),
   ];
 }
 
@@ -155,9 +161,8 @@ function drawProfile(width) {
 function describe() {
   const i = chosen.row * pixels.columns + chosen.column;
   const parts = [`Row ${chosen.row * pixels.step}, column ${chosen.column * pixels.step}: ${pixels.kinds[data.kind[i]].meaning}`];
-  if (Number.isFinite(data.lower[i])) {
-    parts.push(`disparity ${fixed(data.disparity[i], 2)} px, interval ${fixed(data.lower[i], 1)} to ${fixed(data.upper[i], 1)} px`);
-  }
+  if (Number.isFinite(data.disparity[i])) parts.push(`disparity ${fixed(data.disparity[i], 2)} px`);
+  if (Number.isFinite(data.lower[i])) parts.push(`interval ${fixed(data.lower[i], 1)} to ${fixed(data.upper[i], 1)} px`);
   if (Number.isFinite(data.confidence[i])) parts.push(`confidence ${fixed(data.confidence[i], 2)}`);
   if (data.truth && Number.isFinite(data.truth[i])) parts.push(`truth ${fixed(data.truth[i], 2)} px`);
   return parts.join(", ");
@@ -180,16 +185,17 @@ function choose(row, column, redraw) {
   redraw();
 }
 
-/** The map of the shape of the images, and its buttons. */
+/** The map, of the shape of the images unless they are thin, and its buttons. */
 function showMap() {
   const map = find("map");
   Object.assign(map.firstElementChild, { width: pixels.columns, height: pixels.rows });
-  map.style.aspectRatio = `${pixels.columns} / ${pixels.rows}`;
-  map.parentElement.classList.toggle("wide", pixels.columns > 2 * pixels.rows);
-  if (pixels.rows > 1.6 * pixels.columns) map.style.width = `${Math.max(25, (160 * pixels.columns) / pixels.rows)}%`;
+  const tall = Math.min(Math.max(pixels.rows / pixels.columns, 1 / STRETCHED), STRETCHED);
+  map.style.aspectRatio = 1 / tall;
+  map.parentElement.classList.toggle("wide", tall < 0.5);
+  if (tall > 1.6) map.style.width = `${160 / tall}%`;
   find("thinned").textContent =
     (pixels.step > 1 ? `This page holds one row in ${pixels.step} and one column in ${pixels.step}. ` : "") +
-    "Click on the map or move the sliders to see the intervals along another row.";
+    "Click on the map or move the sliders to see another row.";
   const layers = makeLayers();
   for (const layer of layers) {
     const input = element("input", { type: "radio", name: "layer", ...(layer === layers[0] && { checked: "" }) });
@@ -201,9 +207,10 @@ function showMap() {
 
 /** The profile, and what chooses its row: the sliders and the map. */
 function showProfile() {
-  const entries = [["interval", "var(--band)"], ["disparity", "var(--ink)", true], ["low confidence", "var(--low)"]];
+  const entries = [["disparity", "var(--ink)", true], ["low confidence", "var(--low)"]];
+  if (hasIntervals) entries.unshift(["interval", "var(--band)"]);
   if (data.truth) entries.push(["truth", "var(--truth)", true]);
-  const gaps = element("span", { class: "quiet" }, "where there is no band, no pixel is valid");
+  const gaps = element("span", { class: "quiet" }, `where there is no ${hasIntervals ? "band" : "black line"}, no pixel is valid`);
   find("profile-key").append(...legend(entries), gaps);
   const redraw = drawing(find("profile"), 320, "Interval, disparity and truth along the chosen row", drawProfile);
   Object.assign(find("row"), { max: pixels.rows - 1 });
