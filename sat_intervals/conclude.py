@@ -28,7 +28,7 @@ Item = TypeVar("Item")
 STRIP_PIXELS = 1 << 20
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage ("lease", "kernels", "images", "tiles", "bands", "files"), how much is done, of how much."""
+"""Called with a stage ("lease", "kernels", "images", "tiles", "bands", "files"), how much is done, how much in all."""
 
 
 def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 import errno
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from distributed import Client, Future, KilledWorker, wait
+from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
 from sat_intervals.cluster import Jobs, connected
@@ -116,16 +116,17 @@ def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Sca
         futures = client.map(
             measure_block, [image] * len(windows), windows, pure=False, retries=job.config.cluster.retries
         )
-    watch, left = Jobs(client), set(futures)
-    while left:
-        with suppress(TimeoutError):
-            ended, left = wait(left, timeout=_LOOK_AGAIN, return_when="FIRST_COMPLETED")
-            for future in ended:
-                error = _ended_with(future)
-                if error is not None:
-                    raise RunError(f"{image.path} could not be measured: {_reason(error)}") from error
-        watch.check()
-        progress("images", len(windows) - len(left), len(windows))
+    landing = _Landing(client)
+    for future in futures:
+        landing.expect(future)
+    done = 0
+    while done < len(windows):
+        if (landed := landing.next()) is not None:
+            error = _ended_with(landed)
+            if error is not None:
+                raise RunError(f"{image.path} could not be measured: {_reason(error)}") from error
+            done += 1
+        progress("images", done, len(windows))
     with _scheduler_needed():
         return scale_of(client.gather(futures))
 
@@ -209,10 +210,30 @@ def _waiting(job: Job) -> Iterator[Tile]:
     return (tile for tile in job.store.grid if tile.name not in done)
 
 
+class _Landing:
+    """Futures as they end."""
+
+    def __init__(self, client: Client) -> None:
+        self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
+        self._jobs = Jobs(client)
+
+    def expect(self, future: Future[Any]) -> None:
+        """Wait for one more, which whoever calls keeps alive."""
+        future.add_done_callback(self._ended.put)
+
+    def next(self) -> Future[Any] | None:
+        """The next that ends; None where none does for a while, so that whoever waits can look around."""
+        try:
+            return self._ended.get(timeout=_LOOK_AGAIN)
+        except Empty:
+            self._jobs.check()
+            return None
+
+
 class _Flight:
     """Tiles on their way through a cluster; iterates over those that land: job number, tile, error or None.
 
-    Where none lands for a while, None comes in its place, so that whoever waits can look around.
+    None in place of all where none lands for a while.
 
     dask blames a worker's death on every tile that it held. Those blamed too often are tried again at the end, one at a
     time, so that no tile fails for another.
@@ -220,20 +241,17 @@ class _Flight:
 
     def __init__(self, client: Client, jobs: Sequence[Job], waiting: Iterator[tuple[int, Tile]]) -> None:
         self._client, self._jobs, self._waiting = client, jobs, waiting
-        self._landed: SimpleQueue[Future[None]] = SimpleQueue()
+        self._landing = _Landing(client)
         self._tiles: dict[str, tuple[int, Tile, Future[None]]] = {}
         self._suspects: list[tuple[int, Tile]] = []
-        self._watch = Jobs(client)
         self._width, self._looked = 2, float("-inf")
 
     def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None] | None]:
         self._fill()
         while self._tiles:
-            try:
-                future = self._landed.get(timeout=_LOOK_AGAIN)
-            except Empty:
+            future = self._landing.next()
+            if future is None:
                 self._fill()
-                self._watch.check()
                 yield None
                 continue
             error, key = _ended_with(future), str(future.key)
@@ -265,7 +283,7 @@ class _Flight:
         with _scheduler_needed():
             future = self._client.submit(match_tile, job, tile, key=key, retries=job.config.cluster.retries, pure=False)
         self._tiles[key] = i, tile, future
-        future.add_done_callback(self._landed.put)
+        self._landing.expect(future)
 
 
 def _ended_with(future: Future[None]) -> BaseException | None:
