@@ -1,0 +1,173 @@
+"""The matcher as a method of CARS, in its own pipeline: ``dense_matching: {method: sat_intervals}``.
+
+It takes from CARS what is CARS' own, the size of tiles, their margins and the dataset of a tile, and puts disparity,
+interval and confidence where its triangulation looks for them.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from cars.applications.dense_matching import dense_matching_algo, dense_matching_wrappers
+from cars.applications.dense_matching.methods.pandora_method import PandoraMethod
+from cars.core import constants as names
+from cars.data_structures import cars_dataset
+from json_checker import Or
+from pandora.margins import Margins
+
+from sat_intervals.config import Config, load_config
+
+# Bands of `match_arrays` under the names of CARS' triangulation. Of the first CARS makes its ambiguity, 1 - confidence.
+_INDICATORS = {
+    "confidence": "confidence_from_ambiguity.cars_1",
+    "lower": "confidence_from_interval_bounds_inf.cars_3",
+    "upper": "confidence_from_interval_bounds_sup.cars_3",
+}
+
+
+class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore[call-arg, misc]
+    """Disparities with intervals, tile by tile of CARS.
+
+    Parameters
+    ----------
+    conf
+        What CARS' configuration says of ``dense_matching``. ``settings`` holds this package's own, by sections, without
+        the search range, which CARS knows. The rest is Pandora's and does not matter.
+
+    Confidence is relative to the whole search range (``ambiguity: {normalization: range}``) unless the settings say
+    otherwise: percentiles of one tile would make neighbouring tiles differ.
+
+    Raises
+    ------
+    SatIntervalsError
+        Settings that cannot be used.
+    """
+
+    def __init__(self, conf: Mapping[str, Any] | None) -> None:
+        super(PandoraMethod, self).__init__(conf=conf)
+        self.schema = {
+            "method": str,
+            "settings": dict,
+            "performance_map_method": list,
+            "perf_ambiguity_threshold": float,
+            "generate_ambiguity": bool,
+            "loader_conf": Or(dict, None),
+            "confidence_filtering": dict,
+        }
+        # CARS' pipeline asks every method for Pandora's maps of risk and its filtering by them: here are intervals.
+        self.used_config: dict[str, Any] = {
+            "method": "sat_intervals",
+            "settings": dict((conf or {}).get("settings") or {}),
+            "performance_map_method": ["intervals"],
+            "perf_ambiguity_threshold": 0.6,
+            "generate_ambiguity": True,
+            "loader_conf": None,
+            "confidence_filtering": {},
+        }
+        self.method = "sat_intervals"
+        self.corr_config: dict[str, Any] = {}
+        self.loader = _NoLoader()
+        overlap = self._config(0, 0).tiles.overlap
+        self.margins = Margins(overlap, overlap, overlap, overlap)
+
+    def _config(self, minimum: int, maximum: int) -> Config:
+        """The settings over a search range."""
+        settings = self.used_config["settings"]
+        ambiguity = settings.get("ambiguity", {})
+        if isinstance(ambiguity, Mapping):
+            ambiguity = {"normalization": "range", **ambiguity}
+        return load_config({**settings, "ambiguity": ambiguity, "disparity": {"minimum": minimum, "maximum": maximum}})
+
+    def run(
+        self,
+        left_image_object: xr.Dataset,
+        right_image_object: xr.Dataset,
+        disp_range_grid: Any,
+        saving_info: Any = None,
+        compute_disparity_masks: bool = False,
+        crop_with_range: int | None = None,
+        left_overlaps: Any = None,
+        margins_to_keep: int = 0,
+        texture_bands: list[int] | None = None,
+        classif_bands_to_mask: list[Any] | None = None,
+        used_band: str = "b0",
+    ) -> xr.Dataset:
+        """Match one tile with its margins; parameters and result are those of CARS' abstract method.
+
+        The whole range of the tile is searched in all its pixels; where CARS' memory does not allow it, it is cropped
+        around nil as CARS does.
+        """
+        from sat_intervals.in_memory import match_arrays  # not for every `import cars`: it sets up numba
+
+        grids = dense_matching_algo.compute_disparity_grid(
+            disp_range_grid.data, left_image_object, right_image_object, used_band, False
+        )
+        minimum, maximum = int(np.floor(grids[0].min())), int(np.ceil(grids[1].max()))
+        share = 1.0 if crop_with_range is None else min(1.0, crop_with_range / max(1, maximum - minimum))
+        minimum, maximum = round(share * minimum), round(share * maximum)
+        beyond = (grids[0] < minimum) | (grids[1] > maximum)
+        left, right = (_of_band(tile, used_band) for tile in (left_image_object, right_image_object))
+        masked = left[names.EPI_MSK].values != 0
+        if classif_bands_to_mask and names.EPI_CLASSIFICATION in left:
+            classes = left[names.EPI_CLASSIFICATION].sel(band_classif=classif_bands_to_mask)
+            masked |= (classes.values != 0).any(axis=0)
+        matched = match_arrays(
+            np.ma.masked_array(_pixels(left, used_band), masked),
+            np.ma.masked_array(_pixels(right, used_band), right[names.EPI_MSK].values != 0),
+            self._config(minimum, maximum),
+        )
+        result: xr.Dataset = dense_matching_wrappers.create_disp_dataset(
+            _as_pandora(matched, left),
+            left,
+            right,
+            compute_disparity_masks=compute_disparity_masks,
+            disp_min_grid=np.maximum(grids[0], minimum),
+            disp_max_grid=np.minimum(grids[1], maximum),
+            cropped_range=beyond if share < 1 else None,
+            margins_to_keep=margins_to_keep,
+            texture_bands=texture_bands,
+        )
+        cars_dataset.fill_dataset(
+            result,
+            saving_info=saving_info,
+            window=cars_dataset.get_window_dataset(left_image_object),
+            profile=cars_dataset.get_profile_rasterio(left_image_object),
+            attributes={names.CROPPED_DISPARITY_RANGE: share < 1},
+            overlaps=left_overlaps,
+        )
+        return result
+
+
+class _NoLoader:
+    """What CARS asks of the loader of Pandora's configuration: there is none."""
+
+    def get_conf(self) -> dict[str, Any]:
+        return {}
+
+    def check_conf(self, conf: dict[str, Any], *images: Any) -> dict[str, Any]:
+        return conf
+
+
+def _of_band(tile: xr.Dataset, band: str) -> xr.Dataset:
+    """The tile with the mask of one band."""
+    mask = tile[names.EPI_MSK].sel({names.BAND_IM: band}, drop=True)
+    return tile.drop_vars(names.EPI_MSK).assign({names.EPI_MSK: mask})
+
+
+def _pixels(tile: xr.Dataset, band: str) -> np.ndarray:
+    return np.asarray(tile[names.EPI_IMAGE].sel({names.BAND_IM: band}).values)
+
+
+def _as_pandora(matched: xr.Dataset, tile: xr.Dataset) -> xr.Dataset:
+    """The dataset that Pandora would return, whose validity bits are those of `products`."""
+    place = (names.ROW, names.COL)
+    layers = np.stack([matched[band].values for band in _INDICATORS], axis=-1)
+    return xr.Dataset(
+        {
+            "disparity_map": (place, matched["disparity"].values),
+            "validity_mask": (place, matched["validity"].values.astype(np.int64)),
+            "confidence_measure": ((*place, "indicator"), layers),
+        },
+        coords={name: tile.coords[name] for name in place} | {"indicator": list(_INDICATORS.values())},
+    )
