@@ -37,7 +37,8 @@ def dsm(
     """Make a surface model of the points in the folders OUT, which `triangulate` wrote.
 
     Bands: height, height_lower, height_upper, count, confidence, agreement. Heights count from the ellipsoid of WGS 84
-    unless --geoid is given. A point reaches the cells whose centre lies within --radius; the others stay no data.
+    unless --geoid is given. A point reaches its cell and those whose centre lies within --radius; the others stay no
+    data.
     Where several OUT overlap, their intervals are intersected if they meet; else their hull is taken, and agreement is
     0.
     """

@@ -23,6 +23,8 @@ def export(out: Path, target: Path, form: str) -> None:
     s2p    rectified_disp.tif, rectified_mask.png (1 = valid),
            rectified_disp_confidence.tif
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
+
+    All have the size of the left image.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.export import export
 

@@ -32,12 +32,13 @@ def plot(
     OUT/errors.png     with a truth and intervals: where these miss it
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
+    OUT/dsm.png        where there is a dsm.tif: hillshade, height, width
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
+    from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
     from sat_intervals.results import open_results
 
     if columns is not None and row is None:
@@ -58,3 +59,6 @@ def plot(
     if pixel is not None:
         draw_curve(results, out / "curve.png", *pixel, dpi)
         click.echo(out / "curve.png")
+    if (out / "dsm.tif").exists():
+        draw_surface(out / "dsm.tif", out / "dsm.png", dpi)
+        click.echo(out / "dsm.png")

@@ -1,6 +1,7 @@
 """A run as the files that other photogrammetry tools take for their own.
 
-In all of them disparity is ``x_right - x_left`` of the epipolar pair, as here, and none has a CRS.
+In all of them disparity is ``x_right - x_left`` of the epipolar pair, as here, and none has a CRS. Files have the size
+of the left image, since these tools lay them on it; what is outside the region that was matched is not valid.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,10 @@ import numpy as np
 
 from sat_intervals.products import INVALID, Band
 from sat_intervals.raster import File, Georeferencing, OutputWriter
-from sat_intervals.results import open_run
+from sat_intervals.results import Run, open_run
+from sat_intervals.tiling import Window
+
+_ROWS = 512  # of the blocks that runs write
 
 
 class _Pixels(NamedTuple):
@@ -96,18 +100,29 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
         No run, or a file that cannot be written.
     """
     run, target = open_run(out), Path(target)
+    left = run.report["inputs"]["left"]
+    shape = left["height"], left["width"]
     folder, prefix = (target.parent, target.name) if form == "asp" else (target, "")
     rasters = FORMATS[form](prefix)
     files = [file for file, _ in rasters]
-    with OutputWriter(folder, files, *run.shape, Georeferencing(), {}) as writer:
-        for window in run.windows():
-            bands, validity = run.read_bands(window)
-            valid = (validity & INVALID == 0) & np.isfinite(bands[0])
-            disparity, lower, upper, confidence = np.where(valid, bands, np.float32(np.nan))
-            pixels = _Pixels(disparity, lower, upper, confidence, valid.astype(np.uint8))
-            writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))
+    with OutputWriter(folder, files, *shape, Georeferencing(), {}) as writer:
+        for row in range(0, shape[0], _ROWS):
+            pixels = _read(run, Window(row, 0, min(_ROWS, shape[0] - row), shape[1]))
+            writer.write(row, *(_filled(make(pixels), file) for file, make in rasters))
         writer.publish()
     return [folder / file.name for file in files]
+
+
+def _read(run: Run, window: Window) -> _Pixels:
+    """The pixels of a window of the left image."""
+    pixels = np.full((4, window.height, window.width), np.nan, np.float32)
+    inside = window.clipped(run.region)
+    if inside.height:
+        bands, validity = run.read_bands(inside.relative_to(run.region))
+        valid = (validity & INVALID == 0) & np.isfinite(bands[0])
+        pixels[:, *inside.relative_to(window).slices] = np.where(valid, bands, np.float32(np.nan))
+    disparity, lower, upper, confidence = pixels
+    return _Pixels(disparity, lower, upper, confidence, np.isfinite(disparity).astype(np.uint8))
 
 
 def _filled(bands: np.ndarray, file: File) -> np.ndarray:

@@ -167,8 +167,14 @@ def _check_cover(sensors: Sensors, region: Window, right_width: int, minimum: in
 
 
 def _check_points(points: np.ndarray) -> None:
+    lost = 1 - np.isfinite(points).all(axis=1).mean()
+    if lost > 0:
+        raise SatIntervalsError(
+            f"shareloc finds no point for {100 * lost:.0f} % of the lines of sight: check which model and which grid "
+            "belong to the left and the right image; a scene across the 180th meridian is beyond it"
+        )
     residual, height = float(np.median(points[:, 3])), float(np.median(points[:, 2]))
-    if not (np.isfinite(points).all() and residual <= _FOREIGN_RESIDUAL and _GROUND[0] <= height <= _GROUND[1]):
+    if not (residual <= _FOREIGN_RESIDUAL and _GROUND[0] <= height <= _GROUND[1]):
         raise SatIntervalsError(
             f"the models do not fit these images: lines of sight pass each other by {residual:.1f} m and meet at "
             f"{height:.0f} m (medians): check which model and which grid belong to the left and the right image"

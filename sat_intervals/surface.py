@@ -1,7 +1,8 @@
 """From the points of one or several runs to a surface model whose cells carry intervals of height.
 
 The cells are made in tiles of a few rows, each of the points that may reach it: memory follows the tile. Every point
-reaches the cells whose centre lies within a radius of it; cells that none reaches are no data, never filled.
+reaches the cell it falls in and those whose centre lies within a radius of it; cells that none reaches are no data,
+never filled.
 """
 
 import math
@@ -120,7 +121,14 @@ class Cloud:
         known = np.isfinite(longitude)
         self.points += int(known.sum())
         if known.any():
-            x, y = self._projection.place(longitude[known], latitude[known])
+            longitude, latitude = longitude[known], latitude[known]
+            if np.isnan(self._projection.undulation(longitude, latitude)).any():
+                raise SatIntervalsError(
+                    f"the grid of geoid heights ends before the points of {self.run.out}, at longitudes "
+                    f"{longitude.min():.4f} to {longitude.max():.4f}, latitudes {latitude.min():.4f} to "
+                    f"{latitude.max():.4f}: give one that covers them"
+                )
+            x, y = self._projection.place(longitude, latitude)
             self._extents.append((window, Extent(x.min(), y.min(), x.max(), y.max())))
 
     @property
@@ -178,7 +186,8 @@ def make_surface(
     crs
         A projected CRS in metres; by default the UTM zone of the first points.
     radius
-        Metres from a point within which the centres of cells are reached; by default the side of a cell.
+        Metres from a point within which the centres of cells are reached, beside the cell it falls in; by default the
+        side of a cell.
     interval
         The cell's interval: ``envelope`` holds the intervals of all points that reach it; ``mean`` is the weighted mean
         of their bounds. The intervals of several runs are intersected where they meet, else the hull of all is taken.
@@ -312,7 +321,9 @@ def _fused(runs: Sequence[_One]) -> np.ndarray:
     weights = np.stack([run.weight for run in runs])
     weight = np.where(np.isfinite(weights).any(axis=0), np.nansum(weights, axis=0), np.nan)
     height = np.nansum([run.weight * run.height for run in runs], axis=0) / weight
-    confidence = np.nansum([run.weight * run.confidence for run in runs], axis=0) / weight
+    judged = np.nansum([np.where(np.isnan(run.confidence), np.nan, run.weight) for run in runs], axis=0)
+    confidence = np.nansum([run.weight * run.confidence for run in runs], axis=0)
+    confidence = np.divide(confidence, judged, out=np.full(judged.shape, np.nan), where=judged > 0)
     lowers, uppers = (np.stack([getattr(run, name) for run in runs]) for name in ("lower", "upper"))
     inner = np.fmax.reduce(lowers), np.fmin.reduce(uppers)
     outer = np.fmin.reduce(lowers), np.fmax.reduce(uppers)
@@ -321,10 +332,17 @@ def _fused(runs: Sequence[_One]) -> np.ndarray:
     several = np.isfinite(weights).sum(axis=0) > 1
     bands = {
         "height": np.clip(height, lower, upper),
-        "height_lower": lower,
-        "height_upper": upper,
+        "height_lower": _outwards(lower, -np.inf),
+        "height_upper": _outwards(upper, np.inf),
         "count": np.where(np.isfinite(weight), sum(run.points for run in runs), np.nan),
         "confidence": confidence,
         "agreement": np.where(several, meeting, np.nan),
     }
     return np.stack([bands[band.name] for band in SURFACE]).astype(np.float32)
+
+
+def _outwards(bound: np.ndarray, end: float) -> np.ndarray:
+    """The float32 next to a bound, on the side of ``end`` where it is not the bound itself."""
+    single = bound.astype(np.float32)
+    inside = single > bound if end < 0 else single < bound
+    return np.where(inside, np.nextafter(single, np.float32(end)), single)

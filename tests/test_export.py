@@ -1,5 +1,7 @@
 """The files of other tools, field by field."""
 
+import json
+
 import numpy as np
 import pytest
 import rasterio
@@ -82,6 +84,21 @@ def test_export__otb(run, tmp_path):
     assert dtype == "float32"
     assert_array_equal(pixels, [np.where(valid, bands[0], 0), np.zeros(SHAPE)])
     assert_array_equal(look(tmp_path / "mask.tif")[0][0], np.where(valid, 255, 0))
+
+
+@pytest.mark.parametrize("row", [0, 600, 40])
+def test_export__a_region_lies_at_its_place_in_the_left_image(tmp_path, row):
+    bands, validity, _ = random_bands(30, 20)
+    out = write_run(tmp_path, bands, validity)
+    report = json.loads((out / "run.json").read_text())
+    report["inputs"]["left"] |= {"height": 630, "width": 50}
+    report["tiles"]["region"] |= {"row": row, "column": 7}
+    (out / "run.json").write_text(json.dumps(report))
+    exported(out, "s2p", tmp_path / "s2p")
+    expected = np.full((630, 50), np.nan, np.float32)
+    expected[row : row + 30, 7:27] = np.where(validity & INVALID == 0, bands[0], np.nan)
+    assert_array_equal(look(tmp_path / "s2p" / "rectified_disp.tif")[0][0], expected)
+    assert_array_equal(look(tmp_path / "s2p" / "rectified_mask.png")[0][0], np.isfinite(expected))
 
 
 def test_export__refuses_what_is_no_run_and_what_it_does_not_know(run, tmp_path):

@@ -25,8 +25,9 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kinds import KINDS, ORANGE, SKY, VERMILION, classify
 from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
 from sat_intervals.pictures.curve import read_curve
+from sat_intervals.pictures.surface import _relief
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
-from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, write_layer
+from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.scene import make_scene
 from sat_intervals.tiling import Window
@@ -253,6 +254,40 @@ def test_plot__without_intervals_claims_none(tmp_path, words):
     assert "Row 20, columns 0 to 49; where there is no black line, no pixel is valid" in words
     with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: none can be wrong"):
         draw_errors(open_results(out), tmp_path / "errors.png")
+
+
+def write_surface(out, height, agreement=np.nan):
+    """A surface of intervals 3 m wide beside a run, whose confidence is one half."""
+    ones = np.ones_like(height)
+    bands = np.stack([height, height - 1, height + 2, ones, 0.5 * ones, agreement * ones]).astype(np.float32)
+    with OutputWriter(out, [surface_file("dsm.tif")], *height.shape, PLACE, {}) as writer:
+        writer.write(0, bands)
+        writer.publish()
+
+
+@pytest.mark.parametrize("shape", [(40, 60), (700, 30), (1, 5)])
+@pytest.mark.parametrize(("agreement", "last"), [(np.nan, "Confidence"), (1.0, "Agreement of runs")])
+def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, last):
+    out = write_run(tmp_path, *random_bands(20, 20)[:2])
+    height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])) / 10
+    height[:, 3] = np.nan
+    write_surface(out, height, agreement)
+    done = CliRunner().invoke(main, ["plot", str(out), "--dpi", "40"])
+    assert done.output.split() == [str(out / "overview.png"), str(out / "dsm.png")]
+    titles = ["Hillshade, sun in the north-west", "Height", "Interval width", last]
+    assert [word for word in words if word in titles][-4:] == titles
+    assert len(np.unique(pixels_of(out / "dsm.png").reshape(-1, 3), axis=0)) > 20
+
+
+def test_relief__is_bright_where_it_faces_the_sun():
+    rows, columns = np.indices((9, 9)) - 4.0
+    pyramid = 4 - np.maximum(abs(rows), abs(columns))
+    relief = _relief(pyramid, 1.0, 1.0)
+    north_west, south_east = relief[[1, 4], [4, 1]], relief[[7, 4], [4, 7]]
+    flat = _relief(np.zeros((9, 9)), 1.0, 1.0)
+    assert np.allclose(flat, np.sqrt(0.5))
+    assert (north_west > flat[0, 0]).all()
+    assert (south_east < flat[0, 0]).all()
 
 
 def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run, tmp_path, words):

@@ -12,7 +12,7 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
-from sat_intervals import match_pair
+from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.cli import main
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.scene import DATUM, PIXEL, VIEWS, make_scene
@@ -34,7 +34,7 @@ EAST, NORTH = 80_700.0, 111_110.0
 BAND = {band.name: index for index, band in enumerate(POINTS)}
 
 
-def camera(path, view):
+def camera(path, view, longitude=LONGITUDE):
     """Write the RPC of a view of the procedural scene: column = u + a (h - h0), row down the latitudes."""
     scale = 0.01, 60.0  # degrees, metres; over a few metres lines in degrees are straight
     column, line, one = np.zeros(20), np.zeros(20), np.eye(20)[0]
@@ -42,7 +42,7 @@ def camera(path, view):
     line[2] = -NORTH / PIXEL * scale[0]
     rpc = RPC(
         line_off=0.0, line_scale=1.0, samp_off=0.0, samp_scale=1.0,
-        lat_off=LATITUDE, lat_scale=scale[0], long_off=LONGITUDE, long_scale=scale[0],
+        lat_off=LATITUDE, lat_scale=scale[0], long_off=longitude, long_scale=scale[0],
         height_off=DATUM, height_scale=scale[1],
         line_num_coeff=list(line), line_den_coeff=list(one), samp_num_coeff=list(column), samp_den_coeff=list(one),
     )  # fmt: skip
@@ -64,10 +64,10 @@ def grid(path, rows, columns, *, step=20, offset=0.5):
     return path
 
 
-def cameras(folder, rows, columns):
+def cameras(folder, rows, columns, longitude=LONGITUDE):
     return [
-        camera(folder / "left_model.tif", 0),
-        camera(folder / "right_model.tif", 1),
+        camera(folder / "left_model.tif", 0, longitude),
+        camera(folder / "right_model.tif", 1, longitude),
         grid(folder / "left_grid.tif", rows, columns),
         grid(folder / "right_grid.tif", rows, columns),
     ]
@@ -118,6 +118,13 @@ def test_triangulate__orders_bounds_by_height(tmp_path):
     assert np.abs(points[BAND["height_lower"]] - (DATUM - 4.0)).max() < 0.01
     assert np.abs(points[BAND["height_upper"]] - (DATUM + 1.5)).max() < 0.01
     assert np.abs(points[BAND["height"]] - (DATUM - 1.0)).max() < 0.01
+
+
+def test_triangulate__says_what_shareloc_cannot_do(tmp_path):
+    out = write_run(tmp_path, np.ones((4, 40, 50), np.float32), np.zeros((40, 50), np.uint16))
+    middle = on_the_ground(20, 25, DATUM)[0] - LONGITUDE
+    with pytest.raises(SatIntervalsError, match=r"of the lines of sight: .* across the 180th meridian is beyond it"):
+        triangulate(out, *cameras(tmp_path, 40, 50, longitude=180 - middle))
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ def empty_cells(rows: int, columns: int) -> np.ndarray:
 
 @njit(nogil=True, cache=True)
 def splat(column, row, height, lower, upper, confidence, radius, cells):
-    """Let points reach all cells whose centre lies within a radius.
+    """Let points reach the cell they fall in and all cells whose centre lies within a radius.
 
     A point weighs ``exp(-d^2 / 2)`` at a distance of ``d`` cells.
 
@@ -40,10 +40,11 @@ def splat(column, row, height, lower, upper, confidence, radius, cells):
         if np.isnan(height[n]):
             continue
         u, v = column[n] - 0.5, row[n] - 0.5
-        for i in range(max(0, int(np.ceil(v - radius))), min(rows, int(np.floor(v + radius)) + 1)):
-            for j in range(max(0, int(np.ceil(u - radius))), min(columns, int(np.floor(u + radius)) + 1)):
+        reach = max(radius, 0.5)
+        for i in range(max(0, int(np.ceil(v - reach))), min(rows, int(np.floor(v + reach)) + 1)):
+            for j in range(max(0, int(np.ceil(u - reach))), min(columns, int(np.floor(u + reach)) + 1)):
                 square = (i - v) ** 2 + (j - u) ** 2
-                if square > radius**2:
+                if square > radius**2 and max(abs(i - v), abs(j - u)) > 0.5:
                     continue
                 weight = np.exp(-0.5 * square)
                 cells[WEIGHT, i, j] += weight

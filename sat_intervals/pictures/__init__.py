@@ -9,5 +9,6 @@ if find_spec("matplotlib") is None:
 
 from sat_intervals.pictures.lines import draw_curve, draw_profile
 from sat_intervals.pictures.maps import draw_errors, draw_overview
+from sat_intervals.pictures.surface import draw_surface
 
-__all__ = ["draw_curve", "draw_errors", "draw_overview", "draw_profile"]
+__all__ = ["draw_curve", "draw_errors", "draw_overview", "draw_profile", "draw_surface"]

@@ -1,0 +1,98 @@
+"""A surface model: its relief as the sun would show it, heights, width of their intervals, confidence."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
+from matplotlib.ticker import MaxNLocator
+
+from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.products import SURFACE
+from sat_intervals.raster import read_place, read_small_layers
+
+_LONGEST = 5.5  # inches of the longer side of a map
+_STRETCHED = 5.0  # ratio of sides beyond which maps are cut to it
+_SUN = np.array([-0.5, 0.5, np.sqrt(0.5)])  # towards it: east, north, up; 45 degrees high in the north-west
+_FLATTENED = 0.3
+_BAND = {band.name: index for index, band in enumerate(SURFACE)}
+
+
+def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
+    """Draw hillshade, height, interval width and confidence of a surface model, read through its overviews.
+
+    Where several runs overlap, what they agree on takes the place of confidence.
+
+    Raises
+    ------
+    SatIntervalsError
+        A file that cannot be read, or a picture that cannot be written.
+    """
+    shape, place = read_place(surface)
+    assert place.transform is not None
+    assert place.pixel_size is not None
+    tall = float(np.clip(shape[0] / shape[1], 1 / _STRETCHED, _STRETCHED))
+    width = min(_LONGEST, _LONGEST / tall)
+    inches = width * tall, width
+    drawn = fitting(shape, inches, dpi)
+    bands = read_small_layers(surface, drawn)
+    height = bands[_BAND["height"]].astype(np.float64)
+    widths = bands[_BAND["height_upper"]] - bands[_BAND["height_lower"]]
+    agreement = bands[_BAND["agreement"]]
+    across, down = (
+        size * whole / part for size, whole, part in zip(place.pixel_size, shape[::-1], drawn[::-1], strict=True)
+    )
+    relief = _relief(height, across, down)
+    left, top = place.transform.c, place.transform.f
+    extent = (left, left + shape[1] * place.pixel_size[0], top - shape[0] * place.pixel_size[1], top)
+    last = ("Agreement of runs", "1 where intervals meet", agreement)
+    if not np.isfinite(agreement).any():
+        last = ("Confidence", "0 to 1", bands[_BAND["confidence"]])
+    step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
+    caption = f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}"
+    with page(path, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
+        panels = figure.subplots(2, 2).ravel()
+        _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west", ""), "gray", PowerNorm(1, 0, 1))
+        _draw(panels[1], extent, height, ("Height", "m"), "viridis", PowerNorm(1, *limits(height, (0, 1))))
+        widest = limits(widths, (0, 1))[1]
+        _draw(panels[2], extent, widths, ("Interval width", "m, square-root scale"), "magma", PowerNorm(0.5, 0, widest))
+        _draw(panels[3], extent, last[2], last[:2], "cividis", PowerNorm(1, 0, 1))
+
+
+def _relief(height: np.ndarray, across: float, down: float) -> np.ndarray:
+    """What the sun makes of a surface whose cells are so many metres wide and high: 0 to 1, NaN beside holes.
+
+    Slopes are told from cells two apart and flattened: noise of a decimetre is steep from one cell of half a metre to
+    the next.
+    """
+    if min(height.shape) < 2:
+        return np.full(height.shape, np.nan)
+    down_slope, across_slope = np.gradient(_FLATTENED * height, down, across)
+    normal = np.stack([-across_slope, down_slope, np.ones_like(height)])
+    return np.asarray(np.tensordot(_SUN, normal / np.linalg.norm(normal, axis=0), axes=1).clip(0, 1))
+
+
+def _draw(
+    panel: Axes,
+    extent: tuple[float, float, float, float],
+    values: np.ndarray,
+    name: tuple[str, str],
+    colours: str,
+    norm: PowerNorm,
+) -> None:
+    """A layer with title and unit in ``name``, in map coordinates, with a colour bar if it has a unit."""
+    panel.set_facecolor(NOTHING)
+    drawn = panel.imshow(values, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+    panel.set_title(name[0])
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(MaxNLocator(3))
+    panel.ticklabel_format(style="plain", useOffset=False)
+    panel.tick_params(labelsize=8, colors=INK)
+    panel.set_xlabel("easting (m)", fontsize=8, color=INK)
+    panel.set_ylabel("northing (m)", fontsize=8, color=INK)
+    say_empty(panel, values, "no value")
+    if name[1]:
+        assert panel.figure is not None
+        bar = panel.figure.colorbar(drawn, ax=panel, shrink=0.9, aspect=25, pad=0.02)
+        bar.set_label(name[1])
+        bar.ax.tick_params(labelsize=8)
