@@ -64,6 +64,8 @@ def show_scene(scene: Scene) -> None:
     if report["with_rejected"]:
         rows += _areas(report["with_rejected"], ", with rejected")
     show(["", "pixels", "accuracy", "relative size", "mean width (px)", "overestimation"], rows, scene.name)
+    if not report["all"]["count"]:
+        click.echo("no valid pixel has a known truth: check truth and mask")
     bad = [_figure(report[name]) for name in ("bad1", "bad3")]
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
     if report["tolerance"]:

@@ -104,7 +104,7 @@ def _of_folder(folder: Path) -> Pair:
 
 def _of_table(file: Path) -> list[Pair]:
     try:
-        with file.open(newline="", encoding="utf-8") as stream:
+        with file.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets begin with a mark
             reader = csv.DictReader(stream)
             rows, columns = list(reader), reader.fieldnames or []
     except OSError as error:

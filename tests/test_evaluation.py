@@ -345,6 +345,9 @@ def test_find_pairs__of_a_table(tmp_path):
         "name,truth,left,right,minimum,maximum,group\none,t.tif,l.tif,r.tif,-3,4,city\n,t.tif,l.tif,/r.tif,0,1,\n"
     )
     one, two = find_pairs([tmp_path / "pairs.csv"])
+    with_mark = tmp_path / "marked.csv"  # as spreadsheets write it
+    with_mark.write_bytes(b"\xef\xbb\xbf" + (tmp_path / "pairs.csv").read_bytes())
+    assert find_pairs([with_mark]) == [one, two]
     assert (one.name, one.group, one.minimum, one.maximum) == ("one", "city", -3, 4)
     assert (one.left, str(two.right)) == (tmp_path / "l.tif", "/r.tif")
     assert (two.name, two.group) == ("l.tif", "all")
@@ -354,6 +357,14 @@ def test_find_pairs__of_a_table(tmp_path):
 def command(*arguments):
     result = CliRunner().invoke(main, [str(argument) for argument in arguments])
     return result.exit_code, result.stdout, result.stderr
+
+
+def test_command__says_that_nothing_is_judged(run, tmp_path):
+    with rasterio.open(run / "validity.tif") as dataset:
+        write(tmp_path / "nowhere.tif", np.zeros(dataset.shape, np.uint8), 255)
+    status, text, _ = command("evaluate", run, "--mask", tmp_path / "nowhere.tif")
+    assert status == 0
+    assert "no valid pixel has a known truth: check truth and mask" in text
 
 
 def test_command__prints_the_form_of_json(run):

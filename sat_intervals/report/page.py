@@ -53,7 +53,7 @@ def _contents(results: Results) -> dict[str, Any]:
     return {
         "run": results.report,
         "name": Path(results.left.path).name,
-        "folder": shlex.quote(str(results.out)),
+        "folder": shlex.quote(str(results.out.resolve())),
         "histograms": counts.report(),
         "pixels": pixels.report(),
         "truth": truth,
