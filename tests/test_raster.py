@@ -21,8 +21,9 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
+from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA, POINTS
 from sat_intervals.raster import (
+    POINT_FILES,
     RUN_FILES,
     Georeferencing,
     Image,
@@ -480,6 +481,16 @@ def test_output_writer__writes_what_it_is_given(tmp_path, products, rows):
     np.testing.assert_array_equal(look(tmp_path / "out" / "validity.tif")[0], products[1])
     assert (tmp_path / "out" / "run.json").read_text() == "{}\n"
     assert sorted(os.listdir(tmp_path / "out")) == ["intervals.tif", "run.json", "validity.tif"]
+
+
+def test_output_writer__reads_back_large_numbers_in_windows_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(writer, "_READ_BACK", (256, 256))
+    points = np.random.default_rng(0).uniform(-180, 9000, (len(POINTS), 300, 530))
+    with OutputWriter(tmp_path, POINT_FILES, 300, 530, Georeferencing(), {}) as output:
+        for row in range(0, 300, 130):
+            output.write(row, points[:, row : row + 130])
+        output.publish()
+    np.testing.assert_array_equal(look(tmp_path / "points.tif"), points)
 
 
 @pytest.mark.parametrize("kind", KINDS)

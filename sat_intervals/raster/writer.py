@@ -37,6 +37,7 @@ _OVERVIEW_SIZE = 512
 _CACHE = 128 << 20
 # Pixels of a window that is read back: blocks enough for every thread.
 _READ_BACK = 512, 4096
+_SUM_WRAPS = 1 << 64  # the bits of a few float64 are more
 _WAY_OUT = "make room or choose another folder"
 
 
@@ -191,7 +192,7 @@ class OutputWriter:
             with gdal.reading(str(whole), overview_level=level, num_threads=self._threads) as dataset:
                 for area in _areas(dataset):
                     dataset.read(window=area)
-        if found != expected:
+        if (found - expected) % _SUM_WRAPS:
             raise OSError(errno.EIO, "what can be read back is not what was written")
 
     @contextmanager
@@ -247,7 +248,7 @@ def _areas(dataset: DatasetReader) -> Iterator[Area]:
 
 
 def _sum(bands: np.ndarray) -> int:
-    """Sum of an array's bits taken as unsigned integers: one figure in whatever order blocks are read."""
+    """Sum, modulo 2^64, of an array's bits taken as unsigned integers: one figure in whatever order blocks are read."""
     return int(bands.view(f"uint{8 * bands.itemsize}").sum(dtype=np.uint64))
 
 
