@@ -21,7 +21,7 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA, POINTS
+from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
     POINT_FILES,
     RUN_FILES,
@@ -485,7 +485,7 @@ def test_output_writer__writes_what_it_is_given(tmp_path, products, rows):
 
 def test_output_writer__reads_back_large_numbers_in_windows_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setattr(writer, "_READ_BACK", (256, 256))
-    points = np.random.default_rng(0).uniform(-180, 9000, (len(POINTS), 300, 530))
+    points = np.random.default_rng(0).uniform(-180, 9000, (len(POINT_FILES[0].bands), 300, 530))
     with OutputWriter(tmp_path, POINT_FILES, 300, 530, Georeferencing(), {}) as output:
         for row in range(0, 300, 130):
             output.write(row, points[:, row : row + 130])
