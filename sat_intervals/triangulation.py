@@ -16,6 +16,8 @@ from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
+# Pixels in work at a time, 300 bytes each; those read and waiting are 18.
+_PIXELS = 1 << 20
 # What is written is rounded to hundredths of a millimetre on the ground and tenths of one in height, below the error of
 # the lattice: the file is half as large.
 _DEGREES, _METRES = 2.0**-33, 2.0**-13
@@ -64,8 +66,8 @@ def triangulate(
     tags = {"RUN": run.report["finished"], "LEFT_MODEL": str(left_model), "RIGHT_MODEL": str(right_model)}
     tally = _Tally()
     with OutputWriter(run.out, POINT_FILES, *run.shape, _georeferencing(run), tags) as writer:
-        for window in run.windows():
-            bands = _bands(run, lattice, window)
+        for window, disparities in _strips(run):
+            bands = _bands(lattice, window, disparities)
             writer.write(window.row, bands)
             tally.add(height=bands[2], residual=bands[5])
             progress("points", window.row_stop, run.shape[0])
@@ -98,11 +100,23 @@ def _georeferencing(run: Run) -> Georeferencing:
     return open_image(run.out / "validity.tif").georeferencing
 
 
-def _bands(run: Run, lattice: Lattice, window: Window) -> np.ndarray:
-    """The bands of ``points.tif`` for the valid pixels of a window."""
-    (disparity, lower, upper, _), validity = run.read_bands(window)
-    valid = validity & INVALID == 0
-    middle, one, other = (lattice.points(window, np.where(valid, band, np.nan)) for band in (disparity, lower, upper))
+def _strips(run: Run) -> Iterator[tuple[Window, np.ndarray]]:
+    """Windows of whole rows, from the top, with disparity, lower and upper ``(3, rows, columns)``, NaN if not valid.
+
+    Files are read by rows of blocks, which are then cut.
+    """
+    height = max(1, _PIXELS // run.region.width)
+    for block in run.windows():
+        bands, validity = run.read_bands(block)
+        disparities = np.where(validity & INVALID == 0, bands[:3], np.float32(np.nan))
+        for first in range(0, block.height, height):
+            part = disparities[:, first : first + height]
+            yield Window(block.row + first, 0, part.shape[1], block.width), part
+
+
+def _bands(lattice: Lattice, window: Window, disparities: np.ndarray) -> np.ndarray:
+    """The bands of ``points.tif`` for a window."""
+    middle, one, other = (lattice.points(window, disparity) for disparity in disparities)
     # Which bound is the higher depends on which image is the left one, and how the grids are turned.
     low, high = _ordered(one, other)
     heights = (point.height for point in (middle, low, high))
