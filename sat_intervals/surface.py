@@ -48,6 +48,8 @@ _POINT = {band.name: index for index, band in enumerate(POINTS)}
 # Pixels of a window of points, cells of a tile: some tens of megabytes each.
 _WINDOW = 512
 _TILE_ROWS, _TILE_COLUMNS = 512, 2048
+# Cells of a strip of tiles, of which a few are held, 24 bytes each; tiles of wide surfaces are lower for it.
+_STRIP_CELLS, _LOWEST = 1 << 22, 64
 # A surface of more cells than this for a point is a wrong resolution, or points of two places.
 _CELLS_PER_POINT = 10_000
 
@@ -285,8 +287,9 @@ def _strips(
     def tile(window: Window) -> np.ndarray:
         return _fused([_of_one(cloud.splat(cells, window, radius), interval) for cloud in clouds])
 
-    for row in range(0, cells.rows, _TILE_ROWS):
-        height = min(_TILE_ROWS, cells.rows - row)
+    rows = min(_TILE_ROWS, max(_LOWEST, _STRIP_CELLS // cells.columns))
+    for row in range(0, cells.rows, rows):
+        height = min(rows, cells.rows - row)
         windows = (
             Window(row, column, height, min(_TILE_COLUMNS, cells.columns - column))
             for column in range(0, cells.columns, _TILE_COLUMNS)
