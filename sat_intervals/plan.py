@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.cluster import available_cores
-from sat_intervals.config import Config, load_config
+from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.job import checked_pair
 from sat_intervals.memory import PROCESS_BYTES, fitted, tile_bytes
 from sat_intervals.raster import Image
@@ -108,7 +108,7 @@ def _expected_seconds(left: Image, right: Image, config: Config, workers: int, w
     """Seconds of a run: those of a sample, tiles scaled by their work, the rest by pixels."""
     height, width = min(SAMPLE, whole.height), min(SAMPLE, whole.width)
     sample = Window((whole.height - height) // 2, (whole.width - width) // 2, height, width)
-    one = config.model_copy(update={"cluster": config.cluster.model_copy(update={"kind": "threads", "workers": 1})})
+    one = config.model_copy(update={"cluster": Cluster(workers=1)})  # nor in the store of the run itself
     with tempfile.TemporaryDirectory() as folder:
         seconds = match_pair(left, right, Path(folder) / "sample", one, window=sample)["seconds"]
     sampled = _work(Grid(sample, config.tiles.size), whole, config)

@@ -141,6 +141,13 @@ def test_plan__counts_tiles_and_the_work_of_overlaps(images):
     assert made.seconds > 0
 
 
+def test_plan__keeps_out_of_the_store_of_the_run(images, tmp_path):
+    store = tmp_path / "store"
+    config = {"disparity": {"minimum": -18, "maximum": 40}, "cluster": {"store": str(store)}}
+    plan(images / "left1.tif", images / "right1.tif", config, workers=1)
+    assert not store.exists()
+
+
 def test_plan__prints_what_a_run_will_take(images):
     pair = [str(images / "left1.tif"), str(images / "right1.tif"), "--disparity", "-18", "40"]
     result = CliRunner().invoke(main, ["plan", *pair, "--memory", "400MB", "--workers", "3"])
