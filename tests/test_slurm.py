@@ -145,6 +145,7 @@ def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_pat
 
 
 def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
+    pytest.importorskip("dask_jobqueue", reason="needs the extra [cluster]")
     images, settings = pair
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
     command = [SCRIPTS / "sat-intervals", "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
