@@ -5,10 +5,29 @@ from pathlib import Path
 import click
 
 
-@click.command(short_help="Say how far a run is.")
+@click.command(short_help="Say how far a run or a batch is.")
 @click.argument("out", type=click.Path(path_type=Path))
 def status(out: Path) -> None:
-    """Say how many tiles of the run in OUT are done, failed and left, while it goes on anywhere or after it died."""
+    """Say how many tiles of the run in OUT are done, failed and left, while it goes on anywhere or after it died.
+
+    Of the folder of a batch: the same of each of its pairs, and why pairs failed.
+    """
+    from sat_intervals.batch import read_report
+
+    pairs = read_report(out)
+    if pairs is None:
+        _tell(out)
+        return
+    for name, ended in pairs.items():
+        if ended["state"] == "failed":
+            click.echo(f"{out / name}: failed: {ended['error']}")
+        elif ended["state"] == "waiting" and not (out / name).exists():
+            click.echo(f"{out / name}: waiting")
+        else:
+            _tell(out / name)
+
+
+def _tell(out: Path) -> None:
     from sat_intervals.job import OUTPUTS
     from sat_intervals.store import read_status
 
@@ -17,7 +36,7 @@ def status(out: Path) -> None:
         return
     now = read_status(out / "tiles")
     left = now.total - now.done - len(now.failed)
-    state = "a run is at work" if now.running else "no run is at work: the same match command goes on from here"
+    state = "a run is at work" if now.running else "no run is at work: the same command goes on from here"
     click.echo(f"{out}: {now.done} of {now.total} tiles done, {len(now.failed)} failed, {left} left; {state}")
     for name, reason in now.failed.items():
         click.echo(f"  tile {name}: {reason}")

@@ -3,10 +3,11 @@
 import csv
 import json
 import os
+import threading
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,17 @@ from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.job import OUTPUTS, Job, compile_kernels, prepare
+from sat_intervals.folders import LocalFolder
+from sat_intervals.job import OUTPUTS, Job, changes_since, compile_kernels, prepare
 from sat_intervals.raster import open_image
+from sat_intervals.results import open_run
 from sat_intervals.run import check_failures, held, matched, measure_images
 
+REPORT = "batch.json"
+
 _IMAGES = ("left", "right", "left_mask", "right_mask")
+# Names in the folder of a batch that are not those of pairs.
+_TAKEN = (REPORT, "logs")
 # Completes settings whose search range the pairs bring.
 _ANY_RANGE = {"disparity": {"minimum": 0, "maximum": 0}}
 
@@ -71,18 +78,32 @@ def _pair(row: Mapping[str, Any], file: Path, number: int) -> PairOfBatch:
     if missing or None in row:
         what = f"lacks {' and '.join(missing)}" if missing else f"has more values than columns: {row[None]}"  # type: ignore[index]
         raise SatIntervalsError(f"{file}, row {number} {what}")
-    if name in (".", "..") or os.sep in name:
-        raise SatIntervalsError(f"{file}, row {number}: name {name!r} is no name of a folder")
+    if name.startswith(".") or os.sep in name or name in _TAKEN:
+        raise SatIntervalsError(
+            f"{file}, row {number}: name {name!r} cannot be that of the pair's folder, take another"
+        )
     images = {key: _path(str(values.pop(key)), file) for key in _IMAGES if key in values}
     settings: dict[str, Any] = {}
     for key, value in values.items():
-        path = f"disparity.{key}" if key in ("minimum", "maximum") else str(key)
-        *sections, last = path.split(".")
-        target = settings
-        for section in sections:
-            target = target.setdefault(section, {})
-        target[last] = yaml.safe_load(value) if isinstance(value, str) else value
+        try:
+            _set(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
+        except (ValueError, yaml.YAMLError) as error:
+            raise SatIntervalsError(
+                f"{file}, row {number}: {key} is {value!r}: {' '.join(str(error).split())}"
+            ) from error
     return PairOfBatch(name, settings=settings, **images)
+
+
+def _set(settings: dict[str, Any], key: str, value: Any) -> None:
+    """Set a setting under its dotted name; texts, such as all cells of a CSV, are YAML."""
+    *sections, last = key.split(".")
+    for section in sections:
+        settings = settings.setdefault(section, {})
+        if not isinstance(settings, dict):
+            raise ValueError(f"the row gives {section} as a whole too")
+    if last in settings:
+        raise ValueError(f"the row gives parts of {last} too" if isinstance(settings[last], dict) else "given twice")
+    settings[last] = yaml.safe_load(value) if isinstance(value, str) else value
 
 
 def _path(path: str, file: Path) -> str:
@@ -114,32 +135,53 @@ def match_batch(
 
     Returns
     -------
-    By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``counts`` and ``seconds``.
+    By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``counts`` and ``seconds``. ``batch.json``
+    holds the same while the batch goes on, with "waiting" for pairs that have not ended.
+
+    Raises
+    ------
+    SatIntervalsError
+        Settings or a folder that cannot be used.
+    RunError
+        What stops all pairs, such as a full disk.
     """
     ended: dict[str, dict[str, Any]] = {}
-    jobs: list[Job] = []
-    names: dict[int, str] = {}
-    out.mkdir(parents=True, exist_ok=True)
     cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
     with ExitStack() as stack:
+        stack.enter_context(held(out, progress))
         progress = stack.enter_context(held(cluster.store, progress))
-        for pair in pairs:
+
+        def note(states: Mapping[str, dict[str, Any]]) -> None:
+            ended.update(states)
+            LocalFolder(out).write(REPORT, json.dumps(ended, indent=1) + "\n")
+
+        note({pair.name: {"state": "waiting"} for pair in pairs})
+        jobs: dict[str, Job] = {}
+        for number, pair in enumerate(pairs):
+            progress("pairs", number, len(pairs))
             try:
-                settings = _settings(pair, config, overrides, cluster)
-                job = _begun(pair, out, settings, overwrite, stack)
+                job = _begun(pair, out, _settings(pair, config, overrides, cluster), overwrite, stack)
             except (SatIntervalsError, OSError) as error:
-                ended[pair.name] = {"state": "failed", "error": str(error)}
+                note({pair.name: {"state": "failed", "error": str(error)}})
                 continue
             if job is None:
-                ended[pair.name] = {"state": "done before"}
+                note({pair.name: {"state": "done before"}})
             else:
-                names[id(job)] = pair.name
-                jobs.append(job)
-        for name, end in _matched(jobs, names, out, cluster, keep_tiles, progress):
-            ended[name] = end
-    report = {pair.name: ended[pair.name] for pair in pairs}
-    (out / "batch.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    return report
+                jobs[pair.name] = job
+        for name, how in _matched(jobs, out, cluster, keep_tiles, progress):
+            note({name: how})
+    return ended
+
+
+def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
+    """What `match_batch` said last of the pairs in a folder; None where there is no batch."""
+    text = LocalFolder(out).read(REPORT)
+    if text is None:
+        return None
+    try:
+        return {str(name): {"state": str(ended["state"]), **ended} for name, ended in json.loads(text).items()}
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: run the batch again") from error
 
 
 def _settings(pair: PairOfBatch, config: Any, overrides: Mapping[str, Any] | None, cluster: Cluster) -> Config:
@@ -150,13 +192,15 @@ def _settings(pair: PairOfBatch, config: Any, overrides: Mapping[str, Any] | Non
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job | None:
-    """The job of a pair, its store open and locked; None where the pair was matched before with the same settings."""
+    """The job of a pair, its store open and locked; None where the same was matched before."""
     folder = out / pair.name
-    if not overwrite and all((folder / name).exists() for name in OUTPUTS):
-        before = json.loads((folder / "run.json").read_text())["settings"]
-        if load_config(before).model_copy(update={"cluster": settings.cluster}) == settings:
-            return None
     left, right = open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
+    if not overwrite and all((folder / name).exists() for name in OUTPUTS):
+        if changes := changes_since(open_run(folder).report, left, right, settings):
+            raise SatIntervalsError(
+                f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
+            )
+        return None
     job = prepare(left, right, folder, settings, overwrite=overwrite)
     stack.enter_context(held(job.store.home, lambda stage, done, total: None))
     job.begin(overwrite=overwrite)
@@ -172,26 +216,50 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
 
 
 def _matched(
-    jobs: list[Job], names: dict[int, str], out: Path, cluster: Cluster, keep_tiles: bool, progress: Progress
-) -> list[tuple[str, Any]]:
+    jobs: Mapping[str, Job], out: Path, cluster: Cluster, keep_tiles: bool, progress: Progress
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """Match the tiles of all jobs and conclude each, in a thread of its own, while others are being matched."""
     if not jobs:
-        return []
-    for config in {_kernels(job.config): job.config for job in jobs}.values():
+        return
+    for config in {_kernels(job.config): job.config for job in jobs.values()}.values():
         compile_kernels(config)
-    waiting: list[tuple[Job, Future[dict[str, Any]]]] = []
-    ended: list[tuple[str, Any]] = []
-    with ThreadPoolExecutor(1) as thread, connected(cluster, out) as client:
-        measured = []
-        for job in jobs:
+    concluding: dict[Future[dict[str, Any]], str] = {}
+    with _thread() as (thread, check), connected(cluster, out) as client:
+        measured = {}
+        for name, job in jobs.items():
             try:
                 measure_images(client, job, progress)
-                measured.append(job)
+                measured[name] = job
             except RunError as error:
-                ended.append((names[id(job)], {"state": "failed", "error": str(error)}))
-        for job, failures in matched(client, measured, progress):
-            waiting.append((job, thread.submit(_concluded, job, failures, keep_tiles)))
-    return ended + [(names[id(job)], future.result()) for job, future in waiting]
+                yield name, {"state": "failed", "error": str(error)}
+        names = {id(job): name for name, job in measured.items()}
+        for job, failures in matched(client, list(measured.values()), progress):
+            concluding[thread.submit(_concluded, job, failures, keep_tiles, check)] = names[id(job)]
+            for future in [future for future in concluding if future.done()]:
+                yield concluding.pop(future), future.result()
+        total = len(concluding)
+        while concluding:
+            progress("pairs.files", total - len(concluding), total)
+            for future in wait(concluding, timeout=0.5, return_when="FIRST_COMPLETED").done:
+                yield concluding.pop(future), future.result()
+
+
+@contextmanager
+def _thread() -> Iterator[tuple[ThreadPoolExecutor, Progress]]:
+    """A thread, and the progress of what it does, which ends it where the block ends by an error."""
+    is_left = threading.Event()
+
+    def check(stage: str, done: int, total: int) -> None:
+        if is_left.is_set():
+            raise RunError("the batch ended before")
+
+    with ThreadPoolExecutor(1) as thread:
+        try:
+            yield thread, check
+        except BaseException:
+            is_left.set()
+            thread.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _kernels(config: Config) -> str:
@@ -199,12 +267,12 @@ def _kernels(config: Config) -> str:
     return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
-def _concluded(job: Job, failures: dict[str, BaseException], keep_tiles: bool) -> dict[str, Any]:
+def _concluded(job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress) -> dict[str, Any]:
     try:
         check_failures(job, failures)
-        report = conclude(job, {}, lambda stage, done, total: None)
+        report = conclude(job, {}, progress)
+        if not keep_tiles:
+            job.store.remove()
     except (SatIntervalsError, RuntimeError, OSError) as error:
         return {"state": "failed", "error": str(error)}
-    if not keep_tiles:
-        job.store.remove()
     return {"state": "done", "counts": report["counts"], "seconds": report["seconds"]}

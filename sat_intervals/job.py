@@ -1,7 +1,9 @@
 """A pair made ready to be matched: images opened and checked, its folder, its tiles, its store."""
 
+import json
 import os
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -14,14 +16,15 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.features import load_network, weights_file
 from sat_intervals.finish import Rows, Scale, finish_strips
+from sat_intervals.folders import folder_at
 from sat_intervals.inputs import identity, pixels_digest
 from sat_intervals.kernels import FINGERPRINT
-from sat_intervals.memory import fitted, machine_bytes, parse_bytes, volume_bytes
+from sat_intervals.memory import fitted_to_jobs, machine_bytes, volume_bytes
 from sat_intervals.normalization import Scale as ImageScale
 from sat_intervals.normalization import Scales
 from sat_intervals.patch import match_patch
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files, read_window
-from sat_intervals.store import Store
+from sat_intervals.store import Store, differences
 from sat_intervals.tiling import Grid, Window
 
 # Sections of the settings that no tile knows of.
@@ -70,6 +73,7 @@ class Job:
 
         With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
         """
+        check_output(self.out, overwrite)  # again: another run may have ended here before the lock was free
         if overwrite:
             for name in OUTPUTS:
                 (self.out / name).unlink(missing_ok=True)
@@ -105,27 +109,39 @@ def prepare(
     overwrite: bool = False,
 ) -> Job:
     """Check all that can be checked before a pixel is read; parameters as of `match_pair`."""
-    config, out = load_config(config), Path(out)
-    if config.cluster.memory is not None:
-        # dask kills a worker that takes 95 % of its memory
-        config = fitted(config, 9 * parse_bytes(config.cluster.memory) // 10, config.cluster.cores)
+    config, out = fitted_to_jobs(load_config(config)), Path(out)
     left, right = checked_pair(left, right, config)
     region = _region(left, window)
     _check_memory(config, region)
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
-    store = Store(
-        out / "tiles",
-        Grid(region, config.tiles.size),
-        config.disparity.count,
-        config.largest_ambiguity,
-        config.cluster.store,
-    )
-    known = _known(store.inputs())
-    inputs = {"left": _described(left, known), "right": _described(right, known)}
-    if isinstance(config.cost, Mccnn):
-        inputs["weights"] = weights_identity(config.cost)
-    return Job(left, right, config, store, out, inputs)
+    home, elsewhere = out / "tiles", config.cluster.store
+    if elsewhere and folder_at(elsewhere) == folder_at(home):
+        elsewhere = None
+    grid = Grid(region, config.tiles.size)
+    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
+    return Job(left, right, config, store, out, _inputs(left, right, config, store.inputs()))
+
+
+def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: Config) -> list[str]:
+    """In what the run of a ``run.json`` differs from one of whole images with settings, a line each.
+
+    Versions do not count, and neither does where tiles were matched.
+    """
+    config = fitted_to_jobs(config)
+    before = {
+        "settings": load_config(report["settings"]).model_dump(mode="json", exclude={"cluster"}),
+        "inputs": report["inputs"],
+        "region": report["tiles"]["region"],
+    }
+    now = {
+        "settings": config.model_dump(mode="json", exclude={"cluster"}),
+        "inputs": _inputs(left, right, config, report["inputs"]),
+        "region": asdict(_region(left, None)),
+    }
+    for one in (before, now):
+        one["inputs"].get("weights", {}).pop("onnxruntime", None)
+    return list(differences(before, json.loads(json.dumps(now))))
 
 
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
@@ -202,7 +218,16 @@ def _check_memory(config: Config, region: Window) -> None:
         )
 
 
-def _known(inputs: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _inputs(left: Image, right: Image, config: Config, before: Mapping[str, Any]) -> dict[str, Any]:
+    """What run.json and the manifest say of the inputs; what they said before saves hashing files again."""
+    known = _known(before)
+    inputs = {"left": _described(left, known), "right": _described(right, known)}
+    if isinstance(config.cost, Mccnn):
+        inputs["weights"] = weights_identity(config.cost)
+    return inputs
+
+
+def _known(inputs: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """What a manifest says of the files of its inputs, by path."""
     described = [file for one in inputs.values() for file in (one, *one.get("files", ()), one.get("mask"))]
     return {file["path"]: file for file in described if file and "sha256" in file}

@@ -78,3 +78,17 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
         f"{tiles_at_once} at once, need {needed / 1e6:.0f} MB, given are {memory / 1e6:.0f} MB: "
         "give more memory or fewer workers"
     )
+
+
+def fitted_to_jobs(config: Config) -> Config:
+    """The settings with tiles that fit in the memory that they give a job of a batch system.
+
+    Raises
+    ------
+    ConfigError
+        As of `fitted`.
+    """
+    if config.cluster.memory is None:
+        return config
+    # dask kills a worker that takes 95 % of its memory
+    return fitted(config, 9 * parse_bytes(config.cluster.memory) // 10, config.cluster.cores)

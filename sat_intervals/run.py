@@ -1,33 +1,27 @@
 """All tiles of a pair, all pairs of a batch, a bounded number of them in flight."""
 
 import errno
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any
 
-from distributed import Client, Future, KilledWorker
-from distributed.client import ClosedClientError
+from distributed import Client
 
-from sat_intervals.cluster import Jobs, connected
+from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
+from sat_intervals.flight import Flight, Task, reason
 from sat_intervals.folders import folder_at
 from sat_intervals.job import Job, compile_kernels, prepare
-from sat_intervals.normalization import Scale, Scales, blocks, scale_of
+from sat_intervals.normalization import Moments, Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
 from sat_intervals.tile import match_tile, measure_block, timed
 from sat_intervals.tiling import Tile, Window
 
-# Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
-_LOOK_AGAIN = 2.0
 # Errors of a disk, or of a user's share of it.
 _FULL = errno.ENOSPC, errno.EDQUOT
-# Ends the key of a tile that is tried with no other in flight.
-_ALONE = "-alone"
 
 
 def match_pair(
@@ -75,7 +69,7 @@ def match_pair(
     seconds: dict[str, float] = {}
     with timed(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
-    with held(job.store.home, progress), held(job.config.cluster.store, progress) as progress:
+    with held(job.store.home, progress), held(job.store.elsewhere, progress) as progress:
         job.begin(overwrite=overwrite)
         with timed(seconds, "kernels"):
             progress("kernels", 0, 1)
@@ -112,23 +106,15 @@ def measure_images(client: Client, job: Job, progress: Progress) -> None:
 
 def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Scale:
     windows = blocks(image.height, image.width)
-    with _scheduler_needed():
-        futures = client.map(
-            measure_block, [image] * len(windows), windows, pure=False, retries=job.config.cluster.retries
-        )
-    landing = _Landing(client)
-    for future in futures:
-        landing.expect(future)
-    done = 0
-    while done < len(windows):
-        if (landed := landing.next()) is not None:
-            error = _ended_with(landed)
-            if error is not None:
-                raise RunError(f"{image.path} could not be measured: {_reason(error)}") from error
-            done += 1
-        progress("images", done, len(windows))
-    with _scheduler_needed():
-        return scale_of(client.gather(futures))
+    retries = job.config.cluster.retries
+    found: dict[int, Moments] = {}
+    for landed in Flight(client, (Task(i, measure_block, (image, block), retries) for i, block in enumerate(windows))):
+        if landed is not None and landed.error is not None:
+            raise RunError(f"{image.path} could not be measured: {reason(landed.error)}") from landed.error
+        if landed is not None:
+            found[landed.label] = landed.result
+        progress("images", len(found), len(windows))
+    return scale_of(found[i] for i in range(len(windows)))
 
 
 @contextmanager
@@ -155,21 +141,11 @@ def held(place: str | Path | None, progress: Progress) -> Iterator[Progress]:
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
     """Raise a RunError that names every tile that failed, if there are any."""
     if failures:
-        lines = "\n".join(f"  tile {name}: {_reason(error)}" for name, error in sorted(failures.items()))
+        lines = "\n".join(f"  tile {name}: {reason(error)}" for name, error in sorted(failures.items()))
         raise RunError(
             f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept; mend the cause and run the "
             f"same command again:\n{lines}"
         )
-
-
-def _reason(error: BaseException) -> str:
-    """Why a tile failed, in one line."""
-    if isinstance(error, KilledWorker):
-        return (
-            f"every worker that matched it died, the last at {error.last_worker.address}, as they do out of memory: "
-            "give workers more, or choose smaller tiles"
-        )
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[tuple[Job, dict[str, BaseException]]]:
@@ -183,13 +159,16 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
     total = sum(len(job.store.grid) for job in jobs)
     done = total - sum(left)
     yield from ((job, {}) for job, count in zip(jobs, left, strict=True) if count == 0)
-    waiting = ((i, tile) for i, job in enumerate(jobs) for tile in _waiting(job))
-    flight = _Flight(client, jobs, waiting)
-    for landed in flight:
+    tasks = (
+        Task((i, tile), match_tile, (job, tile), job.config.cluster.retries)
+        for i, job in enumerate(jobs)
+        for tile in _waiting(job)
+    )
+    for landed in Flight(client, tasks):
         if landed is None:
             progress("tiles", done, total)
             continue
-        i, tile, error = landed
+        (i, tile), _, error = landed
         if isinstance(error, OSError) and error.errno in _FULL:  # no other tile would fare better
             raise RunError(
                 f"{error.filename or jobs[i].store.folder}: {error.strerror}: make room and run the same command "
@@ -197,7 +176,7 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
             )
         if error is not None:
             failures[i][tile.name] = error
-            jobs[i].store.write_failure(tile.name, _reason(error))
+            jobs[i].store.write_failure(tile.name, reason(error))
         left[i] -= 1
         done += 1
         progress("tiles", done, total)
@@ -208,96 +187,3 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
 def _waiting(job: Job) -> Iterator[Tile]:
     done = job.store.done()
     return (tile for tile in job.store.grid if tile.name not in done)
-
-
-class _Landing:
-    """Futures as they end."""
-
-    def __init__(self, client: Client) -> None:
-        self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
-        self._jobs = Jobs(client)
-
-    def expect(self, future: Future[Any]) -> None:
-        """Wait for one more, which whoever calls keeps alive."""
-        future.add_done_callback(self._ended.put)
-
-    def next(self) -> Future[Any] | None:
-        """The next that ends; None where none does for a while, so that whoever waits can look around."""
-        try:
-            return self._ended.get(timeout=_LOOK_AGAIN)
-        except Empty:
-            self._jobs.check()
-            return None
-
-
-class _Flight:
-    """Tiles on their way through a cluster; iterates over those that land: job number, tile, error or None.
-
-    None in place of all where none lands for a while.
-
-    dask blames a worker's death on every tile that it held. Those blamed too often are tried again at the end, one at a
-    time, so that no tile fails for another.
-    """
-
-    def __init__(self, client: Client, jobs: Sequence[Job], waiting: Iterator[tuple[int, Tile]]) -> None:
-        self._client, self._jobs, self._waiting = client, jobs, waiting
-        self._landing = _Landing(client)
-        self._tiles: dict[str, tuple[int, Tile, Future[None]]] = {}
-        self._suspects: list[tuple[int, Tile]] = []
-        self._width, self._looked = 2, float("-inf")
-
-    def __iter__(self) -> Iterator[tuple[int, Tile, BaseException | None] | None]:
-        self._fill()
-        while self._tiles:
-            future = self._landing.next()
-            if future is None:
-                self._fill()
-                yield None
-                continue
-            error, key = _ended_with(future), str(future.key)
-            i, tile, _ = self._tiles.pop(key)
-            future.release()
-            blamed = isinstance(error, KilledWorker) and not key.endswith(_ALONE)
-            if blamed:
-                self._suspects.append((i, tile))
-            self._fill()
-            if not self._tiles and self._suspects:
-                self._submit(*self._suspects.pop(), _ALONE)
-            if not blamed:
-                yield i, tile, error
-
-    def _fill(self) -> None:
-        """Submit tiles until two are in flight for every core that there is now."""
-        if time.monotonic() - self._looked > _LOOK_AGAIN:
-            with _scheduler_needed():
-                self._width = 2 * max(1, sum(self._client.nthreads().values()))
-            self._looked = time.monotonic()
-        while len(self._tiles) < self._width:
-            following = next(self._waiting, None)
-            if following is None:
-                return
-            self._submit(*following)
-
-    def _submit(self, i: int, tile: Tile, suffix: str = "") -> None:
-        job, key = self._jobs[i], f"match-{i}-{tile.name}{suffix}"
-        with _scheduler_needed():
-            future = self._client.submit(match_tile, job, tile, key=key, retries=job.config.cluster.retries, pure=False)
-        self._tiles[key] = i, tile, future
-        self._landing.expect(future)
-
-
-def _ended_with(future: Future[None]) -> BaseException | None:
-    """What a future ended with."""
-    with _scheduler_needed():
-        error: BaseException | None = future.exception()
-        if future.cancelled():
-            raise ClosedClientError(f"{future.key} is lost")
-    return error
-
-
-@contextmanager
-def _scheduler_needed() -> Iterator[None]:
-    try:
-        yield
-    except (OSError, ClosedClientError) as error:
-        raise RunError("the dask scheduler is gone; the same command goes on from the tiles that are done") from error

@@ -110,7 +110,7 @@ class Store:
         folder, text = self.folder, json.dumps(manifest, indent=1)
         before = None if overwrite else folder.read(_MANIFEST)
         if before is not None:
-            changed = list(_differences(_parsed(before, folder), json.loads(text)))
+            changed = list(differences(_parsed(before, folder), json.loads(text)))
             if changed and self._is_mendable(before, text) and is_mended():
                 folder.write(_MANIFEST, text)
             elif changed:
@@ -136,7 +136,7 @@ class Store:
         there = self.folder.read(_MANIFEST)
         if there is None:
             raise StoreError(f"{self.folder} holds the tiles of no run any more")
-        if changed := list(_differences(json.loads(there), json.loads(json.dumps(manifest)))):
+        if changed := list(differences(json.loads(there), json.loads(json.dumps(manifest)))):
             raise StoreError(f"{self.folder} holds the tiles of another run: {'; '.join(changed)}")
 
     def _check_place(self, overwrite: bool) -> None:
@@ -365,14 +365,14 @@ def _create(
     )  # fmt: skip
 
 
-def _differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
-    """The values in which two manifests differ, each with its path."""
+def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
+    """The values in which two manifests differ, each with its path; when a file was changed does not count."""
     if isinstance(there, dict) and isinstance(wanted, dict):
         for key in sorted(there.keys() | wanted.keys()):
-            yield from _differences(there.get(key), wanted.get(key), f"{path}.{key}".lstrip("."))
+            yield from differences(there.get(key), wanted.get(key), f"{path}.{key}".lstrip("."))
     elif isinstance(there, list) and isinstance(wanted, list) and len(there) == len(wanted):
         for place, pair in enumerate(zip(there, wanted, strict=True)):
-            yield from _differences(*pair, f"{path}.{place}")
+            yield from differences(*pair, f"{path}.{place}")
     elif there != wanted and not path.endswith(".modified"):  # when does not matter where SHA-256 agrees
         yield f"{path} was {json.dumps(there)}, now {json.dumps(wanted)}"
 

@@ -74,6 +74,7 @@ def _match_tile(job: Job, tile: Tile) -> None:
         left_behind = _left_behind(patch, tile, job)
         job.store.check(job.manifest)
         job.store.write_arrays(tile, left_behind)
+        job.store.check(job.manifest)
     job.store.write_record(tile, {"usable_pixels": usable, "pixels_read": pixels_read, "seconds": seconds})
 
 

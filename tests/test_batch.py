@@ -1,6 +1,9 @@
 """Batches, plans and states of runs, through the library and the command."""
 
 import json
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,7 @@ from sat_intervals.batch import match_batch, read_batch
 from sat_intervals.cli import main
 from sat_intervals.config import ConfigError, load_config
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.folders import LocalFolder
 from sat_intervals.memory import fitted, parse_bytes, tile_bytes
 from sat_intervals.plan import plan
 from sat_intervals.raster import north_up, write_layer
@@ -56,6 +60,8 @@ def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(
     assert first.exit_code == 1
     assert "1 of 3 pairs failed" in first.stderr
     assert "nowhere.tif" in first.stderr
+    told = CliRunner().invoke(main, ["status", str(tmp_path / "out")])
+    assert told.stdout.startswith(f"{tmp_path / 'out' / 'broken'}: failed: {images / 'nowhere.tif'}")
     written = (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns
     rows(images)
     second = CliRunner().invoke(main, arguments)
@@ -63,6 +69,8 @@ def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(
     assert (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns == written
     report = json.loads((tmp_path / "out" / "batch.json").read_text())
     assert {end["state"] for end in report.values()} == {"done before"}
+    told = CliRunner().invoke(main, ["status", str(tmp_path / "out")])
+    assert told.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
 
 
 def test_match_batch__never_takes_another_run_for_its_own(images, tmp_path):
@@ -70,7 +78,70 @@ def test_match_batch__never_takes_another_run_for_its_own(images, tmp_path):
     match_batch(pairs, tmp_path)
     report = match_batch(pairs, tmp_path, {"median": None})
     assert {end["state"] for end in report.values()} == {"failed"}
-    assert "already holds a run" in report["pair1"]["error"]
+    assert "settings.median was" in report["pair1"]["error"]
+    assert "--overwrite" in report["pair1"]["error"]
+
+
+def test_match_batch__takes_no_result_of_another_image_for_that_of_a_pair(images, tmp_path):
+    for file in images.glob("*.tif"):
+        shutil.copy(file, tmp_path)
+    pairs = read_batch(rows(tmp_path))
+    match_batch(pairs, tmp_path / "out")
+    scene = make_scene(150, 200, seed=3)
+    write_layer(tmp_path / "left1.tif", scene.left, 0, north_up(32631, 0, 0, 0.5))
+    report = match_batch(pairs, tmp_path / "out")
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done before"}
+    assert "inputs.left.sha256 was" in report["pair1"]["error"]
+    again = match_batch(pairs, tmp_path / "out", overwrite=True)
+    assert {end["state"] for end in again.values()} == {"done"}
+
+
+def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(images, tmp_path):
+    memory = {"kind": "threads", "memory": "520MB"}  # of which a job may take 468
+    config = {"cluster": memory, "tiles": {"size": 1024}}
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path, config)
+    assert json.loads((tmp_path / "pair1" / "run.json").read_text())["tiles"]["size"] < 1024
+    assert {end["state"] for end in match_batch(pairs, tmp_path, config).values()} == {"done before"}
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"settings": {}}', "\xff"])
+def test_match_batch__goes_on_with_the_others_where_a_report_cannot_be_read(images, tmp_path, text):
+    pairs = read_batch(rows(images))
+    folder = tmp_path / "pair1"
+    folder.mkdir()
+    for name in ("intervals.tif", "validity.tif"):
+        shutil.copy(images / "left1.tif", folder / name)
+    (folder / "run.json").write_bytes(text.encode("latin-1"))
+    report = match_batch(pairs, tmp_path)
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
+    assert "run.json" in report["pair1"]["error"]
+    assert json.loads((tmp_path / "batch.json").read_text()) == report
+
+
+def test_match_batch__refuses_a_folder_where_another_batch_is_at_work(images, tmp_path):
+    with (
+        LocalFolder(tmp_path).locked(),
+        pytest.raises(SatIntervalsError, match="another run is at work in"),
+    ):
+        match_batch(read_batch(rows(images)), tmp_path)
+
+
+def test_locked__lets_one_in_at_a_time(tmp_path):
+    folder, inside, most = LocalFolder(tmp_path / "new"), [], []
+
+    def come_and_go(_):
+        for _ in range(100):
+            with suppress(SatIntervalsError), folder.locked():
+                inside.append(None)
+                most.append(len(inside))
+                inside.pop()
+
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(come_and_go, range(8)))
+    assert len(most) >= 8
+    assert max(most) == 1
+    assert not folder.path.exists()
 
 
 @pytest.mark.parametrize(
@@ -79,7 +150,11 @@ def test_match_batch__never_takes_another_run_for_its_own(images, tmp_path):
         ("a.csv", "name,left\nx,l.tif\n", "row 1 lacks right"),
         ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "2 pairs are called x"),
         ("a.csv", "name,left,right\nx,l,r,1\n", "more values than columns"),
-        ("a.csv", "name,left,right\n../x,l,r\n", "no name of a folder"),
+        ("a.csv", "name,left,right\n../x,l,r\n", "row 1: name '../x' cannot be that of the pair's folder"),
+        ("a.csv", "name,left,right\nx,l,r\nlogs,l,r\n", "row 2: name 'logs' cannot be"),
+        ("a.csv", "name,left,right,sgm.p2\nx,l,r,[3\n", r"row 1: sgm.p2 is '\[3': while parsing"),
+        ("a.csv", "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n", "row 1: sgm.p2 is '3': the row gives sgm as a whole"),
+        ("a.csv", "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n", "row 1: sgm is 'null': the row gives parts of sgm"),
         ("a.yaml", "just: text\n", "holds no pairs"),
         ("a.yaml", "- [", "cannot be read"),
         ("a.json", "[]", "holds no pairs"),

@@ -224,6 +224,7 @@ def test_batch__goes_on_after_kill_9_and_does_only_what_is_missing(pair, tmp_pat
             wait_until(lambda: len(done()) >= count or batch.poll() is not None, f"{count} tiles")  # noqa: B023
             assert batch.poll() is None
             batch.kill()
+        assert set(json.loads((tmp_path / "batch.json").read_text())) == set(names)
         before |= done()
     assert subprocess.run(command, check=False).returncode == 0
     after = done()
@@ -301,6 +302,19 @@ def test_match__goes_on_while_workers_join_and_leave(pair, tmp_path):
                     assert command.end() == 0, command.output
         assert process.is_running()
         assert_complete(pair, out)
+
+
+def test_match__shares_a_scheduler_with_another_run(pair, tmp_path):
+    with (
+        scheduler(tmp_path) as (address, _),
+        worker(address, tmp_path),
+        started(pair, tmp_path / "a", "--cluster", address) as first,
+        started(pair, tmp_path / "b", "--cluster", address) as second,
+    ):
+        assert first.end() == 0, first.output
+        assert second.end() == 0, second.output
+    assert_complete(pair, tmp_path / "a")
+    assert_complete(pair, tmp_path / "b")
 
 
 def test_match__ends_when_the_scheduler_dies_and_goes_on_elsewhere(pair, tmp_path):

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 from sat_intervals.errors import SatIntervalsError
 
@@ -74,25 +75,43 @@ class LocalFolder:
     @contextmanager
     def locked(self, waiting: Callable[[], None] = lambda: None) -> Iterator[Callable[[], None]]:
         """See `Folder`; the lock dies with its process, and a folder that is then empty goes."""
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            lock = (self.path / _LOCK).open("w")
-        except OSError as error:
-            raise SatIntervalsError(f"{self} cannot be written: {error.strerror}: choose another folder") from error
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise SatIntervalsError(
-                    f"another run is at work in {self}: wait for its end or choose another folder"
-                ) from error
+        with self._lock() as lock:
             try:
                 yield lambda: None
             finally:
-                if os.listdir(self.path) == [_LOCK]:
-                    (self.path / _LOCK).unlink(missing_ok=True)
-                    with suppress(OSError):
-                        self.path.rmdir()
+                # whoever opened it meanwhile sees that it is gone, see _lock
+                Path(lock.name).unlink(missing_ok=True)
+                with suppress(OSError):
+                    self.path.rmdir()
+
+    def _lock(self) -> TextIO:
+        """The lock's file, open and locked, under its name."""
+        file = self.path / _LOCK
+        while True:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                lock = file.open("w")
+            except FileNotFoundError:
+                continue  # removed by the one who left
+            except OSError as error:
+                raise SatIntervalsError(f"{self} cannot be written: {error.strerror}: choose another folder") from error
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.path.samestat(os.fstat(lock.fileno()), file.stat()):
+                    return lock
+            except FileNotFoundError:
+                pass
+            except BlockingIOError as error:
+                lock.close()
+                raise SatIntervalsError(
+                    f"another run is at work in {self}: wait for its end or choose another folder"
+                ) from error
+            except OSError as error:
+                lock.close()
+                raise SatIntervalsError(
+                    f"{self} cannot be locked: {error.strerror}: choose a folder on a disk that has locks"
+                ) from error
+            lock.close()  # it was removed, or replaced, before it was locked
 
     def is_locked(self) -> bool:
         """See `Folder`."""

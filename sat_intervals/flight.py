@@ -1,0 +1,144 @@
+"""Tasks on their way through a cluster, a bounded number of them at a time, whatever becomes of its workers."""
+
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple
+
+from distributed import Client, Future, KilledWorker
+from distributed.client import ClosedClientError
+
+from sat_intervals.cluster import Jobs
+from sat_intervals.errors import RunError
+
+# Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
+_LOOK_AGAIN = 2.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """A call that any worker may make, any number of times.
+
+    Attributes
+    ----------
+    label
+        What whoever waits for it knows it by.
+    function, arguments
+        The call.
+    retries
+        How often it is tried again where it raises.
+    """
+
+    label: Any
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    retries: int
+
+
+class Landing(NamedTuple):
+    """How a task ended: with a result, or with an error."""
+
+    label: Any
+    result: Any
+    error: BaseException | None
+
+
+class Flight:
+    """Tasks, two of them in flight for every core; iterates over their landings, and None where none lands for a while.
+
+    dask blames a worker's death on every task that it held. Those blamed too often are tried again at the end, one at a
+    time, so that no task fails for another.
+
+    Raises
+    ------
+    RunError
+        When the scheduler is gone, or all jobs of a batch system.
+    """
+
+    def __init__(self, client: Client, tasks: Iterator[Task]) -> None:
+        self._client, self._tasks = client, tasks
+        self._jobs = Jobs(client)
+        self._name = uuid.uuid4().hex  # a scheduler may serve several runs, and takes equal keys for one task
+        self._submitted = 0
+        self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
+        self._flying: dict[str, tuple[Task, bool, Future[Any]]] = {}
+        self._suspects: list[Task] = []
+        self._width, self._looked = 2, float("-inf")
+
+    def __iter__(self) -> Iterator[Landing | None]:
+        self._fill()
+        while self._flying:
+            future = self._next()
+            if future is None:
+                self._fill()
+                yield None
+                continue
+            result, error = _end_of(future)
+            task, is_alone, _ = self._flying.pop(str(future.key))
+            future.release()
+            is_blamed = isinstance(error, KilledWorker) and not is_alone
+            if is_blamed:
+                self._suspects.append(task)
+            self._fill()
+            if not self._flying and self._suspects:
+                self._submit(self._suspects.pop(), is_alone=True)
+            if not is_blamed:
+                yield Landing(task.label, result, error)
+
+    def _next(self) -> Future[Any] | None:
+        """The next future that ends; None where none does for a while, so that whoever waits can look around."""
+        try:
+            return self._ended.get(timeout=_LOOK_AGAIN)
+        except Empty:
+            self._jobs.check()
+            return None
+
+    def _fill(self) -> None:
+        """Submit tasks until two are in flight for every core that there is now."""
+        if time.monotonic() - self._looked > _LOOK_AGAIN:
+            with _scheduler_needed():
+                self._width = 2 * max(1, sum(self._client.nthreads().values()))
+            self._looked = time.monotonic()
+        while len(self._flying) < self._width:
+            following = next(self._tasks, None)
+            if following is None:
+                return
+            self._submit(following)
+
+    def _submit(self, task: Task, *, is_alone: bool = False) -> None:
+        self._submitted += 1
+        key = f"{task.function.__name__}-{self._name}-{self._submitted}"
+        with _scheduler_needed():
+            future = self._client.submit(task.function, *task.arguments, key=key, retries=task.retries, pure=False)
+        self._flying[key] = task, is_alone, future
+        future.add_done_callback(self._ended.put)
+
+
+def _end_of(future: Future[Any]) -> tuple[Any, BaseException | None]:
+    """Result and error of a future, one of which is None."""
+    with _scheduler_needed():
+        error: BaseException | None = future.exception()
+        if future.cancelled():
+            raise ClosedClientError(f"{future.key} is lost")
+        return (future.result(), None) if error is None else (None, error)
+
+
+@contextmanager
+def _scheduler_needed() -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ClosedClientError) as error:
+        raise RunError("the dask scheduler is gone; the same command goes on from the tiles that are done") from error
+
+
+def reason(error: BaseException) -> str:
+    """Why a task failed, in one line."""
+    if isinstance(error, KilledWorker):
+        return (
+            f"every worker that matched it died, the last at {error.last_worker.address}, as they do out of memory: "
+            "give workers more, or choose smaller tiles"
+        )
+    return " ".join(str(error).split()) or type(error).__name__
