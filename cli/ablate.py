@@ -4,14 +4,14 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.match import COSTS
+from sat_intervals.cli.options import cost_option
 from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 
 @click.command(short_help="Compare the method's parts on pairs of known truth.")
 @click.argument("pairs", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
-@judging_options  # type: ignore[untyped-decorator]
+@cost_option
+@judging_options
 def ablate(
     pairs: tuple[Path, ...],
     cost: str | None,

@@ -1,26 +1,23 @@
 """``sat-intervals batch``: many pairs, one cluster."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from sat_intervals.cli.match import overrides, run_options
+from sat_intervals.cli.options import path, run_options, settings_options
 
 
 @click.command(short_help="Match many pairs; run again, it does what is missing.")
-@click.argument("pairs", type=click.Path(path_type=Path))
-@click.argument("out", type=click.Path(path_type=Path))
-@run_options  # type: ignore[untyped-decorator]
+@click.argument("pairs", callback=path)
+@click.argument("out", callback=path)
+@settings_options
+@run_options
 def batch(
     pairs: Path,
     out: Path,
     config_file: Path | None,
-    cost: str | None,
-    tile_size: int | None,
-    overlap: int | None,
-    workers: int | None,
-    cluster: str | None,
-    store: str | None,
+    given: dict[str, Any],
     keep_tiles: bool,
     overwrite: bool,
     quiet: bool,
@@ -35,7 +32,6 @@ def batch(
 
     rows = read_batch(pairs)
     with Console(quiet) as console:
-        given = overrides(None, tile_size, overlap, workers, cluster, cost, store)
         report = match_batch(
             rows,
             out,

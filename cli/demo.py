@@ -5,26 +5,21 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.match import overrides, run_options
-from sat_intervals.cli.options import path
+from sat_intervals.cli.options import path, run_options, settings_options, with_range
 
 
 @click.command(short_help="Make a scene of known truth, match it, compare.")
 @click.argument("out", callback=path)
 @click.option("--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True)
 @click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another scene.")
-@run_options  # type: ignore[untyped-decorator]
+@settings_options
+@run_options
 def demo(
     out: Path,
     size: tuple[int, int],
     seed: int,
     config_file: Path | None,
-    cost: str | None,
-    tile_size: int | None,
-    overlap: int | None,
-    workers: int | None,
-    cluster: str | None,
-    store: str | None,
+    given: dict[str, Any],
     quiet: bool,
     **run: Any,
 ) -> None:
@@ -55,8 +50,7 @@ def demo(
         ):
             write_once(out / f"{name}.tif", layer, nodata, somewhere, overwrite=run["overwrite"])
         console.progress("scene", 1, 1)
-        given = overrides((scene.minimum, scene.maximum), tile_size, overlap, workers, cluster, cost, store)
-        config = load_config(config_file, given)
+        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum)))
         report = match_pair(out / "left.tif", out / "right.tif", out, config, progress=console.progress, **run)
     console.summary(report, out)
     figures = evaluate_run(out, out / "truth.tif")["all"]

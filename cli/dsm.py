@@ -22,8 +22,8 @@ from sat_intervals.cli.options import debug_option, path, quiet_option
 )
 @click.option("--geoid", callback=path, metavar="FILE", help="Grid of geoid heights (GTX, GeoTIFF) to count from.")
 @click.option("--output", callback=path, metavar="FILE", help="The file to write; default dsm.tif in the first OUT.")
-@quiet_option  # type: ignore[untyped-decorator]
-@debug_option  # type: ignore[untyped-decorator]
+@quiet_option
+@debug_option
 def dsm(
     outs: tuple[Path, ...],
     resolution: float,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.match import COSTS
+from sat_intervals.cli.options import COSTS
 from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class _Source:
 @click.option(
     "--cost", type=click.Choice(COSTS), multiple=True, help="Matching cost of pairs; given twice, both are compared."
 )
-@judging_options  # type: ignore[untyped-decorator]
+@judging_options
 def evaluate(
     folders: tuple[Path, ...],
     truth: tuple[Path, ...],

@@ -11,7 +11,7 @@ from sat_intervals.cli.options import debug_option, path
 @click.argument("out", callback=path)
 @click.argument("target", callback=path)
 @click.option("--to", "form", type=click.Choice(["cars", "asp", "s2p", "otb"]), required=True, help="Whose files.")
-@debug_option  # type: ignore[untyped-decorator]
+@debug_option
 def export(out: Path, target: Path, form: str) -> None:
     """Write the finished run in the folder OUT to the folder TARGET in the form of another tool.
 

@@ -1,8 +1,19 @@
 """Options that many commands have, and how names of files are taken."""
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from sat_intervals.raster import Image
+
+COSTS = ("census", "mccnn")
+
+Command = Callable[..., Any]
+Number = TypeVar("Number", int, float)
 
 
 def named(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
@@ -29,3 +40,142 @@ quiet_option = click.option("--quiet", is_flag=True, help="Print errors only.")
 debug_option = click.option(
     "--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."
 )
+cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
+disparity_option = click.option(
+    "--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched."
+)
+
+
+def image_options(command: Command) -> Command:
+    """Options that say how the images of a pair are read; a command gets ``images``, which opens both of them.
+
+    It gets ``window`` as well, the region of the left image, or None.
+    """
+
+    @wraps(command)
+    def with_images(
+        *,
+        left_mask: str | None,
+        right_mask: str | None,
+        nodata: float | None,
+        left_nodata: float | None,
+        right_nodata: float | None,
+        band: int | None,
+        left_band: int | None,
+        right_band: int | None,
+        window: tuple[int, int, int, int] | None,
+        **others: Any,
+    ) -> Any:
+        from sat_intervals.tiling import Window
+
+        def images(left: str, right: str) -> "tuple[Image, Image]":
+            from sat_intervals.raster import open_image
+
+            return (
+                open_image(left, band=_either(left_band, band), nodata=_either(left_nodata, nodata), mask=left_mask),
+                open_image(
+                    right, band=_either(right_band, band), nodata=_either(right_nodata, nodata), mask=right_mask
+                ),
+            )
+
+        return command(images=images, window=Window(*window) if window else None, **others)
+
+    return _with(
+        with_images,
+        click.option(
+            "--left-mask", callback=named, metavar="FILE", help="Left pixels to leave out: non-zero = masked."
+        ),
+        click.option("--right-mask", callback=named, metavar="FILE", help="Right pixels to leave out."),
+        click.option("--nodata", type=float, metavar="V", help="No-data value of both images, in place of their own."),
+        click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image."),
+        click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image."),
+        click.option(
+            "--band", type=int, metavar="N", help="Band to match of both images, needed where they have several."
+        ),
+        click.option("--left-band", type=int, metavar="N", help="Band of the left image."),
+        click.option("--right-band", type=int, metavar="N", help="Band of the right image."),
+        click.option(
+            "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
+        ),
+    )
+
+
+def settings_options(command: Command) -> Command:
+    """Options that give settings; a command gets ``config_file`` and ``given``, the sections of the command line."""
+
+    @wraps(command)
+    def with_settings(
+        *,
+        cost: str | None,
+        tile_size: int | None,
+        overlap: int | None,
+        workers: int | None,
+        cluster: str | None,
+        store: str | None,
+        **others: Any,
+    ) -> Any:
+        is_address = cluster is not None and "://" in cluster
+        sections: dict[str, dict[str, Any]] = {
+            "cost": {"method": cost},
+            "tiles": {"size": tile_size, "overlap": overlap},
+            "cluster": {
+                "workers": workers,
+                "kind": "address" if is_address else cluster,
+                "address": cluster if is_address else None,
+                "store": store,
+            },
+        }
+        set_keys = {
+            name: {key: value for key, value in section.items() if value is not None}
+            for name, section in sections.items()
+        }
+        return command(given={name: section for name, section in set_keys.items() if section}, **others)
+
+    return _with(
+        with_settings,
+        click.option(
+            "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
+        ),
+        cost_option,
+        click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
+        click.option("--overlap", type=int, help="Pixels read around a core."),
+        click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
+        click.option(
+            "--cluster",
+            metavar="SPEC",
+            help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
+        ),
+        click.option(
+            "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles until the run is finished."
+        ),
+    )
+
+
+def run_options(command: Command) -> Command:
+    """Options of a command that makes runs."""
+    return _with(
+        command,
+        click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
+        click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
+        quiet_option,
+        debug_option,
+    )
+
+
+def with_range(given: dict[str, Any], disparity: tuple[int, int] | None) -> dict[str, Any]:
+    """Sections of the command line with its search range, if there is one."""
+    return (
+        given
+        if disparity is None
+        else {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
+    )
+
+
+def _with(command: Command, *options: Callable[[Command], Command]) -> Command:
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _either(first: Number | None, second: Number | None) -> Number | None:
+    return second if first is None else first

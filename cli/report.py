@@ -12,7 +12,7 @@ _FILE = click.Path(path_type=Path)
 @click.command(short_help="Make a page of a finished run to look at in a browser.")
 @click.argument("out", type=_FILE)
 @click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if there is one.")
-@debug_option  # type: ignore[untyped-decorator]
+@debug_option
 def report(out: Path, truth: Path | None) -> None:
     """Write OUT/report.html: one file for any browser, which needs no network and nothing beside it.
 

@@ -15,8 +15,8 @@ from sat_intervals.cli.options import debug_option, path, quiet_option
 )
 @click.option("--left-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the left image.")
 @click.option("--right-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the right image.")
-@quiet_option  # type: ignore[untyped-decorator]
-@debug_option  # type: ignore[untyped-decorator]
+@quiet_option
+@debug_option
 def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path, quiet: bool) -> None:
     """Triangulate the disparity and both bounds of the finished run in the folder OUT.
 

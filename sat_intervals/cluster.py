@@ -119,6 +119,13 @@ def _undisturbed() -> Iterator[None]:
             signal.raise_signal(late)
 
 
+def tiles_at_once(settings: Cluster) -> int:
+    """Tiles in work at once; of a scheduler that is there, as many as this machine had."""
+    if settings.kind in ("threads", "processes", "address"):
+        return settings.workers or available_cores()
+    return (settings.maximum_jobs or settings.jobs) * settings.cores
+
+
 def _batch_system(settings: Cluster, logs: Path) -> Any:
     """The dask-jobqueue cluster of SLURM, PBS, LSF or SGE; what is not set comes from the user's dask configuration."""
     try:
@@ -209,7 +216,7 @@ class Jobs:
         if self._client.nthreads():
             self._seen = now
             return
-        if cluster.refusals:
+        if cluster.refusals and not any(job.job_id for job in cluster.workers.values()):
             raise SatIntervalsError(
                 f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
             )
@@ -219,7 +226,7 @@ class Jobs:
         if now - self._asked < _ASKED_EVERY:
             return
         self._asked = now
-        if _any_in_queue({job.job_id for job in cluster.workers.values()}):
+        if _any_in_queue({job.job_id for job in cluster.workers.values() if job.job_id}):
             self._seen = now
         elif now - self._seen > patience:
             raise RunError(

@@ -111,7 +111,7 @@ def prepare(
     """Check all that can be checked before a pixel is read; parameters as of `match_pair`."""
     config, out = fitted_to_jobs(load_config(config)), Path(out)
     left, right = checked_pair(left, right, config)
-    region = _region(left, window)
+    region = checked_region(left, window)
     _check_memory(config, region)
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
@@ -137,7 +137,7 @@ def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: 
     now = {
         "settings": config.model_dump(mode="json", exclude={"cluster"}),
         "inputs": _inputs(left, right, config, report["inputs"]),
-        "region": asdict(_region(left, None)),
+        "region": asdict(checked_region(left, None)),
     }
     for one in (before, now):
         one["inputs"].get("weights", {}).pop("onnxruntime", None)
@@ -191,7 +191,8 @@ def compile_kernels(config: Config) -> None:
     list(finish_strips([rows], Scale(0.0, 1.0), config))
 
 
-def _region(left: Image, window: Window | None) -> Window:
+def checked_region(left: Image, window: Window | None) -> Window:
+    """What is matched of the left image: the window that is given, or all of it."""
     whole = Window(0, 0, left.height, left.width)
     if window is None:
         return whole

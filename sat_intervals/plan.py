@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.cluster import available_cores
+from sat_intervals.cluster import tiles_at_once
 from sat_intervals.config import Cluster, Config, load_config
-from sat_intervals.job import checked_pair
-from sat_intervals.memory import PROCESS_BYTES, fitted, tile_bytes
+from sat_intervals.job import checked_pair, checked_region
+from sat_intervals.memory import PROCESS_BYTES, fitted, fitted_to_jobs, tile_bytes
 from sat_intervals.raster import Image
 from sat_intervals.run import match_pair
 from sat_intervals.tiling import Grid, Window
@@ -31,8 +31,11 @@ class Plan:
         Tiles in work at once.
     extra_work
         Share of the matching that goes to overlaps.
-    worker_bytes, total_bytes
-        Memory of one tile in work with its process, and of all of them in one process.
+    worker_bytes
+        Memory of one tile in work with its process.
+    together, together_bytes
+        Tiles in work at once in one process, which are all in threads, and as many as it has cores in a job of a batch
+        system; and memory of that process.
     disk_bytes
         Scratch and files in the folder of the run.
     seconds
@@ -44,7 +47,8 @@ class Plan:
     workers: int
     extra_work: float
     worker_bytes: int
-    total_bytes: int
+    together: int
+    together_bytes: int
     disk_bytes: int
     seconds: float
 
@@ -54,6 +58,7 @@ def plan(
     right: str | Path | Image,
     config: Any,
     *,
+    window: Window | None = None,
     memory: int | None = None,
     workers: int | None = None,
 ) -> Plan:
@@ -61,12 +66,14 @@ def plan(
 
     Parameters
     ----------
-    left, right, config
+    left, right, config, window
         As of `match_pair`.
     memory
-        Bytes that a worker may take; the tile gets smaller where it must, the search range never.
+        Bytes that a worker may take; the tile gets smaller where it must, the search range never. By default what the
+        settings give a job.
     workers
-        Tiles in work at once; by default those of the settings, or one a core.
+        Tiles in work at once; by default those of the settings, with batch systems all cores of all jobs, or one a core
+        of this machine.
 
     Raises
     ------
@@ -74,45 +81,47 @@ def plan(
         What cannot be matched, and memory in which no tile fits, with the figures.
     """
     config = load_config(config)
-    if memory is not None:
-        config = fitted(config, memory)
+    config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
     left, right = checked_pair(left, right, config)
-    workers = workers or config.cluster.workers or available_cores()
-    whole = Window(0, 0, left.height, left.width)
-    grid = Grid(whole, config.tiles.size)
-    work = _work(grid, whole, config)
-    pixels = whole.height * whole.width
+    workers = workers or tiles_at_once(config.cluster)
+    region = checked_region(left, window)
+    grid = Grid(region, config.tiles.size)
+    work = _work(grid, region, config)
+    pixels = region.height * region.width
+    together = {"threads": workers, "processes": 1, "address": 1}.get(config.cluster.kind, config.cluster.cores)
     return Plan(
         tile_size=config.tiles.size,
         tiles=len(grid),
         workers=workers,
         extra_work=work / pixels - 1,
         worker_bytes=PROCESS_BYTES + tile_bytes(config),
-        total_bytes=PROCESS_BYTES + workers * tile_bytes(config),
+        together=together,
+        together_bytes=PROCESS_BYTES + together * tile_bytes(config),
         disk_bytes=pixels * (_STORE_BYTES + _STRIP_BYTES + _FILE_BYTES),
-        seconds=_expected_seconds(left, right, config, workers, work, whole),
+        seconds=_expected_seconds(left, right, config, workers, work, region),
     )
 
 
-def _work(grid: Grid, image: Window, config: Config) -> int:
+def _work(grid: Grid, region: Window, config: Config) -> int:
     """Pixels that the two sweeps visit, on average of both: all of the patch but the rows behind its core."""
     overlap = config.tiles.overlap
     total = 0
     for tile in grid:
-        patch = tile.core.grown(overlap, overlap).clipped(image)
+        patch = tile.core.grown(overlap, overlap).clipped(region)
         total += patch.width * (tile.core.height + patch.height) // 2
     return total
 
 
-def _expected_seconds(left: Image, right: Image, config: Config, workers: int, work: int, whole: Window) -> float:
+def _expected_seconds(left: Image, right: Image, config: Config, workers: int, work: int, region: Window) -> float:
     """Seconds of a run: those of a sample, tiles scaled by their work, the rest by pixels."""
-    height, width = min(SAMPLE, whole.height), min(SAMPLE, whole.width)
-    sample = Window((whole.height - height) // 2, (whole.width - width) // 2, height, width)
+    height, width = min(SAMPLE, region.height), min(SAMPLE, region.width)
+    row, column = region.row + (region.height - height) // 2, region.column + (region.width - width) // 2
+    sample = Window(row, column, height, width)
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # nor in the store of the run itself
     with tempfile.TemporaryDirectory() as folder:
         seconds = match_pair(left, right, Path(folder) / "sample", one, window=sample)["seconds"]
-    sampled = _work(Grid(sample, config.tiles.size), whole, config)
+    sampled = _work(Grid(sample, config.tiles.size), region, config)
     tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / sampled / workers
-    files = (seconds["bands"] + seconds["files"]) * (whole.height * whole.width) / (height * width)
+    files = (seconds["bands"] + seconds["files"]) * (region.height * region.width) / (height * width)
     images = seconds["tiles.images"]  # whole already, whatever the sample
     return float(seconds["start"] + seconds["kernels"] + images + tiles + files)

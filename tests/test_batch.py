@@ -6,7 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rasterio
+import yaml
 from click.testing import CliRunner
 
 from sat_intervals.batch import match_batch, read_batch
@@ -227,11 +230,26 @@ def test_plan__prints_what_a_run_will_take(images):
     pair = [str(images / "left1.tif"), str(images / "right1.tif"), "--disparity", "-18", "40"]
     result = CliRunner().invoke(main, ["plan", *pair, "--memory", "400MB", "--workers", "3"])
     assert result.exit_code == 0, result.stderr
-    assert "expected time with 3 workers" in result.stdout
+    assert "expected time, 3 tiles at once" in result.stdout
     assert "smaller than set, to fit" in result.stdout
     refused = CliRunner().invoke(main, ["plan", *pair, "--memory", "100MB"])
     assert refused.exit_code == 2
     assert "given are 100 MB" in refused.stderr
+
+
+def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(images, tmp_path):
+    bands = tmp_path / "bands.tif"
+    with rasterio.open(images / "left1.tif") as file, rasterio.open(bands, "w", **file.profile | {"count": 2}) as copy:
+        copy.write(np.stack([file.read(1), file.read(1)]))
+    cluster = {"kind": "slurm", "jobs": 4, "maximum_jobs": 8, "cores": 3, "memory": "1GB"}
+    settings = tmp_path / "settings.yaml"
+    settings.write_text(yaml.safe_dump({"disparity": {"minimum": -18, "maximum": 40}, "cluster": cluster}))
+    arguments = ["plan", str(bands), str(images / "right1.tif"), "--config", str(settings), "--band", "1"]
+    result = CliRunner().invoke(main, [*arguments, "--window", "20", "0", "100", "200", "--tile-size", "512"])
+    assert result.exit_code == 0, result.stderr
+    assert "24 tiles at once" in result.stdout
+    assert "with 3 tiles at once" in result.stdout
+    assert "1 of 512 px" in result.stdout
 
 
 def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):

@@ -61,8 +61,10 @@ def pair(tmp_path_factory):
 
 
 @contextmanager
-def submitted(pair, folder: Path, status: int = 0, own: dict[str, object] | None = None, **cluster: object):
-    """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration."""
+def submitted(
+    pair, folder: Path, status: int = 0, own: dict[str, object] | None = None, programs: str = "", **cluster: object
+):
+    """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first."""
     images, settings = pair
     folder.mkdir(exist_ok=True)
     job = {"jobs": 1, "cores": 1, "memory": "2GB", "walltime": "00:05:00"} | cluster
@@ -76,6 +78,7 @@ def submitted(pair, folder: Path, status: int = 0, own: dict[str, object] | None
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
     with (folder / "log").open("w") as log:
         environment = os.environ | {f"DASK_{name}": str(value) for name, value in own.items()}
+        environment["PATH"] = f"{programs}:{environment['PATH']}".lstrip(":")
         process = subprocess.Popen(list(map(str, command)), stdout=log, stderr=subprocess.STDOUT, env=environment)
     try:
         yield process
@@ -141,6 +144,21 @@ def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_pat
             worker.send_signal(signal.SIGSTOP)
         wait_until(lambda: job not in jobs(), "end of the job's time", 130)
         assert process.poll() is None
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_match__goes_on_with_the_jobs_that_the_batch_system_took(slurm, pair, tmp_path):
+    programs, once = tmp_path / "programs", tmp_path / "refused"
+    programs.mkdir()
+    sbatch = programs / "sbatch"
+    sbatch.write_text(
+        f"#!/bin/sh\nif mkdir {once} 2> /dev/null; then echo too many jobs >&2; exit 1; fi\n"
+        f'exec {shutil.which("sbatch")} --begin=now+5 "$@"\n'  # the refusal is there for longer than jobs are not
+    )
+    sbatch.chmod(0o755)
+    with submitted(pair, tmp_path, programs=str(programs), jobs=2):
+        pass
+    assert once.exists()
     assert_complete(pair, tmp_path / "out")
 
 
