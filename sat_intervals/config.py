@@ -216,6 +216,20 @@ class MccnnSgm(_Penalties):
     )
     span: Exact = Field(Decimal(16), gt=0, description="cost that etas and alpha are shares of, after SGM")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _check_span(cls, values: Any) -> Any:
+        """The default span was chosen for the default penalties: bounds by another pair of them are not those meant."""
+        if isinstance(values, Mapping) and "span" not in values:
+            fields = {key: cls.model_fields[key].default for key in values if key in cls.model_fields}
+            changed = [key for key, default in fields.items() if default not in (values[key], _as_written(values[key]))]
+            if changed:
+                raise ValueError(
+                    f"span is missing: the default {cls.model_fields['span'].default} belongs to the default penalties, "
+                    f"not to another {' and '.join(changed)}: give one (config --preset mccnn shows some)"
+                )
+        return values
+
     @property
     def largest_p2(self) -> Fraction:
         """What a larger step costs at most."""
@@ -634,7 +648,11 @@ def _read_yaml(file: Path) -> Mapping[str, Any]:
     try:
         values = yaml.load(file.read_bytes(), _UniqueKeyLoader)  # a SafeLoader
     except OSError as error:
-        raise ConfigError(f"{file}: {error.strerror}") from error
+        preset = (
+            isinstance(error, FileNotFoundError) and file.name == f"{file.stem}.yaml" and file.stem in preset_names()
+        )
+        hint = f" (sat-intervals config --preset {file.stem} > {file} writes one)" if preset else ""
+        raise ConfigError(f"{file}: {error.strerror}{hint}") from error
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(f"{file}: {line}{error.problem}") from error

@@ -75,8 +75,16 @@ class Network:
         self.count = int(features.shape[0])
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
-        """Features ``(count, rows - 10, columns - 10)`` of normalised pixels ``(rows, columns)``, float32."""
-        return np.asarray(self._session.run(None, {self._input: pixels})[0])
+        """Features ``(count, rows - 10, columns - 10)`` of normalised pixels ``(rows, columns)``, float32.
+
+        Zeros, whose cosine with any feature is 0, where a network makes no unit vector, as one without biases of a
+        window without texture: NaN, of a division by the length 0.
+        """
+        features = np.asarray(self._session.run(None, {self._input: pixels})[0])
+        lost = np.isnan(features[:1]).all(axis=0)
+        if lost.any():
+            features[:, lost] = 0
+        return features
 
 
 def _session(file: Path) -> Any:

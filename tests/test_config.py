@@ -342,6 +342,10 @@ def test_load_config__merged_keys_may_be_given_again(write) -> None:
 def test_load_config__unreadable_file_is_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing.yaml"
     assert message(missing) == f"{missing}: No such file or directory"
+    preset = tmp_path / "mccnn.yaml"
+    assert message(preset).endswith(
+        f"mccnn.yaml: No such file or directory (sat-intervals config --preset mccnn > {preset} writes one)"
+    )
     assert message(tmp_path) == f"{tmp_path}: Is a directory"
 
 

@@ -99,6 +99,16 @@ def test_network__is_a_valid_convolution(network_file, weights):
     np.testing.assert_allclose(features, slow_features(weights, pixels), atol=1e-5)
 
 
+def test_network__without_a_unit_vector_makes_zeros(tmp_path, weights):
+    unbiased = {name: value * (not name.endswith("bias")) for name, value in weights.items()}
+    network = Network(write_network(tmp_path / "unbiased.onnx", unbiased))
+    pixels = np.random.default_rng(0).standard_normal((19, 40), np.float32)
+    pixels[:, 10:30] = 0
+    features = network(pixels)
+    assert not features[:, :, 10:20].any()
+    np.testing.assert_allclose(np.linalg.norm(features[:, :, [0, 9, 20, 29]], axis=0), 1, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("options", "layers", "message"),
     [
@@ -177,7 +187,9 @@ def test_compare__penalties_follow_both_images(network_file):
 def test_compare__a_right_area_is_a_left_one_of_swapped_images(network_file, gradients):
     left, right = masked_images()
     scales = Scales(Scale(490.0, 75.0), Scale(510.0, 85.0))
-    config, swapped = (settings(*ends, network_file, sgm={"gradients": gradients}) for ends in ((-6, 3), (-3, 6)))
+    config, swapped = (
+        settings(*ends, network_file, sgm={"gradients": gradients, "span": 16}) for ends in ((-6, 3), (-3, 6))
+    )
     window = Window(3, -4, 20, 30)
     both = [Area.of(Window(3, 1, 20, 25), config), Area.mirror(window, config)]
     _, found = compare(_reader(left), _reader(right), both, config, scales)
@@ -197,9 +209,12 @@ def test_config__span_is_declared_and_held_to_what_can_be():
     with pytest.raises(SatIntervalsError, match=r"sgm\.span is 60, allowed: <= 48 with p2 4"):
         settings(-9, 0, sgm={"p2": 4, "span": 60})
     with pytest.raises(SatIntervalsError, match=r"sgm\.gradients raw looks at the right image at disparity 0"):
-        settings(1, 9, sgm={"gradients": "raw"})
+        settings(1, 9, sgm={"gradients": "raw", "span": 16})
     with pytest.raises(SatIntervalsError, match=r"sgm\.p2 is 70, allowed: <= 63 with cost\.method mccnn"):
-        settings(-9, 0, sgm={"p2": 70})
+        settings(-9, 0, sgm={"p2": 70, "span": 16})
+    with pytest.raises(SatIntervalsError, match=r"sgm.*: span is missing: the default 16 .* another p1 and p2: give"):
+        settings(-9, 0, sgm={"p1": 2.3, "p2": 42.3, "v": 1.5, "d": 0.08})
+    assert settings(-9, 0, sgm={"p1": 0.5, "d": 0.08}) == settings(-9, 0)
     with pytest.raises(SatIntervalsError, match=r"sgm\.penalty is constant, allowed: mc_cnn_fast with cost"):
         settings(-9, 0, sgm={"penalty": "constant"})
 
@@ -249,6 +264,19 @@ def test_match_pair__equals_match_arrays_and_keeps_what_decides(tmp_path, networ
     assert run["normalization"]["left"] == pytest.approx({"mean": left.mean(), "deviation": left.std()})
     assert run["normalization"]["right"] == pytest.approx({"mean": right.mean(), "deviation": right.std()})
     assert load_config(run["settings"]) == config
+
+
+def test_match_pair__processes_and_threads_make_the_same_bytes_and_pages(tmp_path):
+    left, right = masked_images(70, 140)
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    for kind in ("threads", "processes"):
+        config = settings(-4, 6, tiles={"size": 64, "overlap": 20}, cluster={"kind": kind, "workers": 2})
+        match_pair(*images, tmp_path / kind, config)
+    for name in ("intervals.tif", "validity.tif"):
+        assert (tmp_path / "threads" / name).read_bytes() == (tmp_path / "processes" / name).read_bytes()
+    told = invoke("report", tmp_path / "processes")
+    assert told.exit_code == 0, told.output
+    assert "mccnn" in (tmp_path / "processes" / "report.html").read_text()
 
 
 def test_match_pair__goes_on_with_the_means_that_were_measured(tmp_path, network_file):
