@@ -225,8 +225,8 @@ class MccnnSgm(_Penalties):
             changed = [key for key, default in fields.items() if default not in (values[key], _as_written(values[key]))]
             if changed:
                 raise ValueError(
-                    f"span is missing: the default {cls.model_fields['span'].default} belongs to the default penalties, "
-                    f"not to another {' and '.join(changed)}: give one (config --preset mccnn shows some)"
+                    f"span is missing: the default, {cls.model_fields['span'].default}, was chosen for the default "
+                    f"penalties, not for another {' and '.join(changed)}: give one (config --preset mccnn shows some)"
                 )
         return values
 
