@@ -1,0 +1,36 @@
+"""What a user may set: its default, its range, its one-line meaning, and the thresholds that follow."""
+
+from sat_intervals.config.penalties import InverseSgm, MccnnSgm, NegativeSgm, Sgm
+from sat_intervals.config.reading import load_config, preset_names, preset_text
+from sat_intervals.config.sections import (
+    Ambiguity,
+    Census,
+    Cluster,
+    ConfigError,
+    Disparity,
+    Interval,
+    Mccnn,
+    Regularization,
+)
+from sat_intervals.config.settings import Config
+from sat_intervals.config.wording import allowed
+
+__all__ = [
+    "Ambiguity",
+    "Census",
+    "Cluster",
+    "Config",
+    "ConfigError",
+    "Disparity",
+    "Interval",
+    "InverseSgm",
+    "Mccnn",
+    "MccnnSgm",
+    "NegativeSgm",
+    "Regularization",
+    "Sgm",
+    "allowed",
+    "load_config",
+    "preset_names",
+    "preset_text",
+]

@@ -1,0 +1,103 @@
+"""Sections of semi-global matching, one for each way in which its penalties may follow the images."""
+
+from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sat_intervals.config.sections import Exact, Section, as_written
+
+
+class _Penalties(Section):
+    """Semi-global matching over 8 paths (Hirschmuller 2008)."""
+
+    penalty: str
+    p1: Any
+    p2: Any
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        if self.p1 > self.p2:
+            raise ValueError(f"p1 {self.p1} is above p2 {self.p2}, the penalty of a larger step")
+        return self
+
+
+class Sgm(_Penalties):
+    """Constant penalties."""
+
+    penalty: Literal["constant"] = Field("constant", description="the same everywhere; or negative or inverse")
+    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
+    p2: int = Field(32, ge=1, description="penalty of a larger step, at least p1")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return Fraction(self.p2)
+
+
+class NegativeSgm(_Penalties):
+    """The penalty of a larger step falls with the gradient of the left image, in a line (Banz et al. 2012)."""
+
+    penalty: Literal["negative"] = Field("negative", description="p2 is gamma - alpha * gradient")
+    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
+    p2: int = Field(32, ge=1, description="least penalty of a larger step, at least p1")
+    alpha: float = Field(ge=0, description="fall of the penalty by a grey value of gradient")
+    gamma: float = Field(gt=0, description="penalty of a larger step without gradient")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return max(Fraction(self.p2), Fraction(self.gamma))
+
+
+class InverseSgm(_Penalties):
+    """The penalty of a larger step falls with the inverse of the left image's gradient (Banz et al. 2012)."""
+
+    penalty: Literal["inverse"] = Field("inverse", description="p2 is gamma + alpha / (gradient + beta)")
+    p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
+    p2: int = Field(32, ge=1, description="least penalty of a larger step, at least p1")
+    alpha: float = Field(ge=0, description="share of the penalty that gradients bring down, times beta")
+    beta: float = Field(gt=0, description="gradient, in grey values, that halves this share")
+    gamma: float = Field(ge=0, description="penalty of a larger step at an endless gradient")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return max(Fraction(self.p2), Fraction(self.gamma) + Fraction(self.alpha) / Fraction(self.beta))
+
+
+class MccnnSgm(_Penalties):
+    """Penalties of MC-CNN, in units of the cosine: they fall where an image has an edge along the path."""
+
+    penalty: Literal["mc_cnn_fast"] = Field("mc_cnn_fast", description="they fall where the images have edges")
+    p1: Exact = Field(Decimal("0.5"), gt=0, description="penalty of a disparity step of one pixel")
+    p2: Exact = Field(Decimal("0.75"), gt=0, description="penalty of a larger step, at least p1")
+    q1: Exact = Field(Decimal(3), ge=1, description="divides both where one of the images has an edge")
+    q2: Exact = Field(Decimal(6), ge=1, description="divides them again where both have")
+    v: Exact = Field(Decimal("1.5"), ge=1, description="divides p1 on the vertical paths")
+    d: float = Field(0.08, ge=0, description="gradient above which there is an edge")
+    gradients: Literal["normalized", "raw"] = Field(
+        "normalized", description="in standard deviations, right where a candidate faces it; or as the reference"
+    )
+    span: Exact = Field(Decimal(16), gt=0, description="cost that etas and alpha are shares of, after SGM")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_span(cls, values: Any) -> Any:
+        """The default span was chosen for the default penalties: bounds by another pair of them are not those meant."""
+        if isinstance(values, Mapping) and "span" not in values:
+            fields = {key: cls.model_fields[key].default for key in values if key in cls.model_fields}
+            changed = [key for key, default in fields.items() if default not in (values[key], as_written(values[key]))]
+            if changed:
+                raise ValueError(
+                    f"span is missing: the default, {cls.model_fields['span'].default}, was chosen for the default "
+                    f"penalties, not for another {' and '.join(changed)}: give one (config --preset mccnn shows some)"
+                )
+        return values
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return Fraction(self.p2)

@@ -1,0 +1,133 @@
+"""Settings from YAML files, mappings and the command line, and the files of settings that come with the package."""
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from sat_intervals.config.sections import ConfigError
+from sat_intervals.config.settings import Config
+from sat_intervals.config.wording import explained, known, shown
+
+
+def load_config(
+    source: str | Path | Mapping[str, Any] | Config | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Config:
+    """Check settings and complete them with the defaults.
+
+    Parameters
+    ----------
+    source
+        A YAML file, a mapping of sections, or settings checked before; None for the defaults.
+    overrides
+        Sections and keys that win over ``source``, as those of the command line do.
+
+    Raises
+    ------
+    ConfigError
+        All that is wrong, in one line.
+    """
+    overrides = overrides or {}
+    values: Mapping[str, Any] = {}
+    file = ""
+    match source:
+        case None:
+            pass
+        case str() | Path():
+            values, file = _read_yaml(Path(source)), f"{source}: "
+        case Config():
+            values = source.model_dump()
+        case Mapping():
+            values = source
+        case _:
+            raise ConfigError(f"settings are {shown(source)}, allowed: a YAML file, a mapping or a Config")
+    try:
+        return Config.model_validate(_merged(_without_other_cost(values, overrides), overrides))
+    except ValidationError as error:
+        problems = error.errors(include_url=False)
+        if all(_given(overrides, problem["loc"]) for problem in problems):
+            file = ""  # not to blame for what the overrides brought
+        raise ConfigError(file + "; ".join(map(explained, problems))) from error
+
+
+def preset_names() -> tuple[str, ...]:
+    """Return the names of the settings files that come with the package."""
+    files = resources.files("sat_intervals.configs").iterdir()
+    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
+
+
+def preset_text(name: str = "default") -> str:
+    """Return the text of a settings file that comes with the package: complete, commented YAML."""
+    if name not in preset_names():
+        raise ConfigError(f"unknown preset {name!r}{known(name, preset_names())}")
+    return (resources.files("sat_intervals.configs") / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def _without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The settings without cost and penalties where the overrides choose another method, whose keys are others."""
+
+    def method(settings: Mapping[str, Any]) -> Any:
+        cost = settings.get("cost")
+        return cost.get("method") if isinstance(cost, Mapping) else None
+
+    if method(overrides) in (None, method(values) or "census"):
+        return values
+    return {key: value for key, value in values.items() if key != "cost" and (key != "sgm" or value is None)}
+
+
+def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(values)
+    for key, value in overrides.items():
+        below = merged.get(key)
+        if isinstance(below, Mapping) and isinstance(value, Mapping):
+            value = _merged(below, value)
+        merged[key] = value
+    return merged
+
+
+def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
+    for key in path:
+        if not isinstance(overrides, Mapping) or key not in overrides:
+            return False
+        overrides = overrides[key]
+    return bool(path)  # an error without a path is between sections
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML's safe subset, where a key given twice is an error: plain YAML keeps the last without a word."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                raise yaml.MarkedYAMLError(problem=f"key {key.value!r} appears twice", problem_mark=key.start_mark)
+            seen.add(key.value)
+        return node
+
+
+def _read_yaml(file: Path) -> Mapping[str, Any]:
+    try:
+        values = yaml.load(file.read_bytes(), _UniqueKeyLoader)  # a SafeLoader
+    except OSError as error:
+        preset = (
+            isinstance(error, FileNotFoundError) and file.name == f"{file.stem}.yaml" and file.stem in preset_names()
+        )
+        hint = f" (sat-intervals config --preset {file.stem} > {file} writes one)" if preset else ""
+        raise ConfigError(f"{file}: {error.strerror}{hint}") from error
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        raise ConfigError(f"{file}: {line}{error.problem}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"{file}: {' '.join(str(error).split())}") from error
+    if values is None:
+        return {}
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{file}: holds {shown(values)}, allowed: sections {', '.join(Config.model_fields)}")
+    return values

@@ -1,0 +1,169 @@
+"""All settings of a run, how their sections fit together, and the integer thresholds that follow from them."""
+
+from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
+from math import ceil, floor
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from sat_intervals.config.penalties import InverseSgm, MccnnSgm, NegativeSgm, Sgm
+from sat_intervals.config.sections import (
+    Ambiguity,
+    Census,
+    Cluster,
+    CrossCheck,
+    Disparity,
+    Interval,
+    Mccnn,
+    Median,
+    Products,
+    Refinement,
+    Regularization,
+    Section,
+    Tiles,
+)
+from sat_intervals.products import IMPOSSIBLE_COST
+
+SGM_PATHS = 8
+
+
+class Config(Section):
+    """All settings of a run; a section that is None switches its step off."""
+
+    disparity: Disparity
+    cost: Census | Mccnn = Field(Census(), discriminator="method")
+    sgm: Sgm | NegativeSgm | InverseSgm | MccnnSgm | None = Field(Sgm(), discriminator="penalty")
+    ambiguity: Ambiguity | None = Ambiguity()
+    interval: Interval | None = Interval()
+    refinement: Refinement | None = Refinement()
+    cross_check: CrossCheck | None = CrossCheck()
+    median: Median | None = Median()
+    regularization: Regularization | None = Regularization()
+    tiles: Tiles = Tiles()
+    products: Products = Products()
+    cluster: Cluster = Cluster()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose_methods(cls, values: Any) -> Any:
+        """Where a section does not say its kind: census, and the penalties of the cost."""
+        if not isinstance(values, Mapping):
+            return values
+        values = dict(values)
+        cost = values.setdefault("cost", {})
+        if isinstance(cost, Mapping):
+            cost = values["cost"] = {"method": "census", **cost}
+        method = cost.get("method") if isinstance(cost, Mapping) else getattr(cost, "method", None)
+        sgm = values.setdefault("sgm", {})
+        if isinstance(sgm, Mapping):
+            values["sgm"] = {"penalty": "mc_cnn_fast" if method == "mccnn" else "constant", **sgm}
+        return values
+
+    @model_validator(mode="after")
+    def _check_sections(self) -> Self:
+        if self.sgm is not None:
+            self._check_sgm(self.sgm)
+        off = [name for name in ("ambiguity", "interval") if getattr(self, name) is None]
+        if self.regularization is not None and off:
+            raise ValueError(
+                f"regularization needs {' and '.join(off)}, which null switches off: "
+                f"give {' and '.join(off)} or set regularization to null"
+            )
+        # Neighbouring tiles are compared on a ring of one pixel around the core: windows must be whole there.
+        smallest = self.cost.window // 2 + 1
+        if self.tiles.overlap < smallest:
+            raise ValueError(
+                f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with {self._cost_in_words}"
+            )
+        return self
+
+    def _check_sgm(self, sgm: Sgm | NegativeSgm | InverseSgm | MccnnSgm) -> None:
+        if isinstance(sgm, MccnnSgm) != isinstance(self.cost, Mccnn):
+            known = "mc_cnn_fast" if isinstance(self.cost, Mccnn) else "constant, negative or inverse"
+            raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: {known} with cost.method {self.cost.method}")
+        # The largest uint16 is kept free: it marks the summed cost of an impossible candidate.
+        largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.cost.largest
+        if self.largest_p2 > largest:
+            key = "p2" if sgm.penalty in ("constant", "mc_cnn_fast") else "gamma, the penalty without gradient,"
+            raise ValueError(
+                f"sgm.{key} is {float(sgm.largest_p2):g}, allowed: <= {largest // self.cost.steps} with "
+                f"{self._cost_in_words}, so that costs summed over {SGM_PATHS} paths fit in 16 bits"
+            )
+        if isinstance(sgm, MccnnSgm):
+            if self.cost_span > self.largest_sum:
+                raise ValueError(
+                    f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
+                )
+            if sgm.gradients == "raw" and not self.disparity.minimum <= 0 <= self.disparity.maximum:
+                raise ValueError("sgm.gradients raw looks at the right image at disparity 0, which is not searched")
+
+    @property
+    def _cost_in_words(self) -> str:
+        return f"cost.window {self.cost.window}" if isinstance(self.cost, Census) else f"cost.method {self.cost.method}"
+
+    def in_steps(self, value: Decimal | float | Fraction) -> int:
+        """The nearest integer cost to a value in units of the settings."""
+        return floor(Fraction(value) * self.cost.steps + Fraction(1, 2))
+
+    @property
+    def largest_p2(self) -> int:
+        """The largest penalty, as an integer cost; 0 without SGM."""
+        return 0 if self.sgm is None else self.in_steps(self.sgm.largest_p2)
+
+    @property
+    def impossible_cost(self) -> int:
+        """What an impossible candidate costs inside SGM."""
+        return self.cost.ceiling + self.largest_p2 + self.cost.steps
+
+    @property
+    def largest_sum(self) -> int:
+        """The largest possible cost, after SGM where it is on; the smallest is 0."""
+        return self.cost.largest if self.sgm is None else SGM_PATHS * (self.cost.largest + self.largest_p2)
+
+    @property
+    def cost_span(self) -> int:
+        """What etas and alpha are shares of: largest minus smallest possible cost, or what the settings declare.
+
+        The paper's ``max C_V - min C_V``, declared and not measured: a span measured on a tile would make the result
+        depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they come nowhere near, and
+        differ: see ``span`` in its settings.
+        """
+        return self.in_steps(self.sgm.span) if isinstance(self.sgm, MccnnSgm) else self.largest_sum
+
+    @property
+    def cut_level(self) -> int | None:
+        """Largest ``S(d) - min S`` of the alpha-cut: ``floor((1 - alpha) * cost_span)``; None if off."""
+        if self.interval is None:
+            return None
+        return floor((1 - Fraction(self.interval.alpha)) * self.cost_span)
+
+    @property
+    def ambiguity_levels(self) -> tuple[int, ...] | None:
+        """Largest ambiguous ``S(d) - min S`` at each eta: ``floor(eta * cost_span)``; None if off."""
+        if self.ambiguity is None:
+            return None
+        step = Fraction(self.ambiguity.eta_step)
+        count = ceil(Fraction(self.ambiguity.eta_max) / step)
+        return tuple(floor(i * step * self.cost_span) for i in range(count))
+
+    @property
+    def largest_ambiguity(self) -> int:
+        """Ambiguity of a pixel all of whose disparities are ambiguous at every eta; 0 without ambiguity."""
+        return len(self.ambiguity_levels or ()) * self.disparity.count
+
+    @property
+    def ambiguity_weights(self) -> npt.NDArray[np.uint16] | None:
+        """Table ``(largest_sum + 1,)`` of what a candidate adds to the ambiguity, by its ``S(d) - min S``.
+
+        The number of levels at or above it; ``weights[0]``, all of them, is also what an impossible candidate
+        adds. None if off.
+        """
+        levels = self.ambiguity_levels
+        if levels is None:
+            return None
+        below = np.searchsorted(levels, np.arange(self.largest_sum + 1), side="left")
+        return (len(levels) - below).astype(np.uint16)

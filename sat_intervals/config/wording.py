@@ -1,0 +1,79 @@
+"""What is wrong with settings, and what is allowed, in words made of the settings' own types and bounds."""
+
+import difflib
+import json
+import reprlib
+from collections.abc import Iterable
+from decimal import Decimal
+from types import NoneType
+from typing import Any, get_args
+
+from pydantic import AfterValidator
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from sat_intervals.config.sections import Section, check_odd
+from sat_intervals.config.settings import Config
+
+
+def allowed(field: FieldInfo) -> str:
+    """Return in words which values a setting takes, from its own type and bounds: ``integer >= 1, odd``."""
+    nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false", str: "text"}
+    signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
+    kinds = get_args(field.annotation) or (field.annotation,)
+    sections = _sections(field)
+    kind = (
+        f"section of {', '.join(sections[0].model_fields)}" if sections else nouns.get(kinds[0]) or " or ".join(kinds)
+    )
+    bounds = [
+        f"{sign} {getattr(constraint, name)}"
+        for constraint in field.metadata
+        for name, sign in signs.items()
+        if hasattr(constraint, name)
+    ]
+    if any(constraint == AfterValidator(check_odd) for constraint in field.metadata):
+        bounds.append("odd")
+    return " ".join(filter(None, [kind, ", ".join(bounds), "or null" if NoneType in kinds else ""]))
+
+
+def _sections(field: FieldInfo) -> list[type[Section]]:
+    """The kinds of section that a field holds."""
+    kinds = get_args(field.annotation) or (field.annotation,)
+    return [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)]
+
+
+def explained(problem: ErrorDetails) -> str:
+    """One problem of settings: the key, its value, what is allowed."""
+    path = [str(key) for key in problem["loc"]]
+    owner: type[Section] = Config
+    if path and path[0] in Config.model_fields:
+        field = Config.model_fields[path[0]]
+        kinds = _sections(field)
+        if problem["type"] == "union_tag_invalid":
+            methods = " or ".join(str(kind.model_fields[str(field.discriminator)].default) for kind in kinds)
+            return f"{path[0]}.{field.discriminator} is {shown(problem['ctx']['tag'])}, allowed: {methods}"
+        if len(kinds) > 1 and len(path) > 1:
+            tag = path.pop(1)  # pydantic names the kind as well
+            kinds = [kind for kind in kinds if kind.model_fields[str(field.discriminator)].default == tag]
+        owner = kinds[0] if len(path) > 1 else Config
+    where = ".".join(path)
+    if problem["type"] == "value_error":
+        return ": ".join(filter(None, [where, str(problem["ctx"]["error"])]))
+    if problem["type"] in ("extra_forbidden", "invalid_key"):
+        return f"unknown key {where!r}{known(path[-1], owner.model_fields)}"
+    state = "missing" if problem["type"] == "missing" else shown(problem["input"])
+    return f"{where} is {state}, allowed: {allowed(owner.model_fields[path[-1]])}"
+
+
+def known(name: str, names: Iterable[str]) -> str:
+    """What a name may have been meant to be, and all there are."""
+    names = list(names)
+    guess = "".join(f", did you mean {close}?" for close in difflib.get_close_matches(name, names, n=1))
+    return f"{guess} (known: {', '.join(names)})"
+
+
+def shown(value: Any) -> str:
+    """A value as YAML has it, cut short where it is long."""
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
+    return str(value) if isinstance(value, Decimal) else reprlib.repr(value)
