@@ -24,7 +24,7 @@ from sat_intervals.normalization import Scale as ImageScale
 from sat_intervals.normalization import Scales
 from sat_intervals.patch import match_patch
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files, read_window
-from sat_intervals.store import Store, differences
+from sat_intervals.store import LAYOUT, Store, differences
 from sat_intervals.tiling import Grid, Window
 
 # Sections of the settings that no tile knows of.
@@ -63,6 +63,7 @@ class Job:
         return {
             "version": version("sat-intervals"),
             "kernels": FINGERPRINT,
+            "layout": LAYOUT,
             "settings": self.config.model_dump(mode="json", exclude=_AFTER_THE_TILES),
             "inputs": self.inputs,
             "region": asdict(self.store.grid.region),

@@ -25,18 +25,21 @@ from sat_intervals.folders import Folder, folder_at
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tiling import Grid, Tile, Window
 
-# Raw products of the pixels of a core.
-PIXEL_ARRAYS = {
-    "winner": np.int16,
-    "lower": np.int16,
-    "upper": np.int16,
-    "disparity": np.float32,
-    "ambiguity": np.uint32,
-    "validity": np.uint16,
+# Raw products of the pixels of a core, in two arrays by their size, whose planes are read and written in one piece.
+_PLANES: dict[str, dict[str, type[np.generic]]] = {
+    "int16": {"winner": np.int16, "lower": np.int16, "upper": np.int16, "validity": np.uint16},
+    "uint32": {"disparity": np.float32, "ambiguity": np.uint32},
 }
+# What a core has seen from the right, see `_rank`.
+_RIGHT = "right"
+# The rank of a right pixel that no candidate was seen from.
+_UNSEEN = np.uint32(0xFFFFFFFF)
 SIDES = ("top", "bottom", "left", "right")
 # The raw products that neighbours compare along a seam.
 SEAM_PRODUCTS = ("winner", "lower", "upper")
+
+# To be counted up when arrays or records change: tiles of before cannot be gone on with.
+LAYOUT = 2
 
 _MANIFEST, _ARRAYS, _RECORDS, _FAILURES = "manifest.json", "arrays.zarr", "records", "failures"
 _NORMALIZATION = "normalization.json"
@@ -173,16 +176,15 @@ class Store:
         width = self.grid.columns * size
         together = math.gcd(size, _ROWS_TOGETHER)
         group = zarr.create_group(self.folder.place(_ARRAYS), zarr_format=3)
-        for name, dtype in PIXEL_ARRAYS.items():
-            _create(group, name, (height, width), (size, size), (together, size), dtype)
+        for dtype, planes in _PLANES.items():
+            count = len(planes)
+            _create(group, dtype, (count, height, width), (count, size, size), (count, together, size), dtype)
         right = height, self.grid.columns * self._reach
-        shard = size, self._reach
-        _create(group, "right_cost", right, shard, (together, self._reach), np.uint16)
-        _create(group, "right_winner", right, shard, (together, self._reach), np.int16)
+        _create(group, _RIGHT, right, (size, self._reach), (together, self._reach), np.uint32, _UNSEEN)
         lines = len(SIDES), 2, len(SEAM_PRODUCTS), size
-        _create(group, "seams", (self.grid.rows, self.grid.columns, *lines), None, (1, 1, *lines), np.int16)
-        counts = self.ambiguities + 1
-        _create(group, "histogram", (self.grid.rows, self.grid.columns, counts), None, (1, 1, counts), np.uint32)
+        tiles, counts = (self.grid.rows, self.grid.columns), self.ambiguities + 1
+        _create(group, "seams", (*tiles, *lines), None, (1, 1, *lines), np.int16, NO_DISPARITY)
+        _create(group, "histogram", (*tiles, counts), None, (1, 1, counts), np.uint32)
 
     def _array(self, name: str, mode: Literal["r", "r+"] = "r") -> zarr.Array[Any]:
         return zarr.open_array(self.folder.place(f"{_ARRAYS}/{name}"), mode=mode, zarr_format=3)
@@ -199,17 +201,21 @@ class Store:
         tile
             Which tile.
         arrays
-            Those of PIXEL_ARRAYS, of the core's shape; ``right_cost`` and ``right_winner``, which may be missing;
-            ``seams`` (SIDES, own line or ring, SEAM_PRODUCTS, size); ``histogram``.
+            ``winner``, ``lower``, ``upper``, ``disparity``, ``ambiguity`` and ``validity`` of the core's shape;
+            ``right_cost`` and ``right_winner``, which may be missing; ``seams`` (SIDES, own line or ring,
+            SEAM_PRODUCTS, size); ``histogram``.
         """
-        row = tile.grid_row * self.grid.size
-        for name, array in arrays.items():
-            target = self._array(name, "r+")
-            if name in ("seams", "histogram"):
-                target[tile.grid_row, tile.grid_column] = array
-            else:
-                column = tile.grid_column * (self.grid.size if name in PIXEL_ARRAYS else self._reach)
-                target[row : row + array.shape[0], column : column + array.shape[1]] = array
+        size, row, column = self.grid.size, tile.grid_row, tile.grid_column
+        height, width = arrays["winner"].shape
+        rows = slice(row * size, row * size + height)
+        for dtype, planes in _PLANES.items():
+            made = np.stack([arrays[name].view(dtype) for name in planes])
+            self._array(dtype, "r+")[:, rows, column * size : column * size + width] = made
+        if "right_cost" in arrays:
+            rank = _rank(arrays["right_cost"], arrays["right_winner"])
+            self._array(_RIGHT, "r+")[rows, column * self._reach : column * self._reach + rank.shape[1]] = rank
+        for name in ("seams", "histogram"):
+            self._array(name, "r+")[row, column] = arrays[name]
 
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
@@ -236,7 +242,7 @@ class Store:
 
     def check_space(self, tile: Tile) -> None:
         """Raise an OSError where the disk has no room for what a tile leaves behind, before work is put in."""
-        pixel = sum(np.dtype(dtype).itemsize for dtype in PIXEL_ARRAYS.values())
+        pixel = sum(np.dtype(dtype).itemsize for planes in _PLANES.values() for dtype in planes.values())
         needed = tile.core.height * (tile.core.width * pixel + (tile.core.width + self.count - 1) * 4)
         free = self.folder.free_bytes()
         if free is not None and free < needed:
@@ -262,28 +268,25 @@ class Store:
 
         The shares of the right view are merged: smallest cost, the largest disparity at ties.
         """
-        arrays = {name: self._array(name) for name in (*PIXEL_ARRAYS, "right_cost", "right_winner")}
-        width = self.grid.region.width
+        arrays = {dtype: self._array(dtype) for dtype in _PLANES}
+        right = self._array(_RIGHT)
         step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
         for first in range(0, self.grid.region.height, step):
             last = min(first + step, self.grid.region.height)
-            strip = {name: np.asarray(arrays[name][first:last, :width]) for name in PIXEL_ARRAYS}
-            cost, winner = (np.asarray(arrays[name][first:last]) for name in ("right_cost", "right_winner"))
-            yield strip | {"right_winner": self._merged(cost, winner)}
+            strip: dict[str, np.ndarray] = {}
+            for dtype, planes in _PLANES.items():
+                read = np.asarray(arrays[dtype][:, first:last, : self.grid.region.width])
+                strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
+            yield strip | {"right_winner": self._merged(np.asarray(right[first:last]))}
 
-    def _merged(self, cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
+    def _merged(self, ranks: np.ndarray) -> np.ndarray:
         """One right view ``(rows, width + count - 1)`` from the shares of all cores of the rows."""
-        columns = self.grid.region.width + self.count - 1
-        best = np.full((cost.shape[0], columns), IMPOSSIBLE_COST, np.uint16)
-        merged = np.full(best.shape, NO_DISPARITY, np.int16)
-        for grid_column in range(self.grid.columns):
-            start, share = grid_column * self.grid.size, grid_column * self._reach
-            width = min(self._reach, columns - start)
-            here, there = np.s_[:, start : start + width], np.s_[:, share : share + width]
-            wins = (cost[there] < best[here]) | ((cost[there] == best[here]) & (winner[there] > merged[here]))
-            best[here] = np.where(wins, cost[there], best[here])
-            merged[here] = np.where(wins, winner[there], merged[here])
-        return merged
+        best = np.full((ranks.shape[0], self.grid.region.width + self.count - 1), _UNSEEN)
+        for column in range(self.grid.columns):
+            seen = best[:, column * self.grid.size : column * self.grid.size + self._reach]
+            share = ranks[:, column * self._reach : column * self._reach + seen.shape[1]]
+            np.minimum(seen, share, out=seen)
+        return _winner(best)
 
     def remove(self) -> None:
         """Delete the tiles, and nothing else that may be in their folder."""
@@ -357,12 +360,23 @@ def _create(
     shard: tuple[int, ...] | None,
     chunk: tuple[int, ...],
     dtype: npt.DTypeLike,
+    fill: Any = 0,
 ) -> None:
-    fill = {"right_cost": IMPOSSIBLE_COST, "disparity": np.nan, "validity": 0, "ambiguity": 0, "histogram": 0}
     group.create_array(
-        name, shape=shape, shards=shard, chunks=chunk, dtype=dtype,
-        compressors=_COMPRESSOR, fill_value=fill.get(name, NO_DISPARITY),
-    )  # fmt: skip
+        name, shape=shape, shards=shard, chunks=chunk, dtype=dtype, compressors=_COMPRESSOR, fill_value=fill
+    )
+
+
+def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
+    """Costs and winners of right pixels as one number, smaller the better: cost, and the larger disparity at ties."""
+    rank = cost.astype(np.uint32) << 16 | (np.iinfo(np.int16).max - winner.astype(np.int32)).astype(np.uint32)
+    return np.where(cost == IMPOSSIBLE_COST, _UNSEEN, rank)
+
+
+def _winner(rank: np.ndarray) -> np.ndarray:
+    """The winners in what `_rank` made."""
+    winner = (np.iinfo(np.int16).max - (rank & 0xFFFF).astype(np.int32)).astype(np.int16)
+    return np.where(rank == _UNSEEN, np.int16(NO_DISPARITY), winner)
 
 
 def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:

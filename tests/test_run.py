@@ -173,7 +173,7 @@ def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_p
     with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: settings\.sgm\.p1 was 7, now 8"):
         match_tile(before, tile)
     assert now.store.done() == set()
-    assert not list((tmp_path / "tiles" / "arrays.zarr" / "winner").glob("c/*/*"))
+    assert not list((tmp_path / "tiles" / "arrays.zarr" / "int16").glob("c/*/*/*"))
     now.store.remove()
     with pytest.raises(SatIntervalsError, match="holds the tiles of no run any more"):
         match_tile(before, tile)

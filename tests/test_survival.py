@@ -144,7 +144,7 @@ def assert_nothing_final(out: Path) -> None:
 
 def half_written(out: Path) -> bool:
     """Whether a tile's first array lies in the store and its record does not."""
-    first = {f"{file.parent.name}_{file.name}" for file in (out / "tiles/arrays.zarr/winner/c").glob("*/[0-9]*")}
+    first = {f"{file.parent.name}_{file.name}" for file in (out / "tiles/arrays.zarr/int16/c/0").glob("*/[0-9]*")}
     return bool({name for name in first if name.replace("_", "").isdigit()} - done_tiles(out))
 
 
