@@ -33,8 +33,9 @@ _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "ba
 _COG = {"COMPRESS": "DEFLATE", "LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
 # Pixels of a side below which there is no smaller overview.
 _OVERVIEW_SIZE = 512
-# Bytes of blocks in GDAL's hands, by default a twentieth of the machine's memory: enough for strips of 100 000 columns.
-_CACHE = 128 << 20
+# Bytes of blocks in GDAL's hands, by default a twentieth of the machine's memory. More makes nothing faster, not even
+# strips of 60 000 columns, and keeps the whole of a small image in memory.
+_CACHE = 16 << 20
 # Pixels of a window that is read back: blocks enough for every thread.
 _READ_BACK = 512, 4096
 _SUM_WRAPS = 1 << 64  # the bits of a few float64 are more
