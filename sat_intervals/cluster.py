@@ -28,6 +28,9 @@ _ASKED_EVERY = 10.0
 # Directives that send jobs where squeue does not look.
 _OTHER_CLUSTERS = re.compile(r"^#SBATCH (-M|--cluster)", re.MULTILINE)
 
+# Batch systems that know projects and no accounts.
+_CHARGE_PROJECTS = "lsf", "sge"
+
 _LOOPBACK = "127.0.0.1"
 
 
@@ -137,13 +140,18 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
     base: Any = getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")
     options = {
         "queue": settings.queue,
-        "account": settings.account,
+        "project" if settings.kind in _CHARGE_PROJECTS else "account": settings.account,
         "cores": settings.cores,
         "processes": 1,
         "memory": settings.memory,
-        "walltime": settings.walltime,
+        "walltime": _without_seconds(settings.walltime) if settings.kind == "lsf" else settings.walltime,
         "job_extra_directives": settings.directives,
     }
+    if settings.memory is None and dask.config.get(f"jobqueue.{settings.kind}.memory", None) is None:
+        raise SatIntervalsError(
+            f"cluster {settings.kind} needs the memory of a job: set cluster.memory, such as 4GB, or "
+            f"jobqueue.{settings.kind}.memory of dask's configuration"
+        )
     given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
     if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
         given["scheduler_options"] = {"dashboard_address": f"{_LOOPBACK}:0"}
@@ -168,6 +176,11 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
         return batch_system(**given, silence_logs=logging.CRITICAL)
     except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
         raise SatIntervalsError(f"cluster {settings.kind}: {' '.join(str(error).split())}") from error
+
+
+def _without_seconds(walltime: str | None) -> str | None:
+    """Hours and minutes, as LSF wants them."""
+    return ":".join(walltime.split(":")[:2]) if walltime else None
 
 
 def job_script(settings: Cluster, out: Path) -> str:

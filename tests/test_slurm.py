@@ -14,7 +14,9 @@ import pytest
 import rasterio
 import yaml
 
-from sat_intervals import match_pair
+from sat_intervals import SatIntervalsError, match_pair
+from sat_intervals.cluster import job_script
+from sat_intervals.config import Cluster
 from sat_intervals.scene import make_scene
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
@@ -172,6 +174,26 @@ def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
     assert {"#SBATCH --cpus-per-task=2", "#SBATCH --mem=3G"} <= set(script)
     assert f"#SBATCH -e {tmp_path}/out/logs/dask-worker-%J.err" in script
     assert [path.name for path in tmp_path.iterdir()] == ["settings.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "lines"),
+    [
+        ("slurm", {"#SBATCH -p day", "#SBATCH -A dinamis", "#SBATCH --cpus-per-task=2", "#SBATCH -t 01:30:00"}),
+        ("pbs", {"#PBS -q day", "#PBS -A dinamis", "#PBS -l select=1:ncpus=2:mem=3815MB", "#PBS -l walltime=01:30:00"}),
+        ("lsf", {"#BSUB -q day", '#BSUB -P "dinamis"', "#BSUB -n 2", "#BSUB -W 01:30"}),
+        ("sge", {"#$ -q day", "#$ -P dinamis", "#$ -l h_rt=01:30:00"}),
+    ],
+)
+def test_job_script__says_what_is_set_as_each_batch_system_takes_it(tmp_path, kind, lines):
+    pytest.importorskip("dask_jobqueue", reason="needs the extra [cluster]")
+    given = {"cores": 2, "memory": "4GB", "walltime": "01:30:00", "queue": "day", "account": "dinamis"}
+    script = job_script(Cluster(kind=kind, directives=["--exclusive"], **given), tmp_path / "out").splitlines()
+    assert lines <= set(script)
+    assert any(line.endswith(" --exclusive") for line in script)
+    with pytest.raises(SatIntervalsError, match=rf"cluster {kind} needs the memory of a job: set cluster\.memory"):
+        job_script(Cluster(kind=kind), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
 
 
 def test_match__ends_when_no_worker_can_come(slurm, pair, tmp_path):
