@@ -21,7 +21,12 @@ from sat_intervals.cli.options import debug_option, path, quiet_option
     help="A cell's interval: all of its points' intervals, or the weighted mean of their bounds.",
 )
 @click.option("--geoid", callback=path, metavar="FILE", help="Grid of geoid heights (GTX, GeoTIFF) to count from.")
-@click.option("--output", callback=path, metavar="FILE", help="The file to write; default dsm.tif in the first OUT.")
+@click.option(
+    "--output",
+    callback=path,
+    metavar="FILE",
+    help="The file to write; default dsm.tif in the first OUT. A surface model there is replaced.",
+)
 @quiet_option
 @debug_option
 def dsm(
@@ -45,9 +50,6 @@ def dsm(
     from sat_intervals.cli.console import Console
     from sat_intervals.surface import make_surface
 
-    for name, value in (("--resolution", resolution), ("--radius", radius)):
-        if value is not None and not 0 < value < float("inf"):
-            raise click.UsageError(f"{name} is {value:g}, it must be above 0")
     output = output or outs[0] / "dsm.tif"
     with Console(quiet) as console:
         report = make_surface(
@@ -66,4 +68,8 @@ def dsm(
     )
     if report["disagreeing"] is not None:
         console.say(f"where runs overlap, {100 * report['disagreeing']:.1f} % of the cells do not agree")
+    for out in report["without_intervals"]:
+        click.echo(
+            f"{out} was matched without intervals: where no other run reaches, cells have heights alone", err=True
+        )
     console.say(str(output))

@@ -75,6 +75,12 @@ def evaluate(
     reference and by width of the interval.
     """
     if dsm or reference:
+        for name, value in (
+            ("--truth", truth), ("--mask", mask), ("--remove-bias", remove_bias), ("--group", group), ("--cost", cost),
+            ("--config", config_file), ("--accurate", accurate), ("--tolerance", tolerance),
+        ):  # fmt: skip
+            if value:
+                raise click.UsageError(f"{name} is for runs and pairs, not for --dsm: leave it out.")
         _evaluate_surface(folders, dsm, reference, as_json)
         return
     if not folders:

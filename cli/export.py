@@ -24,7 +24,7 @@ def export(out: Path, target: Path, form: str) -> None:
            rectified_disp_confidence.tif
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
 
-    All have the size of the left image.
+    All have the size of the left image. Files of these names that are there are replaced.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.export import export
 

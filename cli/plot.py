@@ -39,6 +39,7 @@ def plot(
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
+    from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
 
     if columns is not None and row is None:
@@ -59,6 +60,9 @@ def plot(
     if pixel is not None:
         draw_curve(results, out / "curve.png", *pixel, dpi)
         click.echo(out / "curve.png")
-    if (out / "dsm.tif").exists():
-        draw_surface(out / "dsm.tif", out / "dsm.png", dpi)
+    surface = out / "dsm.tif"
+    if surface.exists() and results.report["finished"] not in read_tags(surface).get("RUNS", ""):
+        click.echo(f"{surface} is of an earlier run and not drawn: run sat-intervals dsm again", err=True)
+    elif surface.exists():
+        draw_surface(surface, out / "dsm.png", dpi)
         click.echo(out / "dsm.png")

@@ -6,6 +6,9 @@ import click
 
 from sat_intervals.cli.options import debug_option, path, quiet_option
 
+# Metres between lines of sight.
+_DOUBTFUL = 0.1
+
 
 @click.command(short_help="Points and heights of a run, with bounds, through sensor models.")
 @click.argument("out", callback=path)
@@ -25,7 +28,9 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
                      where the points of the bounds lie
 
     Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files; grids hold the sensor column and row (bands 1 and 2) of
-    epipolar positions, as CARS and shareloc write them. Needs shareloc: pip install 'sat-intervals[dsm]'.
+    epipolar positions, as CARS and shareloc write them; all of them local files. Models and grids of left and right
+    that change places together go unnoticed, and turn relief upside down.
+    Needs shareloc: pip install 'sat-intervals[dsm]'.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.cli.console import Console
     from sat_intervals.triangulation import triangulate
@@ -40,4 +45,13 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
         )
     else:
         console.say("no valid pixel, no points")
+    if report["lost"]:
+        click.echo(f"{report['lost']} valid pixels have no point: grids or models have no values there", err=True)
+    if report["median_residual"] > _DOUBTFUL:
+        click.echo(
+            f"warning: lines of sight pass each other by {report['median_residual']:.2g} m in the median, where models "
+            "and grids of these images leave millimetres: heights may be wrong by many times as much; check that the "
+            "models are those that the grids were made with",
+            err=True,
+        )
     console.say(str(out / "points.tif"))

@@ -17,6 +17,7 @@ from json_checker import Or
 from pandora.margins import Margins
 
 from sat_intervals.config import Config, load_config
+from sat_intervals.errors import SatIntervalsError
 
 # Bands of `match_arrays` under the names of CARS' triangulation. Of the first CARS makes its ambiguity, 1 - confidence.
 _INDICATORS = {
@@ -74,6 +75,13 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
     def _config(self, minimum: int, maximum: int) -> Config:
         """The settings over a search range."""
         settings = self.used_config["settings"]
+        wrong = [name for name in ("disparity",) if name in settings]
+        wrong += [name for name in ("interval", "ambiguity") if settings.get(name, {}) is None]
+        if wrong:
+            raise SatIntervalsError(
+                f"dense_matching.settings: leave out {' and '.join(wrong)}: CARS gives the search range, and needs "
+                "intervals and ambiguity"
+            )
         ambiguity = settings.get("ambiguity", {})
         if isinstance(ambiguity, Mapping):
             ambiguity = {"normalization": "range", **ambiguity}

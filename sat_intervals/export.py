@@ -10,12 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sat_intervals.config import Config
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import INVALID, Band
 from sat_intervals.raster import File, Georeferencing, OutputWriter
 from sat_intervals.results import Run, open_run
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Window, strips
 
-_ROWS = 512  # of the blocks that runs write
+# Pixels of a strip.
+_STRIP = 1 << 22
 
 
 class _Pixels(NamedTuple):
@@ -41,33 +44,44 @@ def _two(horizontal: np.ndarray, *more: np.ndarray) -> np.ndarray:
     return np.stack([horizontal, np.zeros_like(horizontal), *more])
 
 
-def _cars(prefix: str) -> list[Raster]:
+def _cars(prefix: str, config: Config) -> list[Raster]:
     """The epipolar disparity that CARS 1.3 saves: 255 = valid in the mask, -9999 = no data in all others."""
-    return [
-        (_file("epi_disp.tif", "disparity", nodata=-9999), lambda pixels: pixels.disparity),
+    bounds: list[Raster] = [
         (_file("epi_disp_interval_bounds_inf.tif", "lower", nodata=-9999), lambda pixels: pixels.lower),
         (_file("epi_disp_interval_bounds_sup.tif", "upper", nodata=-9999), lambda pixels: pixels.upper),
-        (_file("epi_disp_ambiguity.tif", "ambiguity", nodata=-9999), lambda pixels: 1 - pixels.confidence),
+    ]
+    ambiguity: Raster = (
+        _file("epi_disp_ambiguity.tif", "ambiguity", nodata=-9999),
+        lambda pixels: 1 - pixels.confidence,
+    )
+    return [
+        (_file("epi_disp.tif", "disparity", nodata=-9999), lambda pixels: pixels.disparity),
+        *(bounds if config.interval else []),
+        *([ambiguity] if config.ambiguity else []),
         (_file("epi_disp_mask.tif", "valid", dtype="uint8"), lambda pixels: 255 * pixels.valid),
     ]
 
 
-def _asp(prefix: str) -> list[Raster]:
+def _asp(prefix: str, config: Config) -> list[Raster]:
     """The disparity that ``parallel_stereo --entry-point 5`` triangulates: horizontal, vertical, 1 = valid."""
     file = _file(f"{prefix}-F.tif", "horizontal", "vertical", "valid")
     return [(file, lambda pixels: _two(np.nan_to_num(pixels.disparity), pixels.valid))]
 
 
-def _s2p(prefix: str) -> list[Raster]:
+def _s2p(prefix: str, config: Config) -> list[Raster]:
     """What s2p leaves in the folder of a tile after matching: NaN = no disparity, 1 = valid in the mask."""
+    confidence: Raster = (
+        _file("rectified_disp_confidence.tif", "confidence", nodata=float("nan")),
+        lambda pixels: pixels.confidence,
+    )
     return [
         (_file("rectified_disp.tif", "disparity", nodata=float("nan")), lambda pixels: pixels.disparity),
         (_file("rectified_mask.png", "valid", dtype="uint8", driver="PNG"), lambda pixels: pixels.valid),
-        (_file("rectified_disp_confidence.tif", "confidence", nodata=float("nan")), lambda pixels: pixels.confidence),
+        *([confidence] if config.ambiguity else []),
     ]
 
 
-def _otb(prefix: str) -> list[Raster]:
+def _otb(prefix: str, config: Config) -> list[Raster]:
     """What OTB's DisparityMapToElevationMap takes as ``-io.in`` (horizontal, vertical) and ``-io.mask``."""
     return [
         (_file("disparity.tif", "horizontal", "vertical"), lambda pixels: _two(np.nan_to_num(pixels.disparity))),
@@ -75,7 +89,7 @@ def _otb(prefix: str) -> list[Raster]:
     ]
 
 
-FORMATS: dict[str, Callable[[str], list[Raster]]] = {"cars": _cars, "asp": _asp, "s2p": _s2p, "otb": _otb}
+FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "asp": _asp, "s2p": _s2p, "otb": _otb}
 
 
 def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
@@ -92,7 +106,8 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
 
     Returns
     -------
-    The files written; files of these names that were there are replaced.
+    The files written; files of these names that were there are replaced. What a run has no band for, such as bounds
+    where its settings switch intervals off, has no file.
 
     Raises
     ------
@@ -103,12 +118,14 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     left = run.report["inputs"]["left"]
     shape = left["height"], left["width"]
     folder, prefix = (target.parent, target.name) if form == "asp" else (target, "")
-    rasters = FORMATS[form](prefix)
+    if form == "asp" and (target.is_dir() or not target.name):
+        raise SatIntervalsError(f"{target} is a folder: give a prefix for ASP's file, such as {target / 'run'}")
+    rasters = FORMATS[form](prefix, run.config)
     files = [file for file, _ in rasters]
     with OutputWriter(folder, files, *shape, Georeferencing(), {}) as writer:
-        for row in range(0, shape[0], _ROWS):
-            pixels = _read(run, Window(row, 0, min(_ROWS, shape[0] - row), shape[1]))
-            writer.write(row, *(_filled(make(pixels), file) for file, make in rasters))
+        for window in strips(*shape, _STRIP):
+            pixels = _read(run, window)
+            writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))
         writer.publish()
     return [folder / file.name for file in files]
 

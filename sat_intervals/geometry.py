@@ -1,6 +1,7 @@
 """Epipolar pixels to points on the ground, through sensor models and epipolar grids. The only home of shareloc."""
 
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,10 @@ except ModuleNotFoundError as error:
 
 # Pixels between the nodes of the lattice: points are smooth enough for errors below a millimetre between them.
 _SPACING = 32
+# Nodes that shareloc is given at a time, a kilobyte each.
+_AT_ONCE = 100_000
+# Positions along rows and columns of a region, and ends of the search range, by which models and grids are judged.
+_JUDGED = 9
 # Lines of sight of one scene meet within centimetres; with models of two scenes they pass by hundreds of metres.
 _FOREIGN_RESIDUAL = 10.0
 # Metres above the ellipsoid between which all ground lies.
@@ -78,9 +83,13 @@ class Sensors:
             ``(n,)`` pixels; the partner is at ``column + disparity`` of the same row.
         """
         matches = np.column_stack([column, row, column + disparity, row]).astype(np.float64)
-        _, points, residuals = epipolar_triangulation(
-            matches, None, "sift", self.left_model, self.right_model, self.left_grid, self.right_grid, residues=True
-        )
+        found = [self._triangulate(matches[first : first + _AT_ONCE]) for first in range(0, len(matches), _AT_ONCE)]
+        return np.concatenate(found)
+
+    def _triangulate(self, matches: np.ndarray) -> np.ndarray:
+        sensors = self.left_model, self.right_model, self.left_grid, self.right_grid
+        with warnings.catch_warnings(action="ignore"):
+            _, points, residuals = epipolar_triangulation(matches, None, "sift", *sensors, residues=True)
         return np.column_stack([points, np.max(residuals, axis=1)])
 
 
@@ -88,59 +97,69 @@ def _read(path: Path, kind: str, reader: Any) -> Any:
     if not path.is_file():
         raise SatIntervalsError(f"{path}: no such file: give the {kind} of the image")
     try:
-        return reader(str(path))
+        with warnings.catch_warnings(action="ignore"):
+            return reader(str(path))
     except Exception as error:  # whatever shareloc, scipy or GDAL stumble over
         reason = " ".join(str(error).split()) or type(error).__name__
         raise SatIntervalsError(f"{path} is no {kind} that shareloc reads: {reason}") from error
 
 
-@dataclass(frozen=True)
 class Lattice:
     """Points at the nodes of a lattice over rows, columns and disparities, and between them by interpolation.
 
     shareloc takes seconds for a million points, and there are three to a pixel. Between nodes 32 pixels apart the
-    points are linear to less than a millimetre.
+    points are linear to less than a millimetre. Nodes are triangulated row by row as windows come, from the top, and
+    forgotten above them.
 
-    Attributes
+    Parameters
     ----------
-    nodes
-        ``(rows, columns, disparities, 4)`` longitude, latitude, height, residual.
+    sensors
+        Models and grids.
     region
-        The pixels of the left image that it covers; the first node is at its first pixel.
-    spacing
-        Pixels between nodes along rows, columns and disparities.
-    minimum
-        Disparity of the first node.
+        The pixels of the left image that it covers.
+    right_width
+        Columns of the right image.
+    minimum, maximum
+        The search range.
+
+    Raises
+    ------
+    SatIntervalsError
+        Grids that do not cover the region, models that do not fit each other.
     """
 
-    nodes: np.ndarray
-    region: Window
-    spacing: tuple[float, float, float]
-    minimum: float
-
-    @classmethod
-    def over(cls, sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> "Lattice":
-        """The lattice of a region and a search range; ``right_width``: columns of the right image.
-
-        Raises
-        ------
-        SatIntervalsError
-            Grids that do not cover the region, models that do not fit each other.
-        """
+    def __init__(self, sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:
         _check_cover(sensors, region, right_width, minimum, maximum)
-        rows, row_step = _axis(region.row, region.row_stop - 1)
-        columns, column_step = _axis(region.column, region.column_stop - 1)
-        disparities, disparity_step = _axis(minimum, maximum)
-        row, column, disparity = np.meshgrid(rows, columns, disparities, indexing="ij")
-        points = sensors.triangulate(row.ravel(), column.ravel(), disparity.ravel())
-        _check_points(points)
-        spacing = row_step, column_step, disparity_step
-        return cls(points.reshape(*row.shape, 4), region, spacing, float(minimum))
+        self.residual = _judged(sensors, region, minimum, maximum)
+        """Metres by which lines of sight pass each other, in the median of a few places."""
+        self._sensors = sensors
+        self._minimum = float(minimum)
+        (self._rows, row_step) = _axis(region.row, region.row_stop - 1)
+        self._columns, column_step = _axis(region.column, region.column_stop - 1)
+        self._disparities, disparity_step = _axis(minimum, maximum)
+        self._spacing = row_step, column_step, disparity_step
+        self._nodes: dict[int, np.ndarray] = {}
 
-    def points(self, window: Window, disparity: np.ndarray) -> Points:
-        """Points of the disparities of a window ``(rows, columns)``, counted from the region's first pixel."""
-        first = -float(window.row), -float(window.column), self.minimum
-        return Points(*interpolate(self.nodes, self.spacing, first, disparity.astype(np.float64)))
+    def points(self, window: Window, *disparities: np.ndarray) -> list[Points]:
+        """Points of each of some disparities of a window ``(rows, columns)``, counted from the region's first pixel."""
+        step = self._spacing[0]
+        first = min(int(window.row / step), len(self._rows) - 2)
+        last = min(int((window.row_stop - 1) / step) + 1, len(self._rows) - 1)
+        self._nodes = {
+            row: self._nodes[row] if row in self._nodes else self._row(row) for row in range(first, last + 1)
+        }
+        nodes = np.stack(list(self._nodes.values()))
+        origin = first * step - window.row, -float(window.column), self._minimum
+        return [
+            Points(*interpolate(nodes, self._spacing, origin, disparity.astype(np.float64)))
+            for disparity in disparities
+        ]
+
+    def _row(self, row: int) -> np.ndarray:
+        """A row of nodes: ``(columns, disparities, 4)``."""
+        column, disparity = np.meshgrid(self._columns, self._disparities, indexing="ij")
+        points = self._sensors.triangulate(np.full(column.size, self._rows[row]), column.ravel(), disparity.ravel())
+        return points.reshape(*column.shape, 4)
 
 
 def _axis(first: float, last: float) -> tuple[np.ndarray, float]:
@@ -157,6 +176,11 @@ def _check_cover(sensors: Sensors, region: Window, right_width: int, minimum: in
     seen = max(0, columns[0] + minimum), min(right_width - 1, columns[1] + maximum)
     for grid, side, (first, last) in ((sensors.left_grid, "left", columns), (sensors.right_grid, "right", seen)):
         grid_columns, grid_rows = grid.points
+        for name, nodes in (("rows", grid_rows), ("columns", grid_columns)):
+            if nodes[0] > nodes[-1]:
+                raise SatIntervalsError(
+                    f"the {name} of {grid.grid_filename} descend: give a grid whose positions ascend"
+                )
         inside = grid_rows[0] <= rows[0] and rows[1] <= grid_rows[-1]
         if not (inside and grid_columns[0] <= first and last <= grid_columns[-1]):
             raise SatIntervalsError(
@@ -166,12 +190,24 @@ def _check_cover(sensors: Sensors, region: Window, right_width: int, minimum: in
             )
 
 
-def _check_points(points: np.ndarray) -> None:
-    lost = 1 - np.isfinite(points).all(axis=1).mean()
-    if lost > 0:
+def _judged(sensors: Sensors, region: Window, minimum: int, maximum: int) -> float:
+    """The median residual of lines of sight all over a region; refuses models that do not fit."""
+    rows = np.linspace(region.row, region.row_stop - 1, _JUDGED)
+    columns = np.linspace(region.column, region.column_stop - 1, _JUDGED)
+    places = np.meshgrid(rows, columns, [minimum, maximum], indexing="ij")
+    try:
+        points = sensors.triangulate(*(place.ravel() for place in places))
+    except (ValueError, TypeError, ArithmeticError) as error:  # of what grids hold, such as complex numbers
         raise SatIntervalsError(
-            f"shareloc finds no point for {100 * lost:.0f} % of the lines of sight: check which model and which grid "
-            "belong to the left and the right image; a scene across the 180th meridian is beyond it"
+            f"shareloc cannot use {sensors.left_grid.grid_filename} and {sensors.right_grid.grid_filename}: "
+            f"{' '.join(str(error).split())}"
+        ) from error
+    points = points[np.isfinite(points).all(axis=1)]
+    if 2 * len(points) < places[0].size:
+        raise SatIntervalsError(
+            f"shareloc finds no point for {places[0].size - len(points)} of {places[0].size} lines of sight: check "
+            "which model and which grid belong to the left and the right image; a scene across the 180th meridian is "
+            "beyond it"
         )
     residual, height = float(np.median(points[:, 3])), float(np.median(points[:, 2]))
     if not (residual <= _FOREIGN_RESIDUAL and _GROUND[0] <= height <= _GROUND[1]):
@@ -179,3 +215,4 @@ def _check_points(points: np.ndarray) -> None:
             f"the models do not fit these images: lines of sight pass each other by {residual:.1f} m and meet at "
             f"{height:.0f} m (medians): check which model and which grid belong to the left and the right image"
         )
+    return residual

@@ -23,10 +23,10 @@ from sat_intervals.raster import (
     read_small_layers,
     read_window,
 )
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Window, strips
 
-# Rows of the blocks that runs write, and bands of the files.
-_BLOCK_ROWS = 512
+# Pixels of a strip, and bands of the files.
+_STRIP = 1 << 23
 _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
 _REGION = ("row", "column", "height", "width")
 
@@ -111,10 +111,8 @@ class Run:
         return read_layers(self.out / "intervals.tif", window), read_layers(self.out / "validity.tif", window)[0]
 
     def windows(self) -> Iterator[Window]:
-        """Full-width windows of the results, from the top, of a row of the blocks that runs write."""
-        height, width = self.shape
-        for row in range(0, height, _BLOCK_ROWS):
-            yield Window(row, 0, min(_BLOCK_ROWS, height - row), width)
+        """Full-width windows of the results, from the top."""
+        return strips(*self.shape, _STRIP)
 
     def layer(self, path: str | Path) -> Layer:
         """Another raster of the same pixels, such as the truth."""

@@ -6,6 +6,7 @@ never filled.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -32,14 +33,16 @@ from sat_intervals.raster import (
     Georeferencing,
     OutputWriter,
     Projection,
+    is_surface,
     north_up,
     read_layers,
+    read_shape,
     read_tags,
     surface_file,
     utm_of,
 )
 from sat_intervals.results import Run, open_run
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Grid, Window
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage ("extent", "cells", "files"), how much of it is done, and how much there is."""
@@ -51,7 +54,9 @@ _TILE_ROWS, _TILE_COLUMNS = 512, 2048
 # Cells of a strip of tiles, of which a few are held, 24 bytes each; tiles of wide surfaces are lower for it.
 _STRIP_CELLS, _LOWEST = 1 << 22, 64
 # A surface of more cells than this for a point is a wrong resolution, or points of two places.
-_CELLS_PER_POINT = 10_000
+_CELLS_PER_POINT = 1000
+# Metres: no cell is wider, and no point reaches further.
+_LARGEST = 10_000.0
 
 
 class Extent(NamedTuple):
@@ -112,10 +117,8 @@ class Cloud:
         self._projection = projection
         self._extents: list[tuple[Window, Extent]] = []
         self.points = 0
-        height, width = run.shape
-        for row in range(0, height, _WINDOW):
-            for column in range(0, width, _WINDOW):
-                self._look(Window(row, column, min(_WINDOW, height - row), min(_WINDOW, width - column)))
+        for tile in Grid(Window(0, 0, *run.shape), _WINDOW):
+            self._look(tile.core)
 
     def _look(self, window: Window) -> None:
         bands = read_layers(self._path, window)
@@ -131,6 +134,10 @@ class Cloud:
                     f"{latitude.max():.4f}: give one that covers them"
                 )
             x, y = self._projection.place(longitude, latitude)
+            if not (np.isfinite(x).all() and np.isfinite(y).all()):
+                raise SatIntervalsError(
+                    f"{self._projection.crs} has no place for points of {self.run.out}: give another"
+                )
             self._extents.append((window, Extent(x.min(), y.min(), x.max(), y.max())))
 
     @property
@@ -186,7 +193,7 @@ def make_surface(
     resolution
         Side of a cell in metres.
     crs
-        A projected CRS in metres; by default the UTM zone of the first points.
+        A projected CRS in metres; by default the UTM zone of a point near the middle.
     radius
         Metres from a point within which the centres of cells are reached, beside the cell it falls in; by default the
         side of a cell.
@@ -209,14 +216,25 @@ def make_surface(
         Runs without points, a CRS or grid that does not serve, a file that cannot be written.
     """
     path, radius = Path(path), resolution if radius is None else radius
-    runs = [_triangulated(Path(out)) for out in outs]
-    projection = Projection(crs or utm_of(*_first_point(runs)), None if geoid is None else Path(geoid))
+    for name, value in (("resolution", resolution), ("radius", radius)):
+        if not 0 < value <= _LARGEST:
+            raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, up to {_LARGEST:g}")
+    _check_target(path)
+    runs = _triangulated([Path(out) for out in outs])
+    middle = _point_near_the_middle(runs)
+    projection = Projection(utm_of(*middle) if crs is None else crs, None if geoid is None else Path(geoid))
+    projection.check(*middle)
     clouds = []
     for done, run in enumerate(runs):
         progress("extent", done, len(runs))
         clouds.append(Cloud(run, projection))
     cells = _cells(clouds, resolution, radius)
-    tags = {"INTERVAL": interval, "RADIUS": f"{radius:g} m", "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}"}
+    tags = {
+        "RUNS": runs_tag(runs),
+        "INTERVAL": interval,
+        "RADIUS": f"{radius:g} m",
+        "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}",
+    }
     counts = np.zeros(3, np.int64)
     writer = OutputWriter(
         path.parent, [surface_file(path.name)], cells.rows, cells.columns, _place(cells, crs=projection.crs), tags
@@ -238,27 +256,47 @@ def make_surface(
         "points": sum(cloud.points for cloud in clouds),
         "filled": filled / (cells.rows * cells.columns),
         "disagreeing": disagreeing / shared if shared else None,
+        "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
     }
 
 
-def _triangulated(out: Path) -> Run:
-    run = open_run(out)
-    path = out / "points.tif"
-    if not path.exists():
-        raise SatIntervalsError(f"{out} has no points.tif: run sat-intervals triangulate on it first")
-    if read_tags(path).get("RUN") != run.report["finished"]:
-        raise SatIntervalsError(f"{path} is of an earlier run in {out}: triangulate again")
-    return run
+def runs_tag(runs: Sequence[Run]) -> str:
+    """What a surface says of the runs that it is of."""
+    return " ".join(run.report["finished"] for run in runs)
 
 
-def _first_point(runs: Sequence[Run]) -> tuple[float, float]:
-    """Longitude and latitude of some point."""
+def _check_target(path: Path) -> None:
+    """Refuse to replace what is no surface model."""
+    if path.exists() and not is_surface(path):
+        raise SatIntervalsError(f"{path} is there, and is no surface model to be replaced: choose another --output")
+
+
+def _triangulated(outs: Sequence[Path]) -> list[Run]:
+    for out, count in Counter(out.resolve() for out in outs).items():
+        if count > 1:
+            raise SatIntervalsError(f"{out} is given {count} times: give each run once")
+    runs = []
+    for out in outs:
+        run = open_run(out)
+        path = out / "points.tif"
+        if not path.exists():
+            raise SatIntervalsError(f"{out} has no points.tif: run sat-intervals triangulate on it first")
+        if read_tags(path).get("RUN") != run.report["finished"] or read_shape(path) != (len(POINTS), *run.shape):
+            raise SatIntervalsError(f"{path} is of an earlier run in {out}: triangulate again")
+        runs.append(run)
+    return runs
+
+
+def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
+    """Longitude and latitude of a point of the first run that has any."""
     for run in runs:
-        for window in run.windows():
-            bands = read_layers(run.out / "points.tif", window)
+        tiles = Grid(Window(0, 0, *run.shape), _WINDOW)
+        middle = tiles.rows / 2 - 0.5, tiles.columns / 2 - 0.5
+        for tile in sorted(tiles, key=lambda tile: math.dist((tile.grid_row, tile.grid_column), middle)):
+            bands = read_layers(run.out / "points.tif", tile.core)
             known = np.isfinite(bands[0])
             if known.any():
-                return float(bands[0][known][0]), float(bands[1][known][0])
+                return float(np.median(bands[0][known])), float(np.median(bands[1][known]))
     raise SatIntervalsError(f"no valid pixel in {', '.join(str(run.out) for run in runs)}: there is no surface to make")
 
 
@@ -310,11 +348,9 @@ class _One(NamedTuple):
 
 def _of_one(gathered: np.ndarray, interval: str) -> _One:
     weight = np.where(gathered[COUNT] > 0, gathered[WEIGHT], np.nan)
-    if interval == "mean":
-        lower, upper = gathered[LOWER] / weight, gathered[UPPER] / weight
-    else:
-        reached = np.isfinite(weight)
-        lower, upper = (np.where(reached, gathered[index], np.nan) for index in (LEAST, MOST))
+    bounded = gathered[LEAST] <= gathered[MOST]
+    bounds = (gathered[LOWER] / weight, gathered[UPPER] / weight) if interval == "mean" else gathered[[LEAST, MOST]]
+    lower, upper = (np.where(bounded, bound, np.nan) for bound in bounds)
     height, confidence = gathered[HEIGHT] / weight, gathered[CONFIDENCE] / weight
     return _One(weight, height, lower, upper, confidence, gathered[COUNT])
 
@@ -332,9 +368,9 @@ def _fused(runs: Sequence[_One]) -> np.ndarray:
     outer = np.fmin.reduce(lowers), np.fmax.reduce(uppers)
     meeting = inner[0] <= inner[1]
     lower, upper = (np.where(meeting, one, other) for one, other in zip(inner, outer, strict=True))
-    several = np.isfinite(weights).sum(axis=0) > 1
+    several = np.isfinite(lowers).sum(axis=0) > 1
     bands = {
-        "height": np.clip(height, lower, upper),
+        "height": np.fmin(np.fmax(height, lower), upper),
         "height_lower": _outwards(lower, -np.inf),
         "height_upper": _outwards(upper, np.inf),
         "count": np.where(np.isfinite(weight), sum(run.points for run in runs), np.nan),

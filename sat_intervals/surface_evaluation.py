@@ -1,6 +1,5 @@
 """Intervals of a surface model against reference heights, strip by strip, whatever the size."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,10 +8,11 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.figures import Histogram
-from sat_intervals.raster import Georeferencing, read_heights, read_layers, read_place
-from sat_intervals.tiling import Window
+from sat_intervals.raster import Georeferencing, is_surface, read_heights, read_layers, read_place, resolution_of
+from sat_intervals.tiling import Window, strips
 
-_ROWS = 512
+# Judged heights of a strip, some hundred bytes each.
+_STRIP = 1 << 20
 # Ends of classes: degrees of the reference's slope, metres of the interval's width.
 SLOPES = (0.0, 5.0, 15.0, 30.0, 45.0, 90.0)
 WIDTHS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, np.inf)
@@ -54,11 +54,12 @@ def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, An
     surface
         A file that `make_surface` wrote.
     reference
-        Heights above the same datum in any CRS; of each cell counts the one nearest to its centre.
+        Heights above the same datum in any CRS. Where it is finer than the cells, a cell is judged by as many heights
+        as its side holds, squared, each by the interval of its cell; else by the one nearest to its centre.
 
     Returns
     -------
-    For ``all`` cells with an interval and a reference, by ``slope`` of the reference (degrees) and by ``width`` of the
+    For ``all`` heights with an interval, by ``slope`` of the reference (degrees) and by ``width`` of the
     interval (metres): ``count``, ``accuracy`` (the share of reference heights inside the interval), ``median_width``,
     ``bias`` (median of height - reference) and ``nmad`` of height - reference, in metres; None of no cells. Classes
     have their ends in ``from`` and ``to``.
@@ -66,16 +67,20 @@ def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, An
     Raises
     ------
     SatIntervalsError
-        Files that cannot be read, or do not meet.
+        Files that cannot be read, do not meet, or whose heights have nothing to do with each other.
     """
     surface, reference = Path(surface), Path(reference)
     shape, place = read_place(surface)
+    if not is_surface(surface):
+        raise SatIntervalsError(f"{surface} is no surface model of sat-intervals dsm: is it the --reference?")
     read_place(reference)
+    assert place.pixel_size is not None
+    finer = max(1, round(place.pixel_size[0] / resolution_of(reference, place)))
     whole = _Class()
     slopes, widths = ([_Class() for _ in ends[1:]] for ends in (SLOPES, WIDTHS))
-    for window in _strips(shape):
-        height, lower, upper = read_layers(surface, window)[:3].astype(np.float64)
-        truth, slope = _truth(reference, place, shape, window)
+    for window in strips(*shape, _STRIP // finer**2):
+        height, lower, upper = (_refined(band, finer) for band in read_layers(surface, window)[:3].astype(np.float64))
+        truth, slope = _truth(reference, place, shape, window, finer)
         judged = np.isfinite(truth) & np.isfinite(lower) & np.isfinite(height)
         error, width = (height - truth)[judged], (upper - lower)[judged]
         inside = ((lower <= truth) & (truth <= upper))[judged]
@@ -86,7 +91,15 @@ def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, An
                 kind.add(error[chosen], width[chosen], inside[chosen])
     report = whole.report()
     if not report["count"]:
-        raise SatIntervalsError(f"no cell of {surface} has a height in {reference}: give a reference of the same place")
+        raise SatIntervalsError(
+            f"no cell of {surface} has an interval and a height in {reference}: give a reference of the same place, "
+            "and a surface of runs with intervals"
+        )
+    if abs(report["bias"]) >= _LARGEST:
+        raise SatIntervalsError(
+            f"the heights of {surface} and {reference} differ by {_LARGEST} m or more in the median: check that both "
+            "are metres above the same datum"
+        )
     return {"all": report, "slope": _by(slopes, SLOPES), "width": _by(widths, WIDTHS)}
 
 
@@ -97,20 +110,27 @@ def _by(classes: list[_Class], ends: tuple[float, ...]) -> list[dict[str, Any]]:
     ]
 
 
-def _strips(shape: tuple[int, int]) -> Iterator[Window]:
-    for row in range(0, shape[0], _ROWS):
-        yield Window(row, 0, min(_ROWS, shape[0] - row), shape[1])
+def _refined(band: np.ndarray, finer: int) -> np.ndarray:
+    """Cells ``(rows, columns)``, each so many times along both axes."""
+    return np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
 
 
-def _truth(path: Path, place: Georeferencing, shape: tuple[int, int], window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Reference heights of a window of cells and their slope in degrees, NaN beside cells without one."""
+def _truth(
+    path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, finer: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reference heights of a window of cells, ``finer`` to the side of each, and their slope in degrees, NaN for none.
+
+    The slope is that of the heights interpolated between the reference's own pixels, which nearest ones would turn into
+    stairs.
+    """
+    place = place.refined(finer)
+    shape = shape[0] * finer, shape[1] * finer
+    window = Window(*(finer * side for side in (window.row, window.column, window.height, window.width)))
     around = window.grown(1, 1).clipped(Window(0, 0, *shape))
-    heights = read_heights(path, place, shape, around)
+    padded = np.pad(read_heights(path, place, shape, around, smooth=True), [(1, 1), (1, 1)], mode="edge")
     assert place.pixel_size is not None
-    padded = np.pad(heights, [(1, 1), (1, 1)], mode="edge")
     across, down = place.pixel_size
     rise_across = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * across)
     rise_down = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * down)
     slope = np.degrees(np.arctan(np.hypot(rise_across, rise_down)))
-    inner = window.relative_to(around).slices
-    return heights[inner], slope[inner]
+    return read_heights(path, place, shape, window), slope[window.relative_to(around).slices]

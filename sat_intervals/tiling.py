@@ -92,6 +92,14 @@ class Grid:
         return Tile(grid_row, grid_column, Window(row, column, self.size, self.size).clipped(self.region))
 
 
+def strips(height: int, width: int, pixels: int) -> Iterator[Window]:
+    """Windows of whole rows, from the top, of no more pixels; of as many rows as the blocks of our files, or fewer."""
+    rows = min(512, max(1, pixels // width))
+    rows = rows // 64 * 64 or rows
+    for row in range(0, height, rows):
+        yield Window(row, 0, min(rows, height - row), width)
+
+
 def facing(window: Window, minimum: int, maximum: int) -> Window:
     """The right pixels that face a left window over the search range.
 

@@ -12,6 +12,7 @@ from sat_intervals.summary import Tally
 
 PLACE = north_up(32631, x=370_000, y=4_830_000, pixel=0.5)
 MINIMUM, MAXIMUM = -20, 10
+FINISHED = "2026-11-21T12:00:00+00:00"
 
 
 def write_run(folder, bands, validity, truth=None, image=None):
@@ -41,7 +42,7 @@ def _report(inputs, bands, validity):
     described = {"height": height, "width": width, "band": 1, "nodata": "0.0", "mask": None, "dtype": "uint16"}
     config = load_config({"disparity": {"minimum": MINIMUM, "maximum": MAXIMUM}})
     return {
-        "finished": "2026-11-21T12:00:00+00:00",
+        "finished": FINISHED,
         "settings": config.model_dump(mode="json"),
         "inputs": {side: {"path": str(path), **described} for side, path in inputs.items()},
         "tiles": {

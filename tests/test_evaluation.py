@@ -235,7 +235,7 @@ def test_evaluate_run__equals_the_slow_twin(pair, run, tmp_path, monkeypatch):
     assert found["bias"] == pytest.approx(expected["bias"], abs=0.0005)
     same(found, expected, abs=0.003)  # of the bias, which decides where the truth lies in its interval
 
-    monkeypatch.setattr("sat_intervals.results._BLOCK_ROWS", 9)
+    monkeypatch.setattr("sat_intervals.results._STRIP", 9 * 90)
     monkeypatch.setattr("sat_intervals.evaluation._JUDGED_PIXELS", 4 * 90)
     same(
         evaluate_run(run, mask=tmp_path / "mask.tif", tolerance=0.25, remove_bias=True) | {"cost": 0},

@@ -1,12 +1,13 @@
 """The files of other tools, field by field."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
 from click.testing import CliRunner
-from finished import random_bands, write_run
+from finished import random_bands, without_intervals, write_run
 from numpy.testing import assert_array_equal
 
 from sat_intervals.cli import main
@@ -53,6 +54,19 @@ def test_export__cars(run, tmp_path):
     mask, dtype, nodata, _ = look(tmp_path / "cars" / "epi_disp_mask.tif")
     assert (dtype, nodata) == ("uint8", None)
     assert_array_equal(mask[0], np.where(valid, 255, 0))
+
+
+def test_export__has_no_file_for_what_a_run_has_not(tmp_path):
+    out = without_intervals(tmp_path)
+    assert [Path(file).name for file in exported(out, "cars", tmp_path / "cars")] == [
+        "epi_disp.tif", "epi_disp_ambiguity.tif", "epi_disp_mask.tif"
+    ]  # fmt: skip
+
+
+def test_export__asp_needs_a_prefix(run, tmp_path):
+    result = CliRunner().invoke(main, ["export", str(run[0]), str(tmp_path), "--to", "asp"])
+    assert result.exit_code == 2
+    assert f"is a folder: give a prefix for ASP's file, such as {tmp_path / 'run'}" in result.stderr
 
 
 def test_export__asp(run, tmp_path):

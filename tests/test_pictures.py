@@ -12,7 +12,7 @@ from operator import getitem
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from finished import PLACE, no_bands, random_bands, without_intervals, write_run
+from finished import FINISHED, PLACE, no_bands, random_bands, without_intervals, write_run
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -23,7 +23,7 @@ from sat_intervals import match_pair
 from sat_intervals.cli import main
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kinds import KINDS, ORANGE, SKY, VERMILION, classify
-from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile
+from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
 from sat_intervals.pictures.curve import read_curve
 from sat_intervals.pictures.surface import _relief
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
@@ -256,11 +256,11 @@ def test_plot__without_intervals_claims_none(tmp_path, words):
         draw_errors(open_results(out), tmp_path / "errors.png")
 
 
-def write_surface(out, height, agreement=np.nan):
+def write_surface(out, height, agreement=np.nan, runs=FINISHED):
     """A surface of intervals 3 m wide beside a run, whose confidence is one half."""
     ones = np.ones_like(height)
     bands = np.stack([height, height - 1, height + 2, ones, 0.5 * ones, agreement * ones]).astype(np.float32)
-    with OutputWriter(out, [surface_file("dsm.tif")], *height.shape, PLACE, {}) as writer:
+    with OutputWriter(out, [surface_file("dsm.tif")], *height.shape, PLACE, {"RUNS": runs}) as writer:
         writer.write(0, bands)
         writer.publish()
 
@@ -277,6 +277,28 @@ def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, las
     titles = ["Hillshade, sun in the north-west", "Height", "Interval width", last]
     assert [word for word in words if word in titles][-4:] == titles
     assert len(np.unique(pixels_of(out / "dsm.png").reshape(-1, 3), axis=0)) > 20
+
+
+def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tmp_path):
+    out = write_run(tmp_path, *random_bands(20, 20)[:2])
+    write_surface(out, np.ones((20, 20)), runs="earlier")
+    done = CliRunner().invoke(main, ["plot", str(out), "--dpi", "40"])
+    assert done.exit_code == 0, done.output
+    assert done.stderr == f"{out / 'dsm.tif'} is of an earlier run and not drawn: run sat-intervals dsm again\n"
+    assert not (out / "dsm.png").exists()
+    shutil.copy(out / "validity.tif", tmp_path / "dsm.tif")
+    with pytest.raises(SatIntervalsError, match=r"dsm\.tif is no surface model of sat-intervals dsm"):
+        draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png")
+
+
+def test_draw_surface__without_bounds(tmp_path, words):
+    height = np.add.outer(np.arange(20.0), np.arange(30.0))
+    bands = np.stack([height, *[np.full(height.shape, np.nan)] * 2, *[np.ones(height.shape)] * 3]).astype(np.float32)
+    with OutputWriter(tmp_path, [surface_file("dsm.tif")], *height.shape, PLACE, {}) as writer:
+        writer.write(0, bands)
+        writer.publish()
+    draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png", 40)
+    assert "Height" in words
 
 
 def test_relief__is_bright_where_it_faces_the_sun():

@@ -1,5 +1,6 @@
 """Rasters in and out, on real files: what is refused, what is read, what is written, what is left behind."""
 
+import errno
 import itertools
 import os
 import pickle
@@ -21,6 +22,7 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
     POINT_FILES,
@@ -33,6 +35,7 @@ from sat_intervals.raster import (
     check_pair,
     open_image,
     read_window,
+    surface_file,
     writer,
 )
 from sat_intervals.tiling import Window
@@ -588,18 +591,45 @@ def test_output_writer__keeps_what_was_there_until_publish(tmp_path, products):
 
 
 def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products):
-    (tmp_path / ".unpublished" / "deep").mkdir(parents=True)
-    (tmp_path / ".unpublished" / "deep" / "strips.tif").write_text("half")
+    (tmp_path / ".unpublished-intervals.tif" / "files" / "deep").mkdir(parents=True)
+    (tmp_path / ".unpublished-intervals.tif" / "files" / "deep" / "strips.tif").write_text("half")
     produce(tmp_path, products)
     assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
 
 
-def test_output_writer__publishes_all_or_nothing(tmp_path, products):
-    (tmp_path / "validity.tif").mkdir()
+@pytest.mark.parametrize("links", [True, False])
+def test_output_writer__publishes_all_or_nothing(tmp_path, products, monkeypatch, links):
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *places: (_ for _ in ()).throw(OSError(errno.EPERM, "no links")))
+    (tmp_path / "validity.tif").write_text("of another")
+    (tmp_path / "run.json").mkdir()
     with pytest.raises(OutputError) as failure:
         produce(tmp_path, products, texts={"run.json": "{}"})
-    message(failure, tmp_path / "validity.tif", "Is a directory")
-    assert left_behind(tmp_path) == ["validity.tif"]
+    message(failure, tmp_path / "run.json", "Is a directory")
+    assert left_behind(tmp_path) == ["run.json", "validity.tif"]
+    assert (tmp_path / "validity.tif").read_text() == "of another"
+
+
+def test_output_writer__refuses_a_name_that_is_no_files_before_the_work(tmp_path, products):
+    (tmp_path / "validity.tif").mkdir()
+    with pytest.raises(OutputError) as failure:
+        produce(tmp_path, products, publish=False)
+    message(failure, tmp_path / "validity.tif", "it is no file: choose another name")
+
+
+def test_output_writer__of_others_in_a_folder_disturbs_none_and_of_the_same_is_refused(tmp_path):
+    def writer(name: str) -> OutputWriter:
+        return OutputWriter(tmp_path, [surface_file(name)], 20, 30, Georeferencing(), {})
+
+    bands = np.zeros((6, 20, 30), np.float32)
+    with writer("a.tif") as one, writer("b.tif") as other:
+        with pytest.raises(SatIntervalsError, match="another run is at work in"), writer("a.tif"):
+            pass
+        one.write(0, bands)
+        one.publish()
+        other.write(0, bands)
+        other.publish()
+    assert left_behind(tmp_path) == ["a.tif", "b.tif"]
 
 
 def test_output_writer__names_a_folder_that_cannot_be_made(tmp_path, products):

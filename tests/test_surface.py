@@ -1,10 +1,12 @@
 """Surface models from points that the tests make up."""
 
+import json
+
 import numpy as np
 import pytest
 import rasterio
 from click.testing import CliRunner
-from finished import write_run
+from finished import FINISHED, write_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -18,7 +20,6 @@ from sat_intervals.products import POINTS, SURFACE
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, Projection
 from sat_intervals.surface import make_surface
 
-FINISHED = "2026-11-21T12:00:00+00:00"  # of the runs that finished.write_run writes
 TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
 BAND = {band.name: index for index, band in enumerate(SURFACE)}
 LEFT, TOP = 370_000.0, 4_830_000.0
@@ -68,6 +69,8 @@ def test_splat__equals_its_slow_twin(data):
     height, confidence = random.normal(50, 10, count), random.random(count)
     height[random.random(count) < 0.2] = np.nan
     lower, upper = height - random.random(count), height + random.random(count)
+    unbounded = random.random(count) < 0.2
+    lower[unbounded] = upper[unbounded] = np.nan
     cells = empty_cells(rows, columns)
     splat(column, row, height, lower, upper, confidence, radius, cells)
     for i in range(rows):
@@ -76,10 +79,11 @@ def test_splat__equals_its_slow_twin(data):
             falls = np.maximum(abs(column - (j + 0.5)), abs(row - (i + 0.5))) <= 0.5
             near = ((distance <= radius) | falls) & ~np.isnan(height)
             weight = np.exp(-(distance[near] ** 2) / 2)
-            sums = [weight.sum(), *((weight * band[near]).sum() for band in (height, confidence, lower, upper))]
+            sums = [weight.sum(), *(np.nansum(weight * band[near]) for band in (height, confidence, lower, upper))]
             assert_allclose(cells[:5, i, j], sums, atol=1e-9)
-            assert cells[5, i, j] == min(lower[near], default=np.inf)
-            assert cells[6, i, j] == max(upper[near], default=-np.inf)
+            bounded = near & ~unbounded
+            assert cells[5, i, j] == min(lower[bounded], default=np.inf)
+            assert cells[6, i, j] == max(upper[bounded], default=-np.inf)
             assert cells[7, i, j] == near.sum()
 
 
@@ -159,6 +163,40 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     assert_array_equal(tiled[3], whole[3])
 
 
+@pytest.mark.parametrize("interval", ["envelope", "mean"])
+def test_make_surface__of_a_run_without_intervals_has_heights_alone(tmp_path, interval):
+    plain = write_points(tmp_path / "a", [0.5, 4.5], [-0.5, -0.5], [10.0, 20.0], lower=np.nan, upper=np.nan)
+    report = json.loads((plain / "run.json").read_text())
+    report["settings"] |= {"interval": None, "regularization": None}
+    (plain / "run.json").write_text(json.dumps(report))
+    surface, place, report = surface_of([plain], tmp_path, radius=0.6, interval=interval)
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(surface[0, i, [j, j + 4]], [10, 20])
+    assert np.isnan(surface[1:3]).all()
+    assert report["without_intervals"] == [str(plain)]
+    other = write_points(tmp_path / "b", [0.5], [-0.5], [11.0])
+    surface, place, _ = surface_of([plain, other], tmp_path, radius=0.6, interval=interval)
+    assert_allclose(surface[:4, i, j], [10.5, 10, 13, 2])
+    assert np.isnan(surface[1:3, i, j + 4]).all()
+    assert np.isnan(surface[BAND["agreement"]]).all()
+
+
+def test_make_surface__a_wide_radius_leaves_no_cell_without_height(tmp_path):
+    out = write_points(tmp_path / "a", [0.5] * 20, [-0.5] * 20, [10.0] * 20)
+    surface, _, _ = surface_of([out], tmp_path, radius=60.0)
+    reached = surface[BAND["count"]] > 0
+    assert reached.sum() > 10_000
+    assert_allclose(surface[0][reached], 10.0, atol=1e-4)
+
+
+def test_make_surface__zone_is_that_of_the_middle(tmp_path):
+    # The first pixel alone lies beyond the border of zones 31 and 32 at 6 degrees, 503 km east of the corner.
+    x = np.full((9, 1100), 503_000.0) + np.linspace(0, 30_000, 1100)
+    x[:, 0] = 300_000.0
+    out = write_points(tmp_path / "a", x, np.zeros_like(x), np.full_like(x, 10.0))
+    assert make_surface([out], tmp_path / "dsm.tif", resolution=1000.0)["crs"] == "EPSG:32632"
+
+
 def test_make_surface__file_says_what_it_is(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 1.5], [-0.5, -0.5], [10.0, 11.0])
     make_surface([out], tmp_path / "new" / "model.tif", resolution=1.0)
@@ -199,6 +237,23 @@ def test_projection__refuses_what_is_no_map_in_metres(crs):
         Projection(crs)
 
 
+def test_projection__takes_a_number_and_no_heights():
+    assert Projection("32637").crs == "EPSG:32637"
+    with pytest.raises(SatIntervalsError, match=r"has heights too: give a map alone, and a geoid by --geoid"):
+        Projection("EPSG:32637+5773")
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32601", "EPSG:27700", "EPSG:3031", "EPSG:32732"])
+def test_projection__refuses_a_map_of_another_place(crs):
+    Projection("EPSG:32632").check(7.2, 43.6)
+    Projection("EPSG:32631").check(7.2, 43.6)
+    Projection("EPSG:3857").check(7.2, 43.6)
+    with pytest.raises(
+        SatIntervalsError, match=r"is for longitudes .* the points are at longitude 7\.20, latitude 43\.60"
+    ):
+        Projection(crs).check(7.2, 43.6)
+
+
 def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
     plain = write_run(tmp_path, np.ones((4, 3, 3), np.float32), np.zeros((3, 3), np.uint16))
     old = write_points(tmp_path / "old", [0.5], [-0.5], [1.0], run="another")
@@ -210,7 +265,16 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([old], [], "is of an earlier run"),
         ([empty], [], "no valid pixel"),
         (far, [], "choose a coarser --resolution, or runs of one place"),
-        ([far[0]], ["--resolution", "-1"], "--resolution is -1, it must be above 0"),
+        ([far[0]], ["--resolution", "-1"], "resolution is -1 m: give one above 0, up to 10000"),
+        ([far[0]], ["--radius", "1e9"], "radius is 1e+09 m: give one above 0"),
+        ([far[0], far[0]], [], "is given 2 times: give each run once"),
+        (
+            [far[0]],
+            ["--output", str(far[0] / "points.tif")],
+            "is no surface model to be replaced: choose another --output",
+        ),
+        ([far[0]], ["--output", str(tmp_path)], "is no surface model to be replaced: choose another --output"),
+        ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "says -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(tmp_path / "none.gtx")], "none.gtx: no such file"),
         ([far[0]], ["--crs", "EPSG:4326"], "is no map in metres"),
         ([tmp_path / "nowhere"], [], "give the folder of a finished run"),

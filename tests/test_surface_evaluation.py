@@ -23,6 +23,8 @@ def write(path, bands, place=PLACE, crs="EPSG:32631"):
     kind = {"height": bands.shape[1], "width": bands.shape[2], "count": bands.shape[0], "dtype": "float32"}
     with rasterio.open(path, "w", driver="GTiff", nodata=np.nan, crs=crs, transform=place, **kind) as dataset:
         dataset.write(bands)
+        if len(bands) == len(SURFACE):
+            dataset.descriptions = [band.name for band in SURFACE]
     return path
 
 
@@ -58,19 +60,41 @@ def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkey
     height = random.normal(50, 3, (23, 31))
     height[random.random(height.shape) < 0.1] = np.nan
     model = surface(tmp_path / "dsm.tif", height, height - 1, height + 2)
-    # Twice as fine and one metre further out: the reference of a cell is the one nearest to its centre.
-    fine = np.repeat(np.repeat(random.normal(50, 3, (25, 33)), 2, axis=0), 2, axis=1)
+    # Twice as fine and one metre further out: each of the four heights in a cell is judged by the cell's interval.
+    fine = random.normal(50, 3, (50, 66))
     place = Affine(0.5, 0, PLACE.c - 1, 0, -0.5, PLACE.f + 1)
     reference = write(tmp_path / "reference.tif", [fine], place)
-    truth = fine[::2, ::2][1:-1, 1:-1]
+    truth, height = fine[2:-2, 2:-2].astype(np.float32), np.repeat(np.repeat(height, 2, axis=0), 2, axis=1)
     known = np.isfinite(height)
     whole = evaluate_surface(model, reference)
     assert whole["all"]["count"] == known.sum()
     inside = ((height - 1 <= truth) & (truth <= height + 2))[known]
     assert whole["all"]["accuracy"] == pytest.approx(inside.mean(), abs=2e-3)
     assert whole["all"]["bias"] == pytest.approx(np.median((height - truth)[known]), abs=0.01)
-    monkeypatch.setattr("sat_intervals.surface_evaluation._ROWS", 5)
+    monkeypatch.setattr("sat_intervals.surface_evaluation._STRIP", 5 * 31 * 4)
     assert evaluate_surface(model, reference) == whole
+
+
+def test_evaluate_surface__slope_is_that_of_the_references_own_grid(tmp_path):
+    # A plane that rises 0.1 a metre, 5.7 degrees, known every 8 m, under cells of 1 m.
+    coarse = 0.1 * 8 * np.broadcast_to(np.arange(12.0), (10, 12))
+    height = np.broadcast_to(0.1 * (np.arange(96.0) - 3.5), (80, 96))
+    model = surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
+    place = Affine(8, 0, PLACE.c, 0, -8, PLACE.f)
+    report = evaluate_surface(model, write(tmp_path / "reference.tif", [coarse], place))
+    counts = [kind["count"] for kind in report["slope"]]
+    assert counts[0] == 10 * 80  # beside the reference's outermost centres, where it is flat
+    assert counts[1] == 86 * 80
+    assert counts[2:] == [0, 0, 0]
+
+
+def test_evaluate_surface__takes_scale_and_offset_of_the_reference(tmp_path):
+    model = surface(tmp_path / "dsm.tif", [[100.5, 101]], [[100.0, 100]], [[102.0, 102]])
+    reference = write(tmp_path / "reference.tif", [[[15.0, 10]]])
+    with rasterio.open(reference, "r+") as dataset:
+        dataset.scales, dataset.offsets = (0.1,), (100.0,)
+    report = evaluate_surface(model, reference)["all"]
+    assert (report["count"], report["accuracy"], report["bias"]) == (2, 1.0, pytest.approx(-0.5, abs=0.51))
 
 
 @settings(deadline=None)
@@ -99,6 +123,7 @@ def test_evaluate_command__of_a_surface(tmp_path):
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
     model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
     away = write(tmp_path / "away.tif", [[[1.5, 9]]], Affine(1, 0, 5, 0, -1, 5))
+    feet = write(tmp_path / "feet.tif", [[[3000.0, 3003]]])
     nowhere = write(tmp_path / "nowhere.tif", [[[1.5, 9]]], crs=None)
     for words, message in (
         ([], "Missing argument 'OUT...'"),
@@ -107,6 +132,12 @@ def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
         (["--dsm", tmp_path / "none.tif", "--reference", away], "none.tif"),
         (["--dsm", model, "--reference", away], "give a reference of the same place"),
         (["--dsm", model, "--reference", nowhere], "does not say where it lies"),
+        (
+            ["--dsm", feet, "--reference", model],
+            "feet.tif is no surface model of sat-intervals dsm: is it the --reference?",
+        ),
+        (["--dsm", model, "--reference", feet], "differ by 500 m or more in the median: check that both are metres"),
+        (["--dsm", model, "--reference", feet, "--tolerance", "5"], "--tolerance is for runs and pairs, not for --dsm"),
     ):
         result = run(*words)
         assert result.exit_code == 2, result.output

@@ -123,7 +123,7 @@ def test_triangulate__orders_bounds_by_height(tmp_path):
 def test_triangulate__says_what_shareloc_cannot_do(tmp_path):
     out = write_run(tmp_path, np.ones((4, 40, 50), np.float32), np.zeros((40, 50), np.uint16))
     middle = on_the_ground(20, 25, DATUM)[0] - LONGITUDE
-    with pytest.raises(SatIntervalsError, match=r"of the lines of sight: .* across the 180th meridian is beyond it"):
+    with pytest.raises(SatIntervalsError, match=r"of 162 lines of sight: .* across the 180th meridian is beyond it"):
         triangulate(out, *cameras(tmp_path, 40, 50, longitude=180 - middle))
 
 
@@ -182,13 +182,13 @@ def test_make_surface__as_many_true_heights_are_inside_cells_as_disparities(matc
 def test_lattice__equals_shareloc(shared_data):
     folder = shared_data / "dsm_picanteo"
     sensors = Sensors.load(*(folder / name for name in FILES))
-    lattice = Lattice.over(sensors, Window(0, 0, 1216, 1262), 1262, -35, 18)
+    lattice = Lattice(sensors, Window(0, 0, 1216, 1262), 1262, -35, 18)
     with (folder / "triangulation_check.csv").open() as stream:
         rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
     assert len(rows) == 200
     for point in rows:
         window = Window(int(point["row"]), int(point["col"]), 1, 1)
-        here = lattice.points(window, np.array([[point["disparity"]]]))
+        (here,) = lattice.points(window, np.array([[point["disparity"]]]))
         assert abs(here.height[0, 0] - point["height"]) < 1e-3
         assert abs(here.longitude[0, 0] - point["lon"]) * 88_000 < 1e-3
         assert abs(here.latitude[0, 0] - point["lat"]) * 111_000 < 1e-3
@@ -243,6 +243,23 @@ def test_triangulate__a_region_of_the_image_gives_the_same_points(shared_data, t
         assert np.abs(part - whole)[BAND[band]][same].max() < allowed
 
 
+def test_lattice__asks_shareloc_for_few_nodes_at_a_time_and_for_none_twice(shared_data, monkeypatch):
+    folder = shared_data / "dsm_picanteo"
+    sensors = Sensors.load(*(folder / name for name in FILES))
+    region = Window(0, 0, 1216, 1262)
+    lattice = Lattice(sensors, region, 1262, -35, 18)
+    disparity = np.full((region.height, 7), 3.25)
+    monkeypatch.setattr("sat_intervals.geometry._AT_ONCE", 40)
+    counts, ask = [], Sensors._triangulate
+    monkeypatch.setattr(Sensors, "_triangulate", lambda self, some: counts.append(len(some)) or ask(self, some))
+    strips = [lattice.points(Window(row, 30, 19, 7), disparity[row : row + 19])[0] for row in range(0, 1216, 19)]
+    assert max(counts) == 40
+    assert sum(counts) == 39 * 41 * 3  # nodes along rows, columns, disparities
+    (whole,) = Lattice(sensors, region, 1262, -35, 18).points(Window(0, 30, 1216, 7), disparity)
+    for band in range(4):
+        np.testing.assert_allclose(np.concatenate([strip[band] for strip in strips]), whole[band], rtol=1e-12)
+
+
 @pytest.fixture
 def small_run(tmp_path):
     bands = np.full((4, 40, 50), 1.0, np.float32)
@@ -252,6 +269,9 @@ def small_run(tmp_path):
 def test_triangulate_command__what_it_cannot_use_gets_one_line(small_run, tmp_path):
     out, files = small_run
     short = grid(tmp_path / "short.tif", 10, 10, step=10)
+    descending = tmp_path / "descending.tif"
+    with rasterio.open(files[3]) as file, rasterio.open(descending, "w", **upside_down(file)) as other:
+        other.write(file.read()[:, ::-1])
     (tmp_path / "model.geom").write_text("no model\n")
     cases = [
         ({0: tmp_path / "missing.geom"}, "missing.geom: no such file: give the RPC model of the image"),
@@ -259,13 +279,45 @@ def test_triangulate_command__what_it_cannot_use_gets_one_line(small_run, tmp_pa
         ({2: tmp_path / "model.geom"}, "is no epipolar grid that shareloc reads"),
         ({3: short}, "covers rows -20 to 30 and columns -20 to 30 of the right epipolar image, the run rows 0 to 39"),
         ({3: grid(tmp_path / "far.tif", 40, 50, offset=9000.0)}, "the models do not fit these images"),
+        ({3: descending}, "rows of {descending} descend: give a grid whose positions ascend"),
     ]
     for changed, message in cases:
         result = run("triangulate", out, *given(changed.get(place, file) for place, file in enumerate(files)))
         assert result.exit_code == 2, result.output
-        assert message in result.output
+        assert message.format(descending=descending) in result.output
         assert result.output.count("\n") == 1
         assert not (out / "points.tif").exists()
+
+
+def upside_down(file):
+    """The profile of a grid whose rows are in the opposite order."""
+    place = file.transform
+    return file.profile | {"transform": Affine(place.a, 0, place.c, 0, -place.e, place.f + file.height * place.e)}
+
+
+def test_triangulate_command__warns_of_models_that_nearly_fit(small_run, tmp_path):
+    out, files = small_run
+    shifted = grid(tmp_path / "shifted.tif", 40, 50, offset=1.5)
+    result = run("triangulate", out, *given([*files[:3], shifted]), "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "warning: lines of sight pass each other by 0." in result.stderr
+    assert result.stdout == ""
+    assert run("triangulate", out, *given(files)).stderr == ""
+
+
+def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(small_run, tmp_path):
+    out, files = small_run
+    files = [*files[:2], grid(tmp_path / "holed.tif", 40, 50, step=4), files[3]]
+    with rasterio.open(files[2], "r+") as file:
+        positions = file.read()
+        positions[:, 2, 2] = np.nan  # of epipolar row and column 0, a node of the lattice
+        file.write(positions)
+    result = run("triangulate", out, *given(files))
+    assert result.exit_code == 0, result.output
+    points = read(out / "points.tif")[BAND["height"]]
+    lost = np.isnan(points)
+    assert 0 < lost.sum() < lost.size
+    assert f"{lost.sum()} valid pixels have no point" in result.stderr
 
 
 def test_triangulate_command__needs_a_run(tmp_path):

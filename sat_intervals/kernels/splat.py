@@ -21,14 +21,14 @@ def empty_cells(rows: int, columns: int) -> np.ndarray:
 def splat(column, row, height, lower, upper, confidence, radius, cells):
     """Let points reach the cell they fall in and all cells whose centre lies within a radius.
 
-    A point weighs ``exp(-d^2 / 2)`` at a distance of ``d`` cells.
+    A point weighs ``exp(-d^2 / 2)`` at a distance of ``d`` cells, and next to nothing from 30 cells on.
 
     Parameters
     ----------
     column, row
         ``(n,)`` positions in cells from the upper left corner of the first cell; those of centres end in one half.
     height, lower, upper, confidence
-        ``(n,)``; a point of NaN height reaches nothing.
+        ``(n,)``; a point of NaN height reaches nothing, NaN bounds count for nothing.
     radius
         In cells.
     cells
@@ -46,12 +46,14 @@ def splat(column, row, height, lower, upper, confidence, radius, cells):
                 square = (i - v) ** 2 + (j - u) ** 2
                 if square > radius**2 and max(abs(i - v), abs(j - u)) > 0.5:
                     continue
-                weight = np.exp(-0.5 * square)
+                weight = np.exp(-0.5 * min(square, 900.0))
                 cells[WEIGHT, i, j] += weight
                 cells[HEIGHT, i, j] += weight * height[n]
                 cells[CONFIDENCE, i, j] += weight * confidence[n]
+                cells[COUNT, i, j] += 1
+                if np.isnan(lower[n]) or np.isnan(upper[n]):
+                    continue
                 cells[LOWER, i, j] += weight * lower[n]
                 cells[UPPER, i, j] += weight * upper[n]
                 cells[LEAST, i, j] = min(cells[LEAST, i, j], lower[n])
                 cells[MOST, i, j] = max(cells[MOST, i, j], upper[n])
-                cells[COUNT, i, j] += 1

@@ -7,9 +7,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.ticker import MaxNLocator
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import read_place, read_small_layers
+from sat_intervals.raster import is_surface, read_place, read_small_layers
 
 _LONGEST = 5.5  # inches of the longer side of a map
 _STRETCHED = 5.0  # ratio of sides beyond which maps are cut to it
@@ -29,6 +30,8 @@ def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
         A file that cannot be read, or a picture that cannot be written.
     """
     shape, place = read_place(surface)
+    if not is_surface(surface):
+        raise SatIntervalsError(f"{surface} is no surface model of sat-intervals dsm: move it away or make it again")
     assert place.transform is not None
     assert place.pixel_size is not None
     tall = float(np.clip(shape[0] / shape[1], 1 / _STRETCHED, _STRETCHED))

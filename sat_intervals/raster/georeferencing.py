@@ -68,6 +68,12 @@ class Georeferencing:
         gcps = tuple(point._replace(row=point.row - row, column=point.column - column) for point in self.gcps)
         return replace(self, transform=transform, gcps=gcps, rpcs=rpcs)
 
+    def refined(self, finer: int) -> "Georeferencing":
+        """The georeferencing of the same image with so many pixels along both sides of each; it has a transform."""
+        assert self.transform is not None
+        a, b, c, d, e, f = self.transform[:6]
+        return replace(self, transform=Affine(a / finer, b / finer, c, d / finer, e / finer, f))
+
     def creation_options(self) -> dict[str, Any]:
         """The arguments by which rasterio gives it to a new GeoTIFF, which holds a transform or control points."""
         options: dict[str, Any] = {}

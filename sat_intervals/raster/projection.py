@@ -11,6 +11,10 @@ from pyproj.exceptions import CRSError, ProjError
 from sat_intervals.errors import SatIntervalsError
 
 _GEOGRAPHIC = "EPSG:4326"
+# Degrees beyond the area of a CRS at which its map still serves: the next UTM zone.
+_BEYOND = 6.0
+# Metres.
+_LARGEST_UNDULATION = 120.0
 
 
 def utm_of(longitude: float, latitude: float) -> str:
@@ -39,6 +43,7 @@ class Projection:
     """
 
     def __init__(self, crs: str, geoid: Path | None = None) -> None:
+        crs = f"EPSG:{crs}" if crs.isdecimal() else crs
         try:
             target = CRS.from_user_input(crs)
         except CRSError as error:
@@ -47,9 +52,31 @@ class Projection:
             raise SatIntervalsError(
                 f"{crs} ({target.name}) is no map in metres: give a projected CRS such as EPSG:32637"
             )
+        if len(target.axis_info) != 2:
+            raise SatIntervalsError(f"{crs} ({target.name}) has heights too: give a map alone, and a geoid by --geoid")
         self.crs = crs
+        self._area = target.area_of_use
         self._map = Transformer.from_crs(_GEOGRAPHIC, target, always_xy=True)
         self._geoid = None if geoid is None else _geoid(geoid)
+
+    def check(self, longitude: float, latitude: float) -> None:
+        """Refuse a CRS whose area is elsewhere, and heights that are no geoid's, at a place (degrees)."""
+        here = f"longitude {longitude:.2f}, latitude {latitude:.2f}"
+        area = self._area
+        if area is not None:
+            away = (longitude - (area.west + area.east) / 2 + 180) % 360 - 180 if area.west <= area.east else 0.0
+            beyond = abs(away) - (area.east - area.west) / 2, area.south - latitude, latitude - area.north
+            if max(beyond) > _BEYOND:
+                raise SatIntervalsError(
+                    f"{self.crs} is for longitudes {area.west:g} to {area.east:g} and latitudes {area.south:g} to "
+                    f"{area.north:g}, the points are at {here}: give the CRS of this place, or none for its UTM zone"
+                )
+        undulation = float(self.undulation(np.array([longitude]), np.array([latitude]))[0])
+        if not abs(undulation) <= _LARGEST_UNDULATION:
+            raise SatIntervalsError(
+                f"the grid of geoid heights says {undulation:g} m at {here}, where the points are: give one that "
+                f"covers them; the geoid is never more than {_LARGEST_UNDULATION:g} m from the ellipsoid"
+            )
 
     def place(self, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Easting and northing in metres."""

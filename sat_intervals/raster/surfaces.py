@@ -5,13 +5,24 @@ from pathlib import Path
 import numpy as np
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
+from rasterio.warp import calculate_default_transform
 from rasterio.windows import Window as Area
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import SURFACE
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 from sat_intervals.tiling import Window
+
+
+def is_surface(path: Path) -> bool:
+    """Whether a file has the bands of a surface model."""
+    try:
+        with opened(str(path)) as dataset:
+            return bool(dataset.descriptions == tuple(band.name for band in SURFACE))
+    except SatIntervalsError:
+        return False
 
 
 def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
@@ -29,23 +40,38 @@ def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
         return dataset.shape, place
 
 
-def read_heights(path: Path, place: Georeferencing, shape: tuple[int, int], window: Window) -> np.ndarray:
-    """The first band of a raster at the centres of cells, the nearest value of each; NaN where there is none.
+def resolution_of(path: Path, place: Georeferencing) -> float:
+    """Side of a raster's pixels in units of another CRS."""
+    with opened(str(path)) as dataset:
+        transform, _, _ = calculate_default_transform(
+            dataset.crs, place.crs, dataset.width, dataset.height, *dataset.bounds
+        )
+        return float(transform.a)
+
+
+def read_heights(
+    path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False
+) -> np.ndarray:
+    """The first band of a raster at the centres of cells; NaN where there is none.
 
     Parameters
     ----------
     path
-        Any raster with a CRS.
+        Any raster with a CRS; scale and offset of its band are applied.
     place, shape
         The cells.
     window
         Which of them.
+    smooth
+        Whether values are interpolated between the raster's pixels; else the nearest counts.
     """
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
+    grid |= {"resampling": Resampling.bilinear if smooth else Resampling.nearest}
     with opened(str(path), window) as dataset:
         try:
-            with WarpedVRT(dataset, resampling=Resampling.nearest, dtype="float64", nodata=np.nan, **grid) as warped:
-                return np.asarray(warped.read(1, window=Area(window.column, window.row, window.width, window.height)))
+            with WarpedVRT(dataset, dtype="float64", nodata=np.nan, **grid) as warped:
+                values = warped.read(1, window=Area(window.column, window.row, window.width, window.height))
         except gdal.GDAL_ERRORS as error:
             raise SatIntervalsError(f"{path} cannot be laid on the surface: {gdal.reason(error)}") from error
+        return np.asarray(values * dataset.scales[0] + dataset.offsets[0])

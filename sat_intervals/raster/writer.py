@@ -5,7 +5,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -18,12 +18,14 @@ from rasterio.shutil import copy
 from rasterio.windows import Window as Area
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.folders import LocalFolder
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 
-# Folder, inside that of the run, where files grow until they are whole. What a killed run left there is replaced.
-_SCRATCH = ".unpublished"
+# Folder, beside the files, where they grow until they are whole; named after the first of them, and locked. What a
+# killed process left there is replaced.
+_SCRATCH = ".unpublished-{}"
 # Strips are kept as they come, in blocks low enough that a strip fills most of those it touches, and band by band, from
 # which the final files are made in four fifths of the time.
 _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "band", "bigtiff": "IF_SAFER"}
@@ -56,7 +58,8 @@ class OutputWriter:
             writer.publish()
 
     Memory follows the strip. Until `publish` the files are in a hidden folder inside ``folder``, as plain GeoTIFFs and
-    then as Cloud-Optimized GeoTIFFs; leaving the context removes it, whatever happened.
+    then as Cloud-Optimized GeoTIFFs; leaving the context removes it, whatever happened. It is locked: of two processes
+    that write the same files the second is refused.
 
     Parameters
     ----------
@@ -91,7 +94,9 @@ class OutputWriter:
         threads: int | None = None,
     ) -> None:
         self._folder = Path(folder)
-        self._scratch = self._folder / _SCRATCH
+        self._hidden = self._folder / _SCRATCH.format(files[0].name)
+        self._scratch, self._replaced = self._hidden / "files", self._hidden / "files" / "replaced"
+        self._locked = ExitStack()
         self._files = tuple(files)
         self._shape = height, width
         self._georeferencing = georeferencing
@@ -101,10 +106,17 @@ class OutputWriter:
         self._sums = {file.name: 0 for file in files}
 
     def __enter__(self) -> Self:
+        for file in self._files:
+            place = self._folder / file.name
+            if place.exists() and not place.is_file():
+                raise OutputError(f"{place} cannot be written: it is no file: choose another name or folder")
         with self._failing(self._folder):
-            shutil.rmtree(self._scratch, ignore_errors=True)
-            self._scratch.mkdir(parents=True)
+            self._folder.mkdir(parents=True, exist_ok=True)
+        self._locked.enter_context(LocalFolder(self._hidden).locked())
         try:
+            with self._failing(self._folder):
+                shutil.rmtree(self._scratch, ignore_errors=True)
+                self._replaced.mkdir(parents=True)
             check_space(self._folder, self._files, *self._shape)
             for file in self._files:
                 self._strips[file.name] = self._create(file)
@@ -153,16 +165,36 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 (self._scratch / name).write_text(text, encoding="utf-8")
                 _flush(self._scratch / name)
-        names = (*(file.name for file in self._files), *texts)
+        reached: list[str] = []
         try:
-            for name in names:
+            for name in (*(file.name for file in self._files), *texts):
                 with self._failing(self._folder / name):
-                    os.replace(self._scratch / name, self._folder / name)
-        except BaseException:  # of some, old or new, none
-            for name in names:
-                with suppress(OSError):
-                    os.unlink(self._folder / name)
+                    reached.append(name)
+                    self._put(name)
+        except BaseException:
+            for name in reached:
+                self._take_back(name)
             raise
+
+    def _put(self, name: str) -> None:
+        """Give a file its name; another that had it is kept until the end."""
+        before = self._folder / name
+        if before.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if before.exists():
+            try:
+                os.link(before, self._replaced / name)
+            except OSError:  # a disk without links: for a moment there is no file of that name
+                os.replace(before, self._replaced / name)
+        os.replace(self._scratch / name, before)
+
+    def _take_back(self, name: str) -> None:
+        """Put back the file that had the name before, or none."""
+        with suppress(OSError):
+            if (self._replaced / name).exists():
+                os.replace(self._replaced / name, self._folder / name)
+            elif not (self._scratch / name).exists():
+                os.unlink(self._folder / name)
 
     def _create(self, file: File) -> DatasetWriter:
         """A plain GeoTIFF for the strips, with all that is said of the file."""
@@ -220,6 +252,7 @@ class OutputWriter:
                 strips.close()
         self._strips.clear()
         shutil.rmtree(self._scratch, ignore_errors=True)
+        self._locked.close()
 
 
 def check_space(folder: Path, files: Sequence[File], height: int, width: int) -> None:
