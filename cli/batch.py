@@ -42,7 +42,8 @@ def batch(
             progress=console.progress,
         )
     console.batch_summary(report)
-    failed = {name: end["error"] for name, end in report.items() if end["state"] == "failed"}
+    done = ("done", "done before")
+    failed = {name: end.get("error", end["state"]) for name, end in report.items() if end["state"] not in done}
     if failed:
         from sat_intervals.errors import RunError
 

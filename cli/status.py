@@ -13,6 +13,7 @@ def status(out: Path) -> None:
     Of the folder of a batch: the same of each of its pairs, and why pairs failed.
     """
     from sat_intervals.batch import read_report
+    from sat_intervals.errors import SatIntervalsError
 
     pairs = read_report(out)
     if pairs is None:
@@ -21,10 +22,11 @@ def status(out: Path) -> None:
     for name, ended in pairs.items():
         if ended["state"] == "failed":
             click.echo(f"{out / name}: failed: {ended['error']}")
-        elif ended["state"] == "waiting" and not (out / name).exists():
-            click.echo(f"{out / name}: waiting")
-        else:
+            continue
+        try:
             _tell(out / name)
+        except SatIntervalsError:  # there is no run yet, or no more
+            click.echo(f"{out / name}: {ended['state']}")
 
 
 def _tell(out: Path) -> None:

@@ -1,13 +1,15 @@
 """Many pairs in one go: one cluster for all, tiles of several pairs in flight, a folder for each."""
 
 import csv
+import io
 import json
 import os
+import resource
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,13 +18,14 @@ import yaml
 
 from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
-from sat_intervals.config import Cluster, Config, load_config
+from sat_intervals.config import Cluster, Config, load_config, load_yaml
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.folders import LocalFolder
+from sat_intervals.folders import LocalFolder, folder_at
 from sat_intervals.job import OUTPUTS, Job, changes_since, compile_kernels, prepare
-from sat_intervals.raster import open_image
+from sat_intervals.raster import Image, open_image
 from sat_intervals.results import open_run
 from sat_intervals.run import check_failures, held, matched, measure_images
+from sat_intervals.store import remove_tiles
 
 REPORT = "batch.json"
 
@@ -59,8 +62,8 @@ def read_batch(file: Path) -> list[PairOfBatch]:
     """
     try:
         text = file.read_text(encoding="utf-8-sig")
-        rows = list(csv.DictReader(text.splitlines())) if file.suffix == ".csv" else yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, csv.Error) as error:
+        rows = _rows_of_csv(text) if file.suffix.lower() == ".csv" else load_yaml(text)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
         raise SatIntervalsError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):
         raise SatIntervalsError(f"{file} holds no pairs: needed is a row a pair, with name, left and right")
@@ -71,6 +74,13 @@ def read_batch(file: Path) -> list[PairOfBatch]:
     return pairs
 
 
+def _rows_of_csv(text: str) -> list[Any]:
+    rows = csv.DictReader(io.StringIO(text, newline=""))
+    if twice := [name for name, count in Counter(rows.fieldnames or ()).items() if count > 1]:
+        raise ValueError(f"column {twice[0]} is there twice")
+    return list(rows)
+
+
 def _pair(row: Mapping[str, Any], file: Path, number: int) -> PairOfBatch:
     values = {key: value for key, value in row.items() if value not in ("", None)}
     missing = [key for key in ("name", "left", "right") if key not in values]
@@ -78,7 +88,9 @@ def _pair(row: Mapping[str, Any], file: Path, number: int) -> PairOfBatch:
     if missing or None in row:
         what = f"lacks {' and '.join(missing)}" if missing else f"has more values than columns: {row[None]}"  # type: ignore[index]
         raise SatIntervalsError(f"{file}, row {number} {what}")
-    if name.startswith(".") or os.sep in name or name in _TAKEN:
+    if "cluster" in (key.split(".")[0] for key in map(str, values)):
+        raise SatIntervalsError(f"{file}, row {number}: cluster is one for all pairs: give it by --config or --cluster")
+    if name.startswith(".") or os.sep in name or name in _TAKEN or not name.isprintable():
         raise SatIntervalsError(
             f"{file}, row {number}: name {name!r} cannot be that of the pair's folder, take another"
         )
@@ -87,7 +99,7 @@ def _pair(row: Mapping[str, Any], file: Path, number: int) -> PairOfBatch:
     for key, value in values.items():
         try:
             _set(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
-        except (ValueError, yaml.YAMLError) as error:
+        except (ValueError, RecursionError, yaml.YAMLError) as error:
             raise SatIntervalsError(
                 f"{file}, row {number}: {key} is {value!r}: {' '.join(str(error).split())}"
             ) from error
@@ -147,6 +159,9 @@ def match_batch(
     """
     ended: dict[str, dict[str, Any]] = {}
     cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
+    if cluster.store and folder_at(cluster.store) == folder_at(out):
+        raise SatIntervalsError(f"the store is {out} itself, where tiles lie by default: leave it out")
+    _allow_files()
     with ExitStack() as stack:
         stack.enter_context(held(out, progress))
         progress = stack.enter_context(held(cluster.store, progress))
@@ -160,14 +175,15 @@ def match_batch(
         for number, pair in enumerate(pairs):
             progress("pairs", number, len(pairs))
             try:
-                job = _begun(pair, out, _settings(pair, config, overrides, cluster), overwrite, stack)
-            except (SatIntervalsError, OSError) as error:
-                note({pair.name: {"state": "failed", "error": str(error)}})
-                continue
-            if job is None:
-                note({pair.name: {"state": "done before"}})
-            else:
-                jobs[pair.name] = job
+                settings = _settings(pair, config, overrides, cluster)
+                before = None if overwrite else _done_before(pair, out, settings)
+                if before is None:
+                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack)
+                else:
+                    _tidy(out / pair.name, keep_tiles)
+                    note({pair.name: {"state": "done before", **before}})
+            except Exception as error:  # whatever is wrong with one pair, the others go on
+                note({pair.name: _failed(error)})
         for name, how in _matched(jobs, out, cluster, keep_tiles, progress):
             note({name: how})
     return ended
@@ -179,7 +195,9 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
     if text is None:
         return None
     try:
-        return {str(name): {"state": str(ended["state"]), **ended} for name, ended in json.loads(text).items()}
+        return {
+            str(name): {"error": "", **ended, "state": str(ended["state"])} for name, ended in json.loads(text).items()
+        }
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: run the batch again") from error
 
@@ -191,20 +209,50 @@ def _settings(pair: PairOfBatch, config: Any, overrides: Mapping[str, Any] | Non
     return settings.model_copy(update={"cluster": settings.cluster.model_copy(update={"store": store})})
 
 
-def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job | None:
-    """The job of a pair, its store open and locked; None where the same was matched before."""
+def _images(pair: PairOfBatch) -> tuple[Image, Image]:
+    return open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
+
+
+def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
+    """What the run says that was made of a pair before, with the same settings and images; None where there is none."""
     folder = out / pair.name
-    left, right = open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
-    if not overwrite and all((folder / name).exists() for name in OUTPUTS):
-        if changes := changes_since(open_run(folder).report, left, right, settings):
-            raise SatIntervalsError(
-                f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
-            )
+    if not all((folder / name).exists() for name in OUTPUTS):
         return None
-    job = prepare(left, right, folder, settings, overwrite=overwrite)
-    stack.enter_context(held(job.store.home, lambda stage, done, total: None))
+    report = open_run(folder).report
+    if changes := changes_since(report, *_images(pair), settings):
+        raise SatIntervalsError(
+            f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
+        )
+    return {name: report[name] for name in ("counts", "seconds")}
+
+
+def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job:
+    """The job of a pair, its store open and locked."""
+    job = prepare(*_images(pair), out / pair.name, settings, overwrite=overwrite)
+    for place in (job.store.home, job.store.elsewhere):
+        if place is not None and isinstance(folder_at(place), LocalFolder):  # of a bucket the batch has a lease
+            stack.enter_context(held(place, lambda stage, done, total: None))
     job.begin(overwrite=overwrite)
     return job
+
+
+def _tidy(folder: Path, keep_tiles: bool) -> None:
+    """Remove tiles that a death between the files and the end of their run left."""
+    if not keep_tiles and (folder / "tiles").exists():
+        with held(folder / "tiles", lambda stage, done, total: None):
+            remove_tiles(folder / "tiles")
+
+
+def _failed(error: Exception) -> dict[str, Any]:
+    return {"state": "failed", "error": str(error) or type(error).__name__}
+
+
+def _allow_files() -> None:
+    """Let this process open as many files as it may: every pair has a lock."""
+    least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if least != most:
+        with suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
@@ -231,7 +279,7 @@ def _matched(
                 measure_images(client, job, progress)
                 measured[name] = job
             except RunError as error:
-                yield name, {"state": "failed", "error": str(error)}
+                yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
         for job, failures in matched(client, list(measured.values()), progress):
             concluding[thread.submit(_concluded, job, failures, keep_tiles, check)] = names[id(job)]
@@ -273,6 +321,6 @@ def _concluded(job: Job, failures: dict[str, BaseException], keep_tiles: bool, p
         report = conclude(job, {}, progress)
         if not keep_tiles:
             job.store.remove()
-    except (SatIntervalsError, RuntimeError, OSError) as error:
-        return {"state": "failed", "error": str(error)}
+    except Exception as error:  # whatever is wrong with one pair, the others go on
+        return _failed(error)
     return {"state": "done", "counts": report["counts"], "seconds": report["seconds"]}

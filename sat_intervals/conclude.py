@@ -100,7 +100,8 @@ def _ahead(items: Iterable[Item]) -> Iterator[Item]:
 
 def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) -> None:
     """An image without data is the user's mistake, and is told so."""
-    missing = [tile.name for tile in job.store.grid if tile.name not in records]
+    done = job.store.done()
+    missing = [tile.name for tile in job.store.grid if tile.name not in done or tile.name not in records]
     if missing:
         raise RunError(f"tiles {', '.join(missing)} are missing in {job.store.folder}: run the same command again")
     if searched:

@@ -25,7 +25,7 @@ from sat_intervals.normalization import Scales
 from sat_intervals.patch import match_patch
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files, read_window
 from sat_intervals.store import LAYOUT, Store, differences
-from sat_intervals.tiling import Grid, Window
+from sat_intervals.tiling import Grid, Tile, Window
 
 # Sections of the settings that no tile knows of.
 _AFTER_THE_TILES = {"median", "regularization", "products", "cluster"}
@@ -94,10 +94,10 @@ class Job:
             for read in reads
         )
 
-    @property
-    def waiting(self) -> int:
-        """Number of tiles that are not done."""
-        return len(self.store.grid) - len(self.store.done())
+    def waiting(self) -> list[Tile]:
+        """The tiles that are not done."""
+        done = self.store.done()
+        return [tile for tile in self.store.grid if tile.name not in done]
 
 
 def prepare(
@@ -113,7 +113,7 @@ def prepare(
     config, out = fitted_to_jobs(load_config(config)), Path(out)
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
-    _check_memory(config, region)
+    check_memory(config, region)
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
     home, elsewhere = out / "tiles", config.cluster.store
@@ -205,7 +205,7 @@ def checked_region(left: Image, window: Window | None) -> Window:
     return window
 
 
-def _check_memory(config: Config, region: Window) -> None:
+def check_memory(config: Config, region: Window) -> None:
     """Refuse tiles that this machine cannot hold; what jobs and the workers of a scheduler have is theirs to know."""
     if config.cluster.kind not in ("threads", "processes"):
         return

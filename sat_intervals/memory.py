@@ -23,7 +23,7 @@ def parse_bytes(text: str) -> int:
     ConfigError
         For what is none.
     """
-    found = re.fullmatch(r"\s*([0-9.]+(?:e[0-9]+)?)\s*([KMGT]?I?)B?\s*", text.upper().replace("E", "e"))
+    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]*)?(?:e[0-9]{1,2})?)\s*([KMGT]?I?)B?\s*", text.upper().replace("E", "e"))
     if not found or found[2] not in _UNITS:
         raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
     return int(float(found[1]) * _UNITS[found[2]])

@@ -7,7 +7,8 @@ from typing import Any
 
 from sat_intervals.cluster import tiles_at_once
 from sat_intervals.config import Cluster, Config, load_config
-from sat_intervals.job import checked_pair, checked_region
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.job import check_memory, checked_pair, checked_region
 from sat_intervals.memory import PROCESS_BYTES, fitted, fitted_to_jobs, tile_bytes
 from sat_intervals.raster import Image
 from sat_intervals.run import match_pair
@@ -85,6 +86,7 @@ def plan(
     left, right = checked_pair(left, right, config)
     workers = workers or tiles_at_once(config.cluster)
     region = checked_region(left, window)
+    check_memory(config, region)
     grid = Grid(region, config.tiles.size)
     work = _work(grid, region, config)
     pixels = region.height * region.width
@@ -114,14 +116,28 @@ def _work(grid: Grid, region: Window, config: Config) -> int:
 
 def _expected_seconds(left: Image, right: Image, config: Config, workers: int, work: int, region: Window) -> float:
     """Seconds of a run: those of a sample, tiles scaled by their work, the rest by pixels."""
-    height, width = min(SAMPLE, region.height), min(SAMPLE, region.width)
-    row, column = region.row + (region.height - height) // 2, region.column + (region.width - width) // 2
-    sample = Window(row, column, height, width)
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # nor in the store of the run itself
     with tempfile.TemporaryDirectory() as folder:
-        seconds = match_pair(left, right, Path(folder) / "sample", one, window=sample)["seconds"]
+        sample, seconds = _sampled(left, right, Path(folder) / "sample", one, region)
     sampled = _work(Grid(sample, config.tiles.size), region, config)
-    tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / sampled / workers
-    files = (seconds["bands"] + seconds["files"]) * (region.height * region.width) / (height * width)
+    tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / sampled
+    tiles /= min(workers, len(Grid(region, config.tiles.size)))
+    files = (seconds["bands"] + seconds["files"]) * (region.height * region.width) / (sample.height * sample.width)
     images = seconds["tiles.images"]  # whole already, whatever the sample
     return float(seconds["start"] + seconds["kernels"] + images + tiles + files)
+
+
+def _sampled(left: Image, right: Image, out: Path, config: Config, region: Window) -> tuple[Window, dict[str, float]]:
+    """The window at the centre, or another where nothing can be matched there, and the seconds that it took."""
+    height, width = min(SAMPLE, region.height), min(SAMPLE, region.width)
+    for share in (0.5, 0.25, 0.75, 0.0, 1.0):
+        row = region.row + round(share * (region.height - height))
+        column = region.column + round(share * (region.width - width))
+        sample = Window(row, column, height, width)
+        try:
+            return sample, match_pair(left, right, out, config, window=sample, overwrite=True)["seconds"]
+        except RunError:
+            raise
+        except SatIntervalsError as error:
+            last = error
+    raise last

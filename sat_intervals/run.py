@@ -18,7 +18,7 @@ from sat_intervals.job import Job, compile_kernels, prepare
 from sat_intervals.normalization import Moments, Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
 from sat_intervals.tile import match_tile, measure_block, timed
-from sat_intervals.tiling import Tile, Window
+from sat_intervals.tiling import Window
 
 # Errors of a disk, or of a user's share of it.
 _FULL = errno.ENOSPC, errno.EDQUOT
@@ -76,11 +76,10 @@ def match_pair(
             compile_kernels(job.config)
             progress("kernels", 1, 1)
         with timed(seconds, "tiles"):
-            if job.waiting:
+            if job.waiting():
                 with connected(job.config.cluster, job.out) as client:
                     with timed(seconds, "tiles.images"):
                         measure_images(client, job, progress)
-                    progress("tiles", len(job.store.grid) - job.waiting, len(job.store.grid))
                     for _, failures in matched(client, [job], progress):
                         check_failures(job, failures)
         report = conclude(job, seconds, progress)
@@ -154,7 +153,8 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
     Tiles of several jobs are in flight at once, two a core and no more, so that the scheduler's memory does not grow
     with the number of tiles. Workers write what they make to the store; only their word comes back.
     """
-    left = [job.waiting for job in jobs]
+    waiting = [job.waiting() for job in jobs]
+    left = [len(tiles) for tiles in waiting]
     failures: list[dict[str, BaseException]] = [{} for _ in jobs]
     total = sum(len(job.store.grid) for job in jobs)
     done = total - sum(left)
@@ -162,8 +162,9 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
     tasks = (
         Task((i, tile), match_tile, (job, tile), job.config.cluster.retries)
         for i, job in enumerate(jobs)
-        for tile in _waiting(job)
+        for tile in waiting[i]
     )
+    progress("tiles", done, total)
     for landed in Flight(client, tasks):
         if landed is None:
             progress("tiles", done, total)
@@ -182,8 +183,3 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
         progress("tiles", done, total)
         if left[i] == 0:
             yield jobs[i], failures[i]
-
-
-def _waiting(job: Job) -> Iterator[Tile]:
-    done = job.store.done()
-    return (tile for tile in job.store.grid if tile.name not in done)

@@ -39,7 +39,7 @@ SIDES = ("top", "bottom", "left", "right")
 SEAM_PRODUCTS = ("winner", "lower", "upper")
 
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
-LAYOUT = 2
+LAYOUT = 3
 
 _MANIFEST, _ARRAYS, _RECORDS, _FAILURES = "manifest.json", "arrays.zarr", "records", "failures"
 _NORMALIZATION = "normalization.json"
@@ -187,11 +187,22 @@ class Store:
         _create(group, "histogram", (*tiles, counts), None, (1, 1, counts), np.uint32)
 
     def _array(self, name: str, mode: Literal["r", "r+"] = "r") -> zarr.Array[Any]:
-        return zarr.open_array(self.folder.place(f"{_ARRAYS}/{name}"), mode=mode, zarr_format=3)
+        # Blocks that hold nothing but fill values are written too: files that are missing tell of tiles that are.
+        array = zarr.open_array(self.folder.place(f"{_ARRAYS}/{name}"), mode=mode, zarr_format=3)
+        return array.with_config({"write_empty_chunks": True})
 
     def done(self) -> set[str]:
-        """Names of the tiles that are complete."""
-        return self.folder.names(_RECORDS)
+        """Names of the tiles that are complete: their record is there, and all that was written before it still is."""
+        records, there = self.folder.names(_RECORDS), self.folder.files(_ARRAYS)
+        return {tile.name for tile in self.grid if tile.name in records and self._shards(tile) <= there}
+
+    def _shards(self, tile: Tile) -> set[str]:
+        """The files that hold what a tile leaves behind."""
+        place = f"{tile.grid_row}/{tile.grid_column}"
+        return {
+            *(f"{dtype}/c/0/{place}" for dtype in _PLANES),
+            f"{_RIGHT}/c/{place}", f"seams/c/{place}/0/0/0/0", f"histogram/c/{place}/0",
+        }  # fmt: skip
 
     def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
         """Write what a tile leaves behind.
@@ -211,9 +222,10 @@ class Store:
         for dtype, planes in _PLANES.items():
             made = np.stack([arrays[name].view(dtype) for name in planes])
             self._array(dtype, "r+")[:, rows, column * size : column * size + width] = made
+        rank = np.full((height, self._reach), _UNSEEN)
         if "right_cost" in arrays:
-            rank = _rank(arrays["right_cost"], arrays["right_winner"])
-            self._array(_RIGHT, "r+")[rows, column * self._reach : column * self._reach + rank.shape[1]] = rank
+            rank[:, : arrays["right_cost"].shape[1]] = _rank(arrays["right_cost"], arrays["right_winner"])
+        self._array(_RIGHT, "r+")[rows, column * self._reach : (column + 1) * self._reach] = rank
         for name in ("seams", "histogram"):
             self._array(name, "r+")[row, column] = arrays[name]
 
@@ -249,9 +261,15 @@ class Store:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
 
     def records(self) -> dict[str, dict[str, Any]]:
-        """The records of the tiles that are done, by name."""
-        texts = self.folder.read_all(_RECORDS)
-        return {tile.name: json.loads(texts[tile.name]) for tile in self.grid if tile.name in texts}
+        """The records of the tiles that are done, by name; those that a power loss left unreadable are deleted."""
+        texts, found = self.folder.read_all(_RECORDS), {}
+        for tile in self.grid:
+            try:
+                if tile.name in texts:
+                    found[tile.name] = dict(json.loads(texts[tile.name]))
+            except (ValueError, TypeError):
+                self.folder.delete(f"{_RECORDS}/{tile.name}.json")
+        return found
 
     def histogram(self) -> np.ndarray:
         """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``."""
@@ -274,10 +292,17 @@ class Store:
         for first in range(0, self.grid.region.height, step):
             last = min(first + step, self.grid.region.height)
             strip: dict[str, np.ndarray] = {}
-            for dtype, planes in _PLANES.items():
-                read = np.asarray(arrays[dtype][:, first:last, : self.grid.region.width])
-                strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
-            yield strip | {"right_winner": self._merged(np.asarray(right[first:last]))}
+            try:
+                for dtype, planes in _PLANES.items():
+                    read = np.asarray(arrays[dtype][:, first:last, : self.grid.region.width])
+                    strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
+                strip["right_winner"] = self._merged(np.asarray(right[first:last]))
+            except (ValueError, RuntimeError) as error:  # of zarr and its codecs
+                raise StoreError(
+                    f"tiles of rows {first} to {last - 1} in {self.folder} cannot be read: "
+                    f"{' '.join(str(error).split())}: --overwrite starts afresh"
+                ) from error
+            yield strip
 
     def _merged(self, ranks: np.ndarray) -> np.ndarray:
         """One right view ``(rows, width + count - 1)`` from the shares of all cores of the rows."""
@@ -290,8 +315,15 @@ class Store:
 
     def remove(self) -> None:
         """Delete the tiles, and nothing else that may be in their folder."""
-        _drop(self.folder)
-        folder_at(self.home).delete(_PLACE)
+        remove_tiles(self.home)
+
+
+def remove_tiles(home: Path) -> None:
+    """Delete the tiles of the run to whose folder ``home`` belongs, wherever they lie."""
+    here = folder_at(home)
+    place = here.read(_PLACE)
+    _drop(folder_at(json.loads(place)) if place else here)
+    here.delete(_PLACE)
 
 
 @dataclass(frozen=True)
@@ -334,7 +366,10 @@ def read_status(home: Path) -> Status:
     if text is None:
         raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")
     manifest = _parsed(text, folder)
-    grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
+    try:
+        grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
+    except (LookupError, TypeError) as error:
+        raise StoreError(f"{folder}/{_MANIFEST} is no manifest of a run: --overwrite starts afresh") from error
     store = Store(home, grid, 1, 0, str(folder) if place else None)
     return Status(len(grid), len(store.done()), store.failures(), here.is_locked() or folder.is_locked())
 
@@ -342,7 +377,7 @@ def read_status(home: Path) -> Status:
 def _parsed(manifest: str, folder: Folder) -> dict[str, Any]:
     try:
         return dict(json.loads(manifest))
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         raise StoreError(f"{folder}/{_MANIFEST} cannot be read, {error}: --overwrite starts afresh") from error
 
 
@@ -364,7 +399,7 @@ def _create(
 ) -> None:
     group.create_array(
         name, shape=shape, shards=shard, chunks=chunk, dtype=dtype, compressors=_COMPRESSOR, fill_value=fill
-    )
+    )  # fmt: skip
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.splat import (
+    BOUNDED,
     CONFIDENCE,
     COUNT,
     HEIGHT,
@@ -348,9 +349,11 @@ class _One(NamedTuple):
 
 def _of_one(gathered: np.ndarray, interval: str) -> _One:
     weight = np.where(gathered[COUNT] > 0, gathered[WEIGHT], np.nan)
-    bounded = gathered[LEAST] <= gathered[MOST]
-    bounds = (gathered[LOWER] / weight, gathered[UPPER] / weight) if interval == "mean" else gathered[[LEAST, MOST]]
-    lower, upper = (np.where(bounded, bound, np.nan) for bound in bounds)
+    bounded = np.where(gathered[BOUNDED] > 0, gathered[BOUNDED], np.nan)
+    if interval == "mean":
+        lower, upper = gathered[LOWER] / bounded, gathered[UPPER] / bounded
+    else:
+        lower, upper = (np.where(np.isnan(bounded), np.nan, gathered[index]) for index in (LEAST, MOST))
     height, confidence = gathered[HEIGHT] / weight, gathered[CONFIDENCE] / weight
     return _One(weight, height, lower, upper, confidence, gathered[COUNT])
 

@@ -2,8 +2,10 @@
 
 import json
 import shutil
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +16,17 @@ from click.testing import CliRunner
 
 from sat_intervals.batch import match_batch, read_batch
 from sat_intervals.cli import main
-from sat_intervals.config import ConfigError, load_config
+from sat_intervals.cluster import connected
+from sat_intervals.config import Cluster, ConfigError, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.folders import LocalFolder
+from sat_intervals.job import prepare
 from sat_intervals.memory import fitted, parse_bytes, tile_bytes
 from sat_intervals.plan import plan
 from sat_intervals.raster import north_up, write_layer
-from sat_intervals.run import match_pair
+from sat_intervals.run import match_pair, matched
 from sat_intervals.scene import make_scene
+from sat_intervals.tile import match_tile
 
 
 @pytest.fixture(scope="module")
@@ -130,21 +135,119 @@ def test_match_batch__refuses_a_folder_where_another_batch_is_at_work(images, tm
         match_batch(read_batch(rows(images)), tmp_path)
 
 
-def test_locked__lets_one_in_at_a_time(tmp_path):
-    folder, inside, most = LocalFolder(tmp_path / "new"), [], []
+COME_AND_GO = """
+import os, sys, time
+from contextlib import suppress
+from pathlib import Path
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.folders import LocalFolder
+from sat_intervals.job import prepare
 
-    def come_and_go(_):
-        for _ in range(100):
-            with suppress(SatIntervalsError), folder.locked():
-                inside.append(None)
-                most.append(len(inside))
-                inside.pop()
+folder, inside, end = LocalFolder(Path(sys.argv[1])), sys.argv[1] + ".inside", time.monotonic() + 3
+count = 0
+while time.monotonic() < end:
+    with suppress(SatIntervalsError), folder.locked():
+        os.close(os.open(inside, os.O_CREAT | os.O_EXCL))  # fails where another is inside
+        time.sleep(0.0005)
+        os.unlink(inside)
+        count += 1
+print(count)
+"""
 
-    with ThreadPoolExecutor(8) as threads:
-        list(threads.map(come_and_go, range(8)))
-    assert len(most) >= 8
-    assert max(most) == 1
-    assert not folder.path.exists()
+
+def test_locked__lets_one_process_in_at_a_time(tmp_path):
+    command = [sys.executable, "-c", COME_AND_GO, str(tmp_path / "new")]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    counts = [int(process.communicate()[0]) for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4
+    assert sum(counts) > 50
+    assert not (tmp_path / "new").exists()
+
+
+def test_locked__is_not_refused_for_one_who_looks(tmp_path):
+    folder, end = LocalFolder(tmp_path), time.monotonic() + 1.0
+
+    def look():
+        while time.monotonic() < end:
+            folder.is_locked()
+
+    with ThreadPoolExecutor(1) as thread:
+        looking = thread.submit(look)
+        while not looking.done():
+            with folder.locked():
+                assert folder.is_locked()
+
+
+def test_locked__ends_where_no_folder_can_be_made():
+    with (
+        pytest.raises(SatIntervalsError, match=r"/proc/nothing cannot be written"),
+        LocalFolder(Path("/proc/nothing")).locked(),
+    ):
+        pass
+
+
+def test_match_batch__holds_the_stores_of_its_pairs(images, tmp_path):
+    config = {"cluster": {"store": str(tmp_path / "store")}}
+    with LocalFolder(tmp_path / "store" / "pair1").locked():
+        report = match_batch(read_batch(rows(images)), tmp_path / "out", config)
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
+    assert "another run is at work in" in report["pair1"]["error"]
+    with pytest.raises(SatIntervalsError, match="where tiles lie by default: leave it out"):
+        match_batch(read_batch(rows(images)), tmp_path / "store", config)
+
+
+@pytest.mark.parametrize("damage", ["manifest", "record", "shard"])
+def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, tmp_path, damage):
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path, keep_tiles=True)
+    tiles = tmp_path / "pair1" / "tiles"
+    for name in ("pair1", "pair2"):
+        (tmp_path / name / "run.json").unlink()
+    if damage == "manifest":
+        (tiles / "manifest.json").write_text("5")
+    elif damage == "record":
+        (tiles / "records" / "0_0.json").write_text("")
+    else:
+        shard = tiles / "arrays.zarr" / "int16" / "c" / "0" / "0" / "0"
+        shard.write_bytes(shard.read_bytes()[:-100])
+    report = match_batch(pairs, tmp_path, keep_tiles=True)
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
+    assert "should not happen" not in report["pair1"]["error"]
+    assert str(tmp_path / "pair1") in report["pair1"]["error"]
+
+
+def test_match_batch__removes_tiles_that_a_death_left_beside_a_result(images, tmp_path):
+    pairs = read_batch(rows(images))
+    first = match_batch(pairs, tmp_path, keep_tiles=True)
+    again = match_batch(pairs, tmp_path)
+    assert not list(tmp_path.glob("*/tiles"))
+    assert {name: end["counts"] for name, end in again.items()} == {name: end["counts"] for name, end in first.items()}
+
+
+def test_status__of_a_batch_goes_on_after_a_pair_without_a_run(images, tmp_path):
+    match_batch(read_batch(rows(images)), tmp_path)
+    shutil.rmtree(tmp_path / "pair1")
+    result = CliRunner().invoke(main, ["status", str(tmp_path)])
+    assert result.stdout == f"{tmp_path / 'pair1'}: done\n{tmp_path / 'pair2'}: complete\n"
+
+
+def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(images, tmp_path):
+    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
+    jobs = [prepare(images / f"left{n}.tif", images / f"right{n}.tif", tmp_path / f"out{n}", settings) for n in (1, 2)]
+    for job in jobs:
+        job.begin()
+    ended = []
+
+    def progress(stage, done, total):
+        if done == 3:  # as one that outlived the run before
+            for tile in jobs[1].waiting()[-4:]:
+                match_tile(jobs[1], tile)
+
+    with connected(Cluster(workers=1), tmp_path) as client:
+        for job, failures in matched(client, jobs, progress):
+            assert not failures
+            ended.append(job)
+    assert ended == jobs
 
 
 @pytest.mark.parametrize(
@@ -158,6 +261,12 @@ def test_locked__lets_one_in_at_a_time(tmp_path):
         ("a.csv", "name,left,right,sgm.p2\nx,l,r,[3\n", r"row 1: sgm.p2 is '\[3': while parsing"),
         ("a.csv", "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n", "row 1: sgm.p2 is '3': the row gives sgm as a whole"),
         ("a.csv", "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n", "row 1: sgm is 'null': the row gives parts of sgm"),
+        ("a.csv", "name,left,right,sgm.p2,sgm.p2\nx,l,r,1,2\n", "column sgm.p2 is there twice"),
+        ("a.csv", "name,left,right,cluster.kind\nx,l,r,slurm\n", "row 1: cluster is one for all pairs"),
+        ("a.csv", 'name,left,right\n"x\ny",l,r\n', r"row 1: name 'x\\ny' cannot be"),
+        ("a.yaml", "- {name: x, left: l, left: m, right: r}", "key 'left' appears twice"),
+        ("a.yaml", "- {name: 2024-13-45, left: l, right: r}", "cannot be read"),
+        ("a.yaml", "[" * 3000, "cannot be read"),
         ("a.yaml", "just: text\n", "holds no pairs"),
         ("a.yaml", "- [", "cannot be read"),
         ("a.json", "[]", "holds no pairs"),
@@ -203,7 +312,7 @@ def test_parse_bytes__reads_figures_with_units(text, count):
     assert parse_bytes(text) == count
 
 
-@pytest.mark.parametrize("text", ["much", "4 bananas", "", "GB"])
+@pytest.mark.parametrize("text", ["much", "4 bananas", "", "GB", "1.2.3GB", "1e400"])
 def test_parse_bytes__refuses_what_is_none(text):
     with pytest.raises(ConfigError, match="such as 4GB"):
         parse_bytes(text)
@@ -250,6 +359,21 @@ def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(
     assert "24 tiles at once" in result.stdout
     assert "with 3 tiles at once" in result.stdout
     assert "1 of 512 px" in result.stdout
+
+
+def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_what_match_does(images, tmp_path):
+    scene = make_scene(700, 700, seed=1)
+    for side in ("left", "right"):
+        image = getattr(scene, side).copy()
+        image[90:610, 90:610] = 0
+        write_layer(tmp_path / f"{side}.tif", image, 0, north_up(32631, 0, 0, 0.5))
+    config = {"disparity": {"minimum": -18, "maximum": 40}}
+    assert plan(tmp_path / "left.tif", tmp_path / "right.tif", config, workers=1).seconds > 0
+    huge = {"disparity": {"minimum": -6000, "maximum": 6000}, "tiles": {"size": 4096}}
+    wide = np.ones((4096, 13000), np.uint8)
+    write_layer(tmp_path / "wide.tif", wide, 0, north_up(32631, 0, 0, 0.5))
+    with pytest.raises(SatIntervalsError, match="GB, the machine has"):
+        plan(tmp_path / "wide.tif", tmp_path / "wide.tif", huge)
 
 
 def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):

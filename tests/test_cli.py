@@ -421,20 +421,6 @@ def disk(tmp_path):
         subprocess.run(["umount", place], check=True)
 
 
-def test_match__on_a_disk_that_tiles_fill_fails_and_goes_on_once_there_is_room(folder, tmp_path, done, disk):
-    """The bands take 936 kB before compression, and have room to begin with; the tiles take more."""
-    out = disk(960) / "out"
-    arguments = matching(folder, out, "--tile-size", 64, "--overlap", 20, "--quiet")
-    full = command(*arguments)
-    assert (full.returncode, full.stdout) == (1, "")
-    assert re.fullmatch(r"sat-intervals: .*: No space left on device: make room and run .* again, .*\n", full.stderr)
-    assert_nothing_final(out)
-    disk(20_000)
-    again = command(*arguments)
-    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
-    assert bytes_of(out) == bytes_of(done[0])
-
-
 def test_match__on_a_disk_that_the_files_fill_fails_and_goes_on_once_there_is_room(folder, tmp_path, done, disk):
     out = disk(20_000) / "out"
     arguments = matching(folder, out, "--tile-size", 64, "--overlap", 20, "--quiet", "--keep-tiles")

@@ -180,6 +180,21 @@ def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_p
     assert not (tmp_path / "tiles" / "arrays.zarr").exists()
 
 
+@pytest.mark.parametrize("array", ["int16/c/0", "uint32/c/0", "right/c", "seams/c", "histogram/c"])
+def test_match_pair__matches_a_tile_again_of_which_a_part_is_gone(pair, tmp_path, array):
+    left, right, settings = pair
+    once = match_pair(left, right, tmp_path, in_tiles(settings, 128), keep_tiles=True)
+    expected = [(tmp_path / name).read_bytes() for name in ("intervals.tif", "validity.tif")]
+    (tmp_path / "run.json").unlink()
+    gone = tmp_path / "tiles" / "arrays.zarr" / array / "0" / "1"
+    shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
+    kept = (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns
+    again = match_pair(left, right, tmp_path, in_tiles(settings, 128), keep_tiles=True)
+    assert [(tmp_path / name).read_bytes() for name in ("intervals.tif", "validity.tif")] == expected
+    assert again["overlap_left"] == once["overlap_left"]
+    assert (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns == kept
+
+
 @pytest.mark.parametrize("store", ["elsewhere", "memory://tiles"])
 def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path, store):
     left, right, settings = pair

@@ -85,6 +85,7 @@ def test_splat__equals_its_slow_twin(data):
             assert cells[5, i, j] == min(lower[bounded], default=np.inf)
             assert cells[6, i, j] == max(upper[bounded], default=-np.inf)
             assert cells[7, i, j] == near.sum()
+            assert_allclose(cells[8, i, j], weight[~unbounded[near]].sum(), atol=1e-9)
 
 
 def test_make_surface__worked_example(tmp_path):
@@ -179,6 +180,15 @@ def test_make_surface__of_a_run_without_intervals_has_heights_alone(tmp_path, in
     assert_allclose(surface[:4, i, j], [10.5, 10, 13, 2])
     assert np.isnan(surface[1:3, i, j + 4]).all()
     assert np.isnan(surface[BAND["agreement"]]).all()
+
+
+@pytest.mark.parametrize("interval", ["envelope", "mean"])
+def test_make_surface__a_point_without_bounds_counts_for_the_height_alone(tmp_path, interval):
+    lower = np.array([[1.0, np.nan]])
+    out = write_points(tmp_path / "a", [0.5, 0.5], [-0.5, -0.5], [10.0, 10.0], lower=lower, upper=2 * lower)
+    surface, place, _ = surface_of([out], tmp_path, radius=0.6, interval=interval)
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(surface[:4, i, j], [10, 9, 12, 2])
 
 
 def test_make_surface__a_wide_radius_leaves_no_cell_without_height(tmp_path):

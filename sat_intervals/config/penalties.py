@@ -1,13 +1,12 @@
 """Sections of semi-global matching, one for each way in which its penalties may follow the images."""
 
-from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sat_intervals.config.sections import Exact, Section, as_written
+from sat_intervals.config.sections import Exact, Section
 
 
 class _Penalties(Section):
@@ -83,19 +82,17 @@ class MccnnSgm(_Penalties):
     )
     span: Exact = Field(Decimal(16), gt=0, description="cost that etas and alpha are shares of, after SGM")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _check_span(cls, values: Any) -> Any:
+    @model_validator(mode="after")
+    def _check_span(self) -> Self:
         """The default span was chosen for the default penalties: bounds by another pair of them are not those meant."""
-        if isinstance(values, Mapping) and "span" not in values:
-            fields = {key: cls.model_fields[key].default for key in values if key in cls.model_fields}
-            changed = [key for key, default in fields.items() if default not in (values[key], as_written(values[key]))]
-            if changed:
-                raise ValueError(
-                    f"span is missing: the default, {cls.model_fields['span'].default}, was chosen for the default "
-                    f"penalties, not for another {' and '.join(changed)}: give one (config --preset mccnn shows some)"
-                )
-        return values
+        defaults = {key: field.default for key, field in type(self).model_fields.items()}
+        changed = [key for key in defaults if getattr(self, key) != defaults[key]]
+        if changed and "span" not in self.model_fields_set:
+            raise ValueError(
+                f"span is missing: the default, {self.span}, was chosen for the default penalties, not for another "
+                f"{' and '.join(changed)}: give one (config --preset mccnn shows some)"
+            )
+        return self
 
     @property
     def largest_p2(self) -> Fraction:

@@ -112,9 +112,20 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return node
 
 
+def load_yaml(text: str | bytes) -> Any:
+    """What a text of YAML holds; a key given twice is an error.
+
+    Raises
+    ------
+    yaml.YAMLError, ValueError, RecursionError
+        For what is none.
+    """
+    return yaml.load(text, _UniqueKeyLoader)  # a SafeLoader
+
+
 def _read_yaml(file: Path) -> Mapping[str, Any]:
     try:
-        values = yaml.load(file.read_bytes(), _UniqueKeyLoader)  # a SafeLoader
+        values = load_yaml(file.read_bytes())
     except OSError as error:
         preset = (
             isinstance(error, FileNotFoundError) and file.name == f"{file.stem}.yaml" and file.stem in preset_names()
@@ -124,7 +135,7 @@ def _read_yaml(file: Path) -> Mapping[str, Any]:
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(f"{file}: {line}{error.problem}") from error
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{file}: {' '.join(str(error).split())}") from error
     if values is None:
         return {}

@@ -45,6 +45,8 @@ def _sections(field: FieldInfo) -> list[type[Section]]:
 def explained(problem: ErrorDetails) -> str:
     """One problem of settings: the key, its value, what is allowed."""
     path = [str(key) for key in problem["loc"]]
+    while len(path) > 1 and path[-1].isdecimal():
+        path.pop()  # a place in a list
     owner: type[Section] = Config
     if path and path[0] in Config.model_fields:
         field = Config.model_fields[path[0]]

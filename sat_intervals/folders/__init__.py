@@ -23,6 +23,9 @@ class Folder(Protocol):
     def names(self, folder: str) -> set[str]:
         """Names, without ending, of the JSON files in a folder."""
 
+    def files(self, folder: str) -> set[str]:
+        """Names of all files in a folder and in those below it, relative to it."""
+
     def write(self, name: str, text: str) -> None:
         """Write a file that is either there as a whole or not at all."""
 

@@ -3,6 +3,7 @@
 import fcntl
 import os
 import shutil
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -13,6 +14,8 @@ from typing import TextIO
 from sat_intervals.errors import SatIntervalsError
 
 _LOCK = ".lock"
+# Seconds for which a lock is tried.
+_PATIENCE = 0.2
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,11 @@ class LocalFolder:
     def _files(self, folder: str) -> Iterator[Path]:
         return (self.path / folder).glob("[!.]*.json")
 
+    def files(self, folder: str) -> set[str]:
+        """See `Folder`."""
+        root = self.path / folder
+        return {os.path.relpath(Path(place, name), root) for place, _, names in os.walk(root) for name in names}
+
     def write(self, name: str, text: str) -> None:
         """See `Folder`."""
         file = self.path / name
@@ -50,6 +58,8 @@ class LocalFolder:
         try:
             temporary.write_text(text)
             os.replace(temporary, file)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(file)) from error
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -87,13 +97,15 @@ class LocalFolder:
     def _lock(self) -> TextIO:
         """The lock's file, open and locked, under its name."""
         file = self.path / _LOCK
+        end = time.monotonic() + _PATIENCE
         while True:
+            is_late = time.monotonic() > end
             try:
                 self.path.mkdir(parents=True, exist_ok=True)
                 lock = file.open("w")
-            except FileNotFoundError:
-                continue  # removed by the one who left
             except OSError as error:
+                if isinstance(error, (FileNotFoundError, FileExistsError)) and not is_late:
+                    continue  # removed by the one who left
                 raise SatIntervalsError(f"{self} cannot be written: {error.strerror}: choose another folder") from error
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -102,10 +114,12 @@ class LocalFolder:
             except FileNotFoundError:
                 pass
             except BlockingIOError as error:
-                lock.close()
-                raise SatIntervalsError(
-                    f"another run is at work in {self}: wait for its end or choose another folder"
-                ) from error
+                if is_late:  # else it may be held by one who only looks whether it is
+                    lock.close()
+                    raise SatIntervalsError(
+                        f"another run is at work in {self}: wait for its end or choose another folder"
+                    ) from error
+                time.sleep(_PATIENCE / 20)
             except OSError as error:
                 lock.close()
                 raise SatIntervalsError(

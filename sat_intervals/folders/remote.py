@@ -63,6 +63,13 @@ class RemoteFolder:
             return [file for file in system.ls(path, detail=False) if file.endswith(".json")]
         return []
 
+    def files(self, folder: str) -> set[str]:
+        """See `Folder`."""
+        with suppress(FileNotFoundError), self._reached(folder) as (system, path):
+            system.invalidate_cache(path)
+            return {str(PurePosixPath(file).relative_to(path)) for file in system.find(path)}
+        return set()
+
     def write(self, name: str, text: str) -> None:
         """See `Folder`."""
         with self._reached(name) as (system, path):

@@ -7,12 +7,12 @@ import numpy as np
 from numba import njit
 
 # What is gathered of a cell.
-WEIGHT, HEIGHT, CONFIDENCE, LOWER, UPPER, LEAST, MOST, COUNT = range(8)
+WEIGHT, HEIGHT, CONFIDENCE, LOWER, UPPER, LEAST, MOST, COUNT, BOUNDED = range(9)
 
 
 def empty_cells(rows: int, columns: int) -> np.ndarray:
-    """Cells that no point has reached: ``(8, rows, columns)`` float64, see `splat`."""
-    cells = np.zeros((8, rows, columns))
+    """Cells that no point has reached: ``(9, rows, columns)`` float64, see `splat`."""
+    cells = np.zeros((9, rows, columns))
     cells[LEAST], cells[MOST] = np.inf, -np.inf
     return cells
 
@@ -32,8 +32,9 @@ def splat(column, row, height, lower, upper, confidence, radius, cells):
     radius
         In cells.
     cells
-        ``(8, rows, columns)`` float64, updated: sums of weights and of weighted height, confidence, lower and upper
-        bound, the least lower bound, the largest upper bound, the number of points.
+        ``(9, rows, columns)`` float64, updated: sums of weights and of weighted height, confidence, lower and upper
+        bound, the least lower bound, the largest upper bound, the number of points, the sum of weights of those with
+        bounds.
     """
     rows, columns = cells.shape[1:]
     for n in range(height.size):
@@ -53,6 +54,7 @@ def splat(column, row, height, lower, upper, confidence, radius, cells):
                 cells[COUNT, i, j] += 1
                 if np.isnan(lower[n]) or np.isnan(upper[n]):
                     continue
+                cells[BOUNDED, i, j] += weight
                 cells[LOWER, i, j] += weight * lower[n]
                 cells[UPPER, i, j] += weight * upper[n]
                 cells[LEAST, i, j] = min(cells[LEAST, i, j], lower[n])
