@@ -107,6 +107,53 @@ def test_triangulate__heights_of_an_exact_scene_come_back(tmp_path):
     assert np.isnan(points[:, ~known]).all()
 
 
+def dimap(path, geotiff, view):
+    """Write the model of a view as DIMAP 2, which counts pixels from 1 and has the way down to the ground as well."""
+    with rasterio.open(geotiff) as dataset:
+        rpc = dataset.rpcs
+    across, up, down = rpc.samp_num_coeff[1], rpc.samp_num_coeff[3], rpc.line_num_coeff[2]
+    one = np.eye(20)[0]
+    samp, line = np.zeros(20), np.zeros(20)
+    samp[1], samp[3], line[2] = 1 / across, -up / across, 1 / down
+    ways = {
+        "Direct_Model": {"SAMP_NUM": samp, "SAMP_DEN": one, "LINE_NUM": line, "LINE_DEN": one},
+        "Inverse_Model": {
+            "SAMP_NUM": rpc.samp_num_coeff, "SAMP_DEN": one, "LINE_NUM": rpc.line_num_coeff, "LINE_DEN": one
+        },
+    }  # fmt: skip
+    scales = {
+        "LINE_OFF": rpc.line_off + 1, "SAMP_OFF": rpc.samp_off + 1, "LINE_SCALE": rpc.line_scale,
+        "SAMP_SCALE": rpc.samp_scale, "LAT_OFF": rpc.lat_off, "LAT_SCALE": rpc.lat_scale, "LONG_OFF": rpc.long_off,
+        "LONG_SCALE": rpc.long_scale, "HEIGHT_OFF": rpc.height_off, "HEIGHT_SCALE": rpc.height_scale,
+    }  # fmt: skip
+    parts = [
+        f"<{way}>" + "".join(
+            f"<{name}_COEFF_{index}>{float(value)!r}</{name}_COEFF_{index}>"
+            for name, values in polynomials.items() for index, value in enumerate(values, start=1)
+        ) + f"</{way}>"
+        for way, polynomials in ways.items()
+    ]  # fmt: skip
+    validity = "".join(f"<{name}>{float(value)!r}</{name}>" for name, value in scales.items())
+    path.write_text(
+        '<Dimap_Document><Metadata_Identification><METADATA_FORMAT version="2.0">DIMAP</METADATA_FORMAT>'
+        f"</Metadata_Identification><Rational_Function_Model><Global_RFM>{''.join(parts)}<RFM_Validity>{validity}"
+        "</RFM_Validity></Global_RFM></Rational_Function_Model></Dimap_Document>"
+    )
+    return path
+
+
+def test_triangulate__reads_models_of_dimap(tmp_path):
+    bands = np.full((4, 40, 50), 1.25, np.float32)
+    bands[1], bands[2] = -1.5, 4.0
+    out = write_run(tmp_path, bands, np.zeros((40, 50), np.uint16))
+    left, right, *grids = cameras(tmp_path, 40, 50)
+    triangulate(out, left, right, *grids)
+    expected = read(out / "points.tif")
+    triangulate(out, dimap(tmp_path / "left.XML", left, 0), dimap(tmp_path / "right.XML", right, 1), *grids)
+    np.testing.assert_allclose(read(out / "points.tif")[:5], expected[:5], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(read(out / "points.tif")[:2], expected[:2], rtol=0, atol=1e-8)
+
+
 def test_triangulate__orders_bounds_by_height(tmp_path):
     # The views change places: height falls as disparity grows.
     bands = np.full((4, 40, 50), 1.0, np.float32)
