@@ -22,6 +22,7 @@ FLOORS = [
     {"tile"},
     {"job"},
     {"evaluation", "triangulation", "surface", "surface_evaluation", "export"},
+    {"cloud", "fusion"},
     {"finish", "patch", "demo", "results"},
     {"similarity", "store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
     {"config", "features", "kernels", "normalization", "scene", "inputs", "figures", "kinds", "pairs", "tables"},

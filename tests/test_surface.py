@@ -155,7 +155,7 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     x, y = random.uniform(0, 40, (2, 12, 12))
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     whole, place, _ = surface_of([out], tmp_path)
-    monkeypatch.setattr("sat_intervals.surface._WINDOW", 7)
+    monkeypatch.setattr("sat_intervals.cloud.WINDOW", 7)
     monkeypatch.setattr("sat_intervals.surface._TILE_ROWS", 20)
     monkeypatch.setattr("sat_intervals.surface._TILE_COLUMNS", 25)
     tiled, same_place, _ = surface_of([out], tmp_path)

@@ -1,0 +1,64 @@
+"""The cells of several runs as one: intersection of their intervals where they meet, hull where they do not."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.kernels.splat import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LEAST, LOWER, MOST, UPPER, WEIGHT
+from sat_intervals.products import SURFACE
+
+
+class RunCells(NamedTuple):
+    """The cells of one run; NaN where no point reaches."""
+
+    weight: np.ndarray
+    height: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    confidence: np.ndarray
+    points: np.ndarray
+
+
+def cells_of_run(gathered: np.ndarray, interval: str) -> RunCells:
+    """Heights and bounds from what points gathered, see `kernels.splat`; ``interval`` as of `make_surface`."""
+    weight = np.where(gathered[COUNT] > 0, gathered[WEIGHT], np.nan)
+    bounded = np.where(gathered[BOUNDED] > 0, gathered[BOUNDED], np.nan)
+    if interval == "mean":
+        lower, upper = gathered[LOWER] / bounded, gathered[UPPER] / bounded
+    else:
+        lower, upper = (np.where(np.isnan(bounded), np.nan, gathered[index]) for index in (LEAST, MOST))
+    height, confidence = gathered[HEIGHT] / weight, gathered[CONFIDENCE] / weight
+    return RunCells(weight, height, lower, upper, confidence, gathered[COUNT])
+
+
+def fused(runs: Sequence[RunCells]) -> np.ndarray:
+    """The bands of SURFACE from those of each run: ``(6, rows, columns)`` float32."""
+    weights = np.stack([run.weight for run in runs])
+    weight = np.where(np.isfinite(weights).any(axis=0), np.nansum(weights, axis=0), np.nan)
+    height = np.nansum([run.weight * run.height for run in runs], axis=0) / weight
+    judged = np.nansum([np.where(np.isnan(run.confidence), np.nan, run.weight) for run in runs], axis=0)
+    confidence = np.nansum([run.weight * run.confidence for run in runs], axis=0)
+    confidence = np.divide(confidence, judged, out=np.full(judged.shape, np.nan), where=judged > 0)
+    lowers, uppers = (np.stack([getattr(run, name) for run in runs]) for name in ("lower", "upper"))
+    inner = np.fmax.reduce(lowers), np.fmin.reduce(uppers)
+    outer = np.fmin.reduce(lowers), np.fmax.reduce(uppers)
+    meeting = inner[0] <= inner[1]
+    lower, upper = (np.where(meeting, one, other) for one, other in zip(inner, outer, strict=True))
+    several = np.isfinite(lowers).sum(axis=0) > 1
+    bands = {
+        "height": np.fmin(np.fmax(height, lower), upper),
+        "height_lower": _outwards(lower, -np.inf),
+        "height_upper": _outwards(upper, np.inf),
+        "count": np.where(np.isfinite(weight), sum(run.points for run in runs), np.nan),
+        "confidence": confidence,
+        "agreement": np.where(several, meeting, np.nan),
+    }
+    return np.stack([bands[band.name] for band in SURFACE]).astype(np.float32)
+
+
+def _outwards(bound: np.ndarray, end: float) -> np.ndarray:
+    """The float32 next to a bound, on the side of ``end`` where it is not the bound itself."""
+    single = bound.astype(np.float32)
+    inside = single > bound if end < 0 else single < bound
+    return np.where(inside, np.nextafter(single, np.float32(end)), single)
