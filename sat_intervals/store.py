@@ -20,7 +20,7 @@ import numpy.typing as npt
 import zarr
 from zarr.codecs import BloscCodec
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.folders import Folder, folder_at
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tiling import Grid, Tile, Window
@@ -48,6 +48,8 @@ _PLACE = "store.json"
 
 # Rows of a shard that are compressed together, so that strips read no more than they need.
 _ROWS_TOGETHER = 128
+# What zarr and its codecs raise of files that were cut short or changed.
+_DAMAGED = ValueError, RuntimeError
 _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 
 
@@ -216,6 +218,13 @@ class Store:
             ``right_cost`` and ``right_winner``, which may be missing; ``seams`` (SIDES, own line or ring,
             SEAM_PRODUCTS, size); ``histogram``.
         """
+        try:
+            self._write(tile, arrays)
+        except _DAMAGED:  # zarr reads what is there before it writes over it
+            self._drop_tile(tile)
+            self._write(tile, arrays)
+
+    def _write(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
         size, row, column = self.grid.size, tile.grid_row, tile.grid_column
         height, width = arrays["winner"].shape
         rows = slice(row * size, row * size + height)
@@ -286,23 +295,42 @@ class Store:
 
         The shares of the right view are merged: smallest cost, the largest disparity at ties.
         """
-        arrays = {dtype: self._array(dtype) for dtype in _PLANES}
-        right = self._array(_RIGHT)
         step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
         for first in range(0, self.grid.region.height, step):
             last = min(first + step, self.grid.region.height)
-            strip: dict[str, np.ndarray] = {}
             try:
-                for dtype, planes in _PLANES.items():
-                    read = np.asarray(arrays[dtype][:, first:last, : self.grid.region.width])
-                    strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
-                strip["right_winner"] = self._merged(np.asarray(right[first:last]))
-            except (ValueError, RuntimeError) as error:  # of zarr and its codecs
-                raise StoreError(
-                    f"tiles of rows {first} to {last - 1} in {self.folder} cannot be read: "
-                    f"{' '.join(str(error).split())}: --overwrite starts afresh"
-                ) from error
-            yield strip
+                strip, right = self._read(slice(first, last), slice(None, self.grid.region.width), slice(None))
+            except _DAMAGED as error:
+                raise RunError(f"{self._dropped(first, last)}: {' '.join(str(error).split())}") from error
+            yield strip | {"right_winner": self._merged(right)}
+
+    def _read(self, rows: slice, columns: slice, right_columns: slice) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Raw products of some pixels by name, and ranks of right ones."""
+        strip: dict[str, np.ndarray] = {}
+        for dtype, planes in _PLANES.items():
+            read = np.asarray(self._array(dtype)[:, rows, columns])
+            strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
+        return strip, np.asarray(self._array(_RIGHT)[rows, right_columns])
+
+    def _dropped(self, first: int, last: int) -> str:
+        """Take tiles of some rows that cannot be read for not done, and say so."""
+        names = []
+        size = self.grid.size
+        for tile in self.grid:
+            row, column = tile.grid_row * size, tile.grid_column * size
+            share = slice(tile.grid_column * self._reach, (tile.grid_column + 1) * self._reach)
+            if row < last and first < row + size:
+                try:
+                    self._read(slice(row, row + tile.core.height), slice(column, column + tile.core.width), share)
+                except _DAMAGED:
+                    self._drop_tile(tile)
+                    names.append(tile.name)
+        return f"tiles {', '.join(names)} in {self.folder} cannot be read, the same command matches them again"
+
+    def _drop_tile(self, tile: Tile) -> None:
+        self.folder.delete(f"{_RECORDS}/{tile.name}.json")
+        for name in self._shards(tile):
+            self.folder.delete(f"{_ARRAYS}/{name}")
 
     def _merged(self, ranks: np.ndarray) -> np.ndarray:
         """One right view ``(rows, width + count - 1)`` from the shares of all cores of the rows."""

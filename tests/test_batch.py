@@ -199,8 +199,8 @@ def test_match_batch__holds_the_stores_of_its_pairs(images, tmp_path):
 @pytest.mark.parametrize("damage", ["manifest", "record", "shard"])
 def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, tmp_path, damage):
     pairs = read_batch(rows(images))
-    match_batch(pairs, tmp_path, keep_tiles=True)
-    tiles = tmp_path / "pair1" / "tiles"
+    match_batch(pairs, tmp_path, {"tiles": {"size": 64}}, keep_tiles=True)
+    tiles, before = tmp_path / "pair1" / "tiles", bytes_of(tmp_path / "pair1")
     for name in ("pair1", "pair2"):
         (tmp_path / name / "run.json").unlink()
     if damage == "manifest":
@@ -210,10 +210,16 @@ def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, t
     else:
         shard = tiles / "arrays.zarr" / "int16" / "c" / "0" / "0" / "0"
         shard.write_bytes(shard.read_bytes()[:-100])
-    report = match_batch(pairs, tmp_path, keep_tiles=True)
+    report = match_batch(pairs, tmp_path, {"tiles": {"size": 64}}, keep_tiles=True)
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
     assert "should not happen" not in report["pair1"]["error"]
     assert str(tmp_path / "pair1") in report["pair1"]["error"]
+    if damage != "manifest":  # one tile is matched again
+        kept = (tiles / "records" / "0_1.json").stat().st_mtime_ns
+        again = match_batch(pairs, tmp_path, {"tiles": {"size": 64}}, keep_tiles=True)
+        assert {name: end["state"] for name, end in again.items()} == {"pair1": "done", "pair2": "done before"}
+        assert (tiles / "records" / "0_1.json").stat().st_mtime_ns == kept
+        assert bytes_of(tmp_path / "pair1") == before
 
 
 def test_match_batch__removes_tiles_that_a_death_left_beside_a_result(images, tmp_path):

@@ -188,6 +188,9 @@ def test_match_pair__matches_a_tile_again_of_which_a_part_is_gone(pair, tmp_path
     (tmp_path / "run.json").unlink()
     gone = tmp_path / "tiles" / "arrays.zarr" / array / "0" / "1"
     shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
+    other = tmp_path / "tiles" / "arrays.zarr" / "int16" / "c" / "0" / "1" / "1"  # as a power loss leaves it
+    other.write_bytes(other.read_bytes()[:-100])
+    (tmp_path / "tiles" / "records" / "1_1.json").unlink()
     kept = (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns
     again = match_pair(left, right, tmp_path, in_tiles(settings, 128), keep_tiles=True)
     assert [(tmp_path / name).read_bytes() for name in ("intervals.tif", "validity.tif")] == expected
