@@ -1,42 +1,25 @@
-"""What tiles leave behind until the run is finished: arrays, records, a manifest. The only home of zarr.
+"""What tiles leave behind until the run is finished: arrays, records, a manifest.
 
-A tile's arrays lie in one shard each, written by whoever computed the tile, and its record comes last: a tile is done
-when its record is there. Writing a tile again writes the same bytes. The manifest holds everything that decides the
-bytes; a store with another manifest is never mixed in.
+A tile's arrays lie in files of its own, written by whoever computed the tile, and its record comes last: a tile is done
+when its record and its files are there. Writing a tile again writes the same bytes. The manifest holds everything that
+decides the bytes; a store with another manifest is never mixed in.
 """
 
 import errno
 import json
-import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-import zarr
-from zarr.codecs import BloscCodec
 
+from sat_intervals.arrays import DamagedTilesError, TileArrays
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.folders import Folder, folder_at
-from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tiling import Grid, Tile, Window
-
-# Raw products of the pixels of a core, in two arrays by their size, whose planes are read and written in one piece.
-_PLANES: dict[str, dict[str, type[np.generic]]] = {
-    "int16": {"winner": np.int16, "lower": np.int16, "upper": np.int16, "validity": np.uint16},
-    "uint32": {"disparity": np.float32, "ambiguity": np.uint32},
-}
-# What a core has seen from the right, see `_rank`.
-_RIGHT = "right"
-# The rank of a right pixel that no candidate was seen from.
-_UNSEEN = np.uint32(0xFFFFFFFF)
-SIDES = ("top", "bottom", "left", "right")
-# The raw products that neighbours compare along a seam.
-SEAM_PRODUCTS = ("winner", "lower", "upper")
 
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
 LAYOUT = 3
@@ -45,12 +28,6 @@ _MANIFEST, _ARRAYS, _RECORDS, _FAILURES = "manifest.json", "arrays.zarr", "recor
 _NORMALIZATION = "normalization.json"
 # In the folder of the run where its tiles lie elsewhere: it says where.
 _PLACE = "store.json"
-
-# Rows of a shard that are compressed together, so that strips read no more than they need.
-_ROWS_TOGETHER = 128
-# What zarr and its codecs raise of files that were cut short or changed.
-_DAMAGED = ValueError, RuntimeError
-_COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 
 
 class StoreError(SatIntervalsError):
@@ -87,9 +64,8 @@ class Store:
         return folder_at(self.elsewhere or self.home)
 
     @property
-    def _reach(self) -> int:
-        """Columns of the right view that a core sees."""
-        return self.grid.size + self.count - 1
+    def _arrays(self) -> TileArrays:
+        return TileArrays(self.folder.inside(_ARRAYS), self.grid, self.count, self.ambiguities)
 
     def open(
         self, manifest: Mapping[str, Any], *, overwrite: bool = False, is_mended: Callable[[], bool] = lambda: False
@@ -127,7 +103,7 @@ class Store:
         _drop(folder)
         folder.make(_RECORDS)
         folder.make(_FAILURES)
-        self._create_arrays()
+        self._arrays.create()
         folder.write(_MANIFEST, text)
 
     def check(self, manifest: Mapping[str, Any]) -> None:
@@ -173,70 +149,15 @@ class Store:
         except (OSError, AttributeError, TypeError, ValueError):
             return {}
 
-    def _create_arrays(self) -> None:
-        size, height = self.grid.size, self.grid.rows * self.grid.size
-        width = self.grid.columns * size
-        together = math.gcd(size, _ROWS_TOGETHER)
-        group = zarr.create_group(self.folder.place(_ARRAYS), zarr_format=3)
-        for dtype, planes in _PLANES.items():
-            count = len(planes)
-            _create(group, dtype, (count, height, width), (count, size, size), (count, together, size), dtype)
-        right = height, self.grid.columns * self._reach
-        _create(group, _RIGHT, right, (size, self._reach), (together, self._reach), np.uint32, _UNSEEN)
-        lines = len(SIDES), 2, len(SEAM_PRODUCTS), size
-        tiles, counts = (self.grid.rows, self.grid.columns), self.ambiguities + 1
-        _create(group, "seams", (*tiles, *lines), None, (1, 1, *lines), np.int16, NO_DISPARITY)
-        _create(group, "histogram", (*tiles, counts), None, (1, 1, counts), np.uint32)
-
-    def _array(self, name: str, mode: Literal["r", "r+"] = "r") -> zarr.Array[Any]:
-        # Blocks that hold nothing but fill values are written too: files that are missing tell of tiles that are.
-        array = zarr.open_array(self.folder.place(f"{_ARRAYS}/{name}"), mode=mode, zarr_format=3)
-        return array.with_config({"write_empty_chunks": True})
-
     def done(self) -> set[str]:
         """Names of the tiles that are complete: their record is there, and all that was written before it still is."""
-        records, there = self.folder.names(_RECORDS), self.folder.files(_ARRAYS)
-        return {tile.name for tile in self.grid if tile.name in records and self._shards(tile) <= there}
-
-    def _shards(self, tile: Tile) -> set[str]:
-        """The files that hold what a tile leaves behind."""
-        place = f"{tile.grid_row}/{tile.grid_column}"
-        return {
-            *(f"{dtype}/c/0/{place}" for dtype in _PLANES),
-            f"{_RIGHT}/c/{place}", f"seams/c/{place}/0/0/0/0", f"histogram/c/{place}/0",
-        }  # fmt: skip
+        records, arrays = self.folder.names(_RECORDS), self._arrays
+        there = arrays.files()
+        return {tile.name for tile in self.grid if tile.name in records and arrays.files_of(tile) <= there}
 
     def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write what a tile leaves behind.
-
-        Parameters
-        ----------
-        tile
-            Which tile.
-        arrays
-            ``winner``, ``lower``, ``upper``, ``disparity``, ``ambiguity`` and ``validity`` of the core's shape;
-            ``right_cost`` and ``right_winner``, which may be missing; ``seams`` (SIDES, own line or ring,
-            SEAM_PRODUCTS, size); ``histogram``.
-        """
-        try:
-            self._write(tile, arrays)
-        except _DAMAGED:  # zarr reads what is there before it writes over it
-            self._drop_tile(tile)
-            self._write(tile, arrays)
-
-    def _write(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
-        size, row, column = self.grid.size, tile.grid_row, tile.grid_column
-        height, width = arrays["winner"].shape
-        rows = slice(row * size, row * size + height)
-        for dtype, planes in _PLANES.items():
-            made = np.stack([arrays[name].view(dtype) for name in planes])
-            self._array(dtype, "r+")[:, rows, column * size : column * size + width] = made
-        rank = np.full((height, self._reach), _UNSEEN)
-        if "right_cost" in arrays:
-            rank[:, : arrays["right_cost"].shape[1]] = _rank(arrays["right_cost"], arrays["right_winner"])
-        self._array(_RIGHT, "r+")[rows, column * self._reach : (column + 1) * self._reach] = rank
-        for name in ("seams", "histogram"):
-            self._array(name, "r+")[row, column] = arrays[name]
+        """Write what a tile leaves behind, see `TileArrays.write`."""
+        self._arrays.write(tile, arrays)
 
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
@@ -263,8 +184,7 @@ class Store:
 
     def check_space(self, tile: Tile) -> None:
         """Raise an OSError where the disk has no room for what a tile leaves behind, before work is put in."""
-        pixel = sum(np.dtype(dtype).itemsize for planes in _PLANES.values() for dtype in planes.values())
-        needed = tile.core.height * (tile.core.width * pixel + (tile.core.width + self.count - 1) * 4)
+        needed = self._arrays.bytes_of(tile)
         free = self.folder.free_bytes()
         if free is not None and free < needed:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
@@ -282,64 +202,30 @@ class Store:
 
     def histogram(self) -> np.ndarray:
         """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``."""
-        stored = self._array("histogram")
-        rows = (np.asarray(stored[row]).sum(axis=0, dtype=np.int64) for row in range(self.grid.rows))
-        return sum(rows, np.zeros(self.ambiguities + 1, np.int64))
+        return self._arrays.histogram()
 
     def seams(self) -> np.ndarray:
-        """The lines along the tiles' borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size)."""
-        return np.asarray(self._array("seams")[:])
+        """The lines along the tiles' borders, see `TileArrays.seams`."""
+        return self._arrays.seams()
 
     def strips(self, rows: int) -> Iterator[dict[str, np.ndarray]]:
         """Raw products of the region in full-width strips of about ``rows`` rows, from the top.
 
-        The shares of the right view are merged: smallest cost, the largest disparity at ties.
+        Raises
+        ------
+        RunError
+            Of tiles whose files cannot be read; they are no longer done.
         """
-        step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
-        for first in range(0, self.grid.region.height, step):
-            last = min(first + step, self.grid.region.height)
-            try:
-                strip, right = self._read(slice(first, last), slice(None, self.grid.region.width), slice(None))
-            except _DAMAGED as error:
-                raise RunError(f"{self._dropped(first, last)}: {' '.join(str(error).split())}") from error
-            yield strip | {"right_winner": self._merged(right)}
-
-    def _read(self, rows: slice, columns: slice, right_columns: slice) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Raw products of some pixels by name, and ranks of right ones."""
-        strip: dict[str, np.ndarray] = {}
-        for dtype, planes in _PLANES.items():
-            read = np.asarray(self._array(dtype)[:, rows, columns])
-            strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
-        return strip, np.asarray(self._array(_RIGHT)[rows, right_columns])
-
-    def _dropped(self, first: int, last: int) -> str:
-        """Take tiles of some rows that cannot be read for not done, and say so."""
-        names = []
-        size = self.grid.size
-        for tile in self.grid:
-            row, column = tile.grid_row * size, tile.grid_column * size
-            share = slice(tile.grid_column * self._reach, (tile.grid_column + 1) * self._reach)
-            if row < last and first < row + size:
-                try:
-                    self._read(slice(row, row + tile.core.height), slice(column, column + tile.core.width), share)
-                except _DAMAGED:
-                    self._drop_tile(tile)
-                    names.append(tile.name)
-        return f"tiles {', '.join(names)} in {self.folder} cannot be read, the same command matches them again"
-
-    def _drop_tile(self, tile: Tile) -> None:
-        self.folder.delete(f"{_RECORDS}/{tile.name}.json")
-        for name in self._shards(tile):
-            self.folder.delete(f"{_ARRAYS}/{name}")
-
-    def _merged(self, ranks: np.ndarray) -> np.ndarray:
-        """One right view ``(rows, width + count - 1)`` from the shares of all cores of the rows."""
-        best = np.full((ranks.shape[0], self.grid.region.width + self.count - 1), _UNSEEN)
-        for column in range(self.grid.columns):
-            seen = best[:, column * self.grid.size : column * self.grid.size + self._reach]
-            share = ranks[:, column * self._reach : column * self._reach + seen.shape[1]]
-            np.minimum(seen, share, out=seen)
-        return _winner(best)
+        try:
+            yield from self._arrays.strips(rows)
+        except DamagedTilesError as error:
+            for tile in error.tiles:
+                self.folder.delete(f"{_RECORDS}/{tile.name}.json")
+                self._arrays.drop(tile)
+            names = ", ".join(tile.name for tile in error.tiles)
+            raise RunError(
+                f"tiles {names} in {self.folder} cannot be read, {error}: the same command matches them again"
+            ) from error
 
     def remove(self) -> None:
         """Delete the tiles, and nothing else that may be in their folder."""
@@ -414,32 +300,6 @@ def _drop(folder: Folder) -> None:
     # The manifest first: without it nothing of the rest counts.
     for name in (_MANIFEST, _ARRAYS, _RECORDS, _FAILURES, _NORMALIZATION):
         folder.delete(name)
-
-
-def _create(
-    group: zarr.Group,
-    name: str,
-    shape: tuple[int, ...],
-    shard: tuple[int, ...] | None,
-    chunk: tuple[int, ...],
-    dtype: npt.DTypeLike,
-    fill: Any = 0,
-) -> None:
-    group.create_array(
-        name, shape=shape, shards=shard, chunks=chunk, dtype=dtype, compressors=_COMPRESSOR, fill_value=fill
-    )  # fmt: skip
-
-
-def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
-    """Costs and winners of right pixels as one number, smaller the better: cost, and the larger disparity at ties."""
-    rank = cost.astype(np.uint32) << 16 | (np.iinfo(np.int16).max - winner.astype(np.int32)).astype(np.uint32)
-    return np.where(cost == IMPOSSIBLE_COST, _UNSEEN, rank)
-
-
-def _winner(rank: np.ndarray) -> np.ndarray:
-    """The winners in what `_rank` made."""
-    winner = (np.iinfo(np.int16).max - (rank & 0xFFFF).astype(np.int32)).astype(np.int16)
-    return np.where(rank == _UNSEEN, np.int16(NO_DISPARITY), winner)
 
 
 def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:

@@ -25,7 +25,19 @@ FLOORS = [
     {"cloud", "fusion"},
     {"finish", "patch", "demo", "results"},
     {"similarity", "store", "raster", "cluster", "memory", "seams", "summary", "geometry"},
-    {"config", "features", "kernels", "normalization", "scene", "inputs", "figures", "kinds", "pairs", "tables"},
+    {
+        "arrays",
+        "config",
+        "features",
+        "kernels",
+        "normalization",
+        "scene",
+        "inputs",
+        "figures",
+        "kinds",
+        "pairs",
+        "tables",
+    },
     {"folders"},
     {"tiling", "products", "errors", "configs"},
 ]
@@ -47,7 +59,7 @@ HOMES = {
     "rasterio": {"raster"},
     "rich": {"cli"},
     "shareloc": {"geometry"},
-    "zarr": {"store"},
+    "zarr": {"arrays"},
 }
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())

@@ -32,6 +32,9 @@ class Folder(Protocol):
     def delete(self, name: str) -> None:
         """Delete a file, or a folder with all that is in it, if it is there."""
 
+    def inside(self, folder: str) -> "Folder":
+        """A folder in it."""
+
     def make(self, folder: str) -> None:
         """Make a folder, where folders must be made."""
 

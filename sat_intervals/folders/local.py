@@ -70,6 +70,10 @@ class LocalFolder:
         else:
             (self.path / name).unlink(missing_ok=True)
 
+    def inside(self, folder: str) -> "LocalFolder":
+        """See `Folder`."""
+        return LocalFolder(self.path / folder)
+
     def make(self, folder: str) -> None:
         """See `Folder`."""
         (self.path / folder).mkdir(parents=True, exist_ok=True)

@@ -90,6 +90,10 @@ class RemoteFolder:
             system.invalidate_cache(path)
             system.rm(path, recursive=True)
 
+    def inside(self, folder: str) -> "RemoteFolder":
+        """See `Folder`."""
+        return RemoteFolder(f"{self.url}/{folder}")
+
     def make(self, folder: str) -> None:
         """See `Folder`."""
         with suppress(FileExistsError), self._reached(folder) as (system, path):
@@ -97,7 +101,7 @@ class RemoteFolder:
 
     def place(self, name: str) -> str:
         """See `Folder`."""
-        return f"{self.url}/{name}"
+        return f"{self.url}/{name}".rstrip("/")
 
     def free_bytes(self) -> None:
         """See `Folder`."""
