@@ -1,11 +1,15 @@
 """The kernels on other processors, and without compilation: in processes of their own, as numba decides at import."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import sat_intervals
+from sat_intervals.kernels import FINGERPRINT, _fingerprint
 
 TESTS = Path(__file__).parent
 
@@ -28,7 +32,21 @@ def test_kernels__equal_their_twins_on_processors_without_avx512(tmp_path, proce
         "tests/test_intervals.py::test_match_arrays__equals_reference",
         "tests/test_correlation.py::test_correlate__worked_example",
         "tests/test_sgm.py::test_cost_volume__equals_reference_with_penalties_that_follow_edges",
+        "tests/test_sgm.py::test_cost_volume__equals_reference_at_every_count",
+        "tests/test_intervals.py::test_match__interval_equals_reference_at_every_count",
+        "tests/test_disparity.py::test_match__equals_reference_at_every_count",
     )
+
+
+@pytest.mark.parametrize("changed", ["kernels/vector.py", "products.py"])
+def test_fingerprint__follows_every_source_that_decides_what_kernels_do(tmp_path, changed):
+    package = Path(sat_intervals.__file__).parent
+    shutil.copytree(package / "kernels", tmp_path / "kernels")
+    shutil.copy(package / "products.py", tmp_path)
+    assert _fingerprint(tmp_path) == FINGERPRINT
+    with (tmp_path / changed).open("a") as source:
+        source.write("# changed\n")
+    assert _fingerprint(tmp_path) != FINGERPRINT
 
 
 def test_kernels__plain_ones_equal_their_twins_without_compilation(tmp_path):

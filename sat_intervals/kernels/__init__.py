@@ -1,7 +1,7 @@
 """The method's inner loops: arrays in, arrays out. The only home of numba.
 
-Compiled once a machine and kept in a folder that is named after the kernels' sources: numba itself looks at the file of
-a kernel alone, and not at those of the kernels that it calls.
+Compiled once a machine and kept in a folder that is named after the kernels' sources, and after the constants that they
+freeze: numba itself looks at the file of a kernel alone, and not at those of the kernels that it calls.
 """
 
 import hashlib
@@ -12,9 +12,9 @@ from pathlib import Path
 from numba import config
 
 
-def _fingerprint() -> str:
+def _fingerprint(package: Path) -> str:
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in (*sorted((package / "kernels").glob("*.py")), package / "products.py"):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -34,5 +34,5 @@ def _cache_folder() -> Path:
 
 
 # Tells these kernels from those of any other version.
-FINGERPRINT = _fingerprint()
+FINGERPRINT = _fingerprint(Path(__file__).parents[1])
 config.CACHE_DIR = str(_cache_folder())

@@ -194,7 +194,8 @@ def regularize(lower, upper, low, depth, quantile, first, last):
     low_bound = high_bound = 0.0
     for s in range(row_start[first], row_start[last]):
         # Segments of a row that touch the same segments have, from two steps on, the same area: without this, a row
-        # of short segments beside one long segment would cost their number squared.
+        # of short segments beside one long segment would cost their number squared. It still would where each of them
+        # touches another one as well, two dotted rows below a full one.
         if not (depth > 1 and s > row_start[segment_row[s]] and _same_neighbours(s - 1, s, above, below)):
             members = _area(s, depth, above, below, visited, area)
             size = _count(lower_steps, upper_steps, segment_row, start, stop, area, members, lower_counts, upper_counts)
