@@ -159,6 +159,7 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
     # Jobs may not see the folder of a run whose tiles lie elsewhere, and their scripts take no spaces.
     if own_logs is None and settings.store is None and not any(map(str.isspace, str(logs.absolute()))):
         given["log_directory"] = str(logs.absolute())
+    submitted: set[str] = set()
     refusals: list[str] = []
 
     class Job(base.job_cls):  # type: ignore[misc]
@@ -169,9 +170,11 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
                 refusals.append(str(error).rpartition("stderr:")[2])
                 self.status = Status.failed  # else it could not be closed
                 raise
+            submitted.add(self.job_id)
 
     logged = given.get("log_directory") or own_logs or os.getcwd()
-    batch_system = type(base.__name__, (base,), {"job_cls": Job, "refusals": refusals, "logged": logged})
+    own = {"job_cls": Job, "submitted": submitted, "refusals": refusals, "logged": logged}
+    batch_system = type(base.__name__, (base,), own)
     try:
         return batch_system(**given, silence_logs=logging.CRITICAL)
     except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
@@ -229,7 +232,7 @@ class Jobs:
         if self._client.nthreads():
             self._seen = now
             return
-        if cluster.refusals and not any(job.job_id for job in cluster.workers.values()):
+        if cluster.refusals and not cluster.submitted:
             raise SatIntervalsError(
                 f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
             )
@@ -239,7 +242,7 @@ class Jobs:
         if now - self._asked < _ASKED_EVERY:
             return
         self._asked = now
-        if _any_in_queue({job.job_id for job in cluster.workers.values() if job.job_id}):
+        if _any_in_queue(cluster.submitted):  # of dask's own list a job is missing while it takes another's place
             self._seen = now
         elif now - self._seen > patience:
             raise RunError(
