@@ -242,7 +242,7 @@ class Jobs:
         if now - self._asked < _ASKED_EVERY:
             return
         self._asked = now
-        if _any_in_queue(cluster.submitted):  # of dask's own list a job is missing while it takes another's place
+        if _any_in_queue(cluster.submitted):  # all of them: dask's own list may lack one
             self._seen = now
         elif now - self._seen > patience:
             raise RunError(
