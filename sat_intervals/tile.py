@@ -57,8 +57,9 @@ def _match_tile(job: Job, tile: Tile) -> None:
         def read(window: Window) -> tuple[np.ndarray, np.ndarray]:
             with timed(seconds, "read"):
                 pixels, state = read_window(image, window)
+                digest = pixels_digest(pixels, state)
             usable[side] += int((state == 0).sum())
-            pixels_read.append({"side": side, "window": asdict(window), "digest": pixels_digest(pixels, state)})
+            pixels_read.append({"side": side, "window": asdict(window), "digest": digest})
             return pixels, state
 
         return read

@@ -58,3 +58,11 @@ def test_kernels__plain_ones_equal_their_twins_without_compilation(tmp_path):
         "-k",
         "worked_example and not match__ and not alpha_cut",
     )
+
+
+def test_kernels__where_none_can_be_kept_leave_nothing_behind(tmp_path):
+    script = "from sat_intervals import kernels; from numba import config; print(config.CACHE_DIR)"
+    environment = os.environ | {"NUMBA_CACHE_DIR": "/proc/no-folder", "TMPDIR": str(tmp_path)}
+    run = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert Path(run.stdout.strip()).parent == tmp_path
+    assert list(tmp_path.iterdir()) == []

@@ -4,8 +4,10 @@ Compiled once a machine and kept in a folder that is named after the kernels' so
 freeze: numba itself looks at the file of a kernel alone, and not at those of the kernels that it calls.
 """
 
+import atexit
 import hashlib
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -29,8 +31,15 @@ def _cache_folder() -> Path:
         folder = Path(place).expanduser() / "sat-intervals" / FINGERPRINT
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):
-        return Path(tempfile.mkdtemp())
-    return folder if os.access(folder, os.W_OK) else Path(tempfile.mkdtemp())
+        return _own_folder()
+    return folder if os.access(folder, os.W_OK) else _own_folder()
+
+
+def _own_folder() -> Path:
+    """One that goes with this process."""
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
 
 
 # Tells these kernels from those of any other version.

@@ -135,9 +135,12 @@ PIPELINE = {
     "validation": {"validation_method": "cross_checking_fast"},
     "filter": {
         "filter_method": "median_for_intervals",
+        "filter_size": 3,
         "interval_indicator": "intervals",
         "regularization": True,
         "ambiguity_indicator": "ambiguity",
+        "vertical_depth": 2,
+        "quantile_regularization": 0.9,
     },
 }
 
