@@ -57,7 +57,8 @@ def write_pair(folder, size):
     for side, image in zip(("left", "right"), make_pair(size, size), strict=True):
         paths.append(folder / f"{side}{size}.tif")
         kind = {"height": size, "width": size, "count": 1, "dtype": "uint16", "nodata": 0, "tiled": True}
-        with rasterio.open(paths[-1], "w", driver="GTiff", crs="EPSG:32631", **kind) as file:
+        place = {"crs": "EPSG:32631", "transform": rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)}
+        with rasterio.open(paths[-1], "w", driver="GTiff", **place, **kind) as file:
             file.write(image, 1)
     return paths
 
