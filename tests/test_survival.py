@@ -37,15 +37,26 @@ def pair(tmp_path_factory):
     """A folder with left.tif, right.tif, settings.yaml of 7 x 8 tiles, and the run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("pair")
     scene = make_scene(400, 500, seed=3)
-    for name, image in (("left", scene.left), ("right", scene.right)):
-        write_image(folder / f"{name}.tif", image)
-    settings = {
-        "disparity": {"minimum": scene.minimum, "maximum": scene.maximum},
-        "tiles": {"size": 64, "overlap": 20},
-    }
-    (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
+    disparity = {"minimum": scene.minimum, "maximum": scene.maximum}
+    settings = {"disparity": disparity, "tiles": {"size": 64, "overlap": 20}}
+    write_pair(folder, scene, settings)
     match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
     return folder
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory):
+    """The same of four tiles: one takes 290 MB for its volume of costs, three take 12 MB at most."""
+    folder = tmp_path_factory.mktemp("uneven")
+    settings = {"disparity": {"minimum": -260, "maximum": 260}, "tiles": {"size": 512, "overlap": 3}}
+    write_pair(folder, make_scene(528, 528, seed=3), settings)
+    return folder
+
+
+def write_pair(folder, scene, settings):
+    for name, image in (("left", scene.left), ("right", scene.right)):
+        write_image(folder / f"{name}.tif", image)
+    (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
 
 
 def write_image(path, image):
@@ -370,35 +381,31 @@ def test_match__does_only_what_is_missing_after_a_truncated_input_is_mended(pair
     assert_complete(pair, out)
 
 
-# Four tiles: one of 384 x 384 pixels that takes 150 MB for its volume of costs, three that take less than 50 MB.
-WIDE = ("--disparity", "-240", "240", "--tile-size", "384", "--overlap", "3")
-
-
-def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(pair, tmp_path):
+def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tmp_path):
     out = tmp_path / "out"
     with scheduler(tmp_path) as (address, _):
-        # of which dask leaves 95 %, and a worker takes 230 MiB before its first tile
+        # of which dask leaves 95 %; a worker takes 270 MiB between tiles
         with (
-            worker(address, tmp_path, "--memory-limit", "350MiB"),
-            started(pair, out, "--cluster", address, *WIDE) as command,
+            worker(address, tmp_path, "--memory-limit", "430MiB"),
+            started(uneven, out, "--cluster", address) as command,
         ):
             assert command.end() == 1, command.output
             assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
             assert "give workers more, or choose smaller tiles" in command.output
         assert_nothing_final(out)
         assert done_tiles(out) == {"0_1", "1_0", "1_1"}
-        with worker(address, tmp_path), started(pair, out, "--cluster", address, *WIDE) as command:
+        with worker(address, tmp_path), started(uneven, out, "--cluster", address) as command:
             assert command.end() == 0, command.output
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
 
-def test_match__is_not_stalled_by_a_tile_at_which_dask_pauses_its_worker(pair, tmp_path):
-    out = tmp_path / "out"
-    # above 80 % of the memory while the large tile is matched
+def test_match__is_not_stalled_by_a_tile_at_which_dask_pauses_its_worker(uneven, tmp_path, monkeypatch):
+    # above 80 % of the memory while the large tile is matched, below it before and after; dask would kill it at 95 %
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE", "False")
     with (
         scheduler(tmp_path) as (address, _),
-        worker(address, tmp_path, "--memory-limit", "440MiB"),
-        started(pair, out, "--cluster", address, *WIDE) as command,
+        worker(address, tmp_path, "--memory-limit", "450MiB"),
+        started(uneven, tmp_path / "out", "--cluster", address) as command,
     ):
         assert command.end() == 0, command.output
 
