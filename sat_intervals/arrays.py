@@ -27,7 +27,6 @@ SIDES = ("top", "bottom", "left", "right")
 # The raw products that neighbours compare along a seam.
 SEAM_PRODUCTS = ("winner", "lower", "upper")
 
-
 # Rows of a shard that are compressed together, so that strips read no more than they need.
 _ROWS_TOGETHER = 128
 # What zarr and its codecs raise of files that were cut short or changed.

@@ -83,7 +83,8 @@ def make_surface(
     Returns
     -------
     ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (the share of cells with a height), ``disagreeing`` (the
-    share of the cells of several runs in which these do not meet, None without such cells).
+    share of the cells of several runs in which these do not meet, None without such cells), ``without_intervals`` (the
+    folders of runs that have none).
 
     Raises
     ------

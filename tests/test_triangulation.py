@@ -142,11 +142,16 @@ def dimap(path, geotiff, view):
     return path
 
 
-def test_triangulate__reads_models_of_dimap(tmp_path):
-    bands = np.full((4, 40, 50), 1.25, np.float32)
+@pytest.fixture
+def level_run(tmp_path):
+    """A run of one disparity, 1, in the interval -1.5 to 4, and its cameras."""
+    bands = np.full((4, 40, 50), 1.0, np.float32)
     bands[1], bands[2] = -1.5, 4.0
-    out = write_run(tmp_path, bands, np.zeros((40, 50), np.uint16))
-    left, right, *grids = cameras(tmp_path, 40, 50)
+    return write_run(tmp_path, bands, np.zeros((40, 50), np.uint16)), cameras(tmp_path, 40, 50)
+
+
+def test_triangulate__reads_models_of_dimap(level_run, tmp_path):
+    out, (left, right, *grids) = level_run
     triangulate(out, left, right, *grids)
     expected = read(out / "points.tif")
     triangulate(out, dimap(tmp_path / "left.XML", left, 0), dimap(tmp_path / "right.XML", right, 1), *grids)
@@ -154,12 +159,9 @@ def test_triangulate__reads_models_of_dimap(tmp_path):
     np.testing.assert_allclose(read(out / "points.tif")[:2], expected[:2], rtol=0, atol=1e-8)
 
 
-def test_triangulate__orders_bounds_by_height(tmp_path):
+def test_triangulate__orders_bounds_by_height(level_run):
     # The views change places: height falls as disparity grows.
-    bands = np.full((4, 40, 50), 1.0, np.float32)
-    bands[1], bands[2] = -1.5, 4.0
-    out = write_run(tmp_path, bands, np.zeros((40, 50), np.uint16))
-    left, right, *grids = cameras(tmp_path, 40, 50)
+    out, (left, right, *grids) = level_run
     triangulate(out, right, left, *grids)
     points = read(out / "points.tif")
     assert np.abs(points[BAND["height_lower"]] - (DATUM - 4.0)).max() < 0.01
@@ -307,14 +309,8 @@ def test_lattice__asks_shareloc_for_few_nodes_at_a_time_and_for_none_twice(share
         np.testing.assert_allclose(np.concatenate([strip[band] for strip in strips]), whole[band], rtol=1e-12)
 
 
-@pytest.fixture
-def small_run(tmp_path):
-    bands = np.full((4, 40, 50), 1.0, np.float32)
-    return write_run(tmp_path, bands, np.zeros((40, 50), np.uint16)), cameras(tmp_path, 40, 50)
-
-
-def test_triangulate_command__what_it_cannot_use_gets_one_line(small_run, tmp_path):
-    out, files = small_run
+def test_triangulate_command__what_it_cannot_use_gets_one_line(level_run, tmp_path):
+    out, files = level_run
     short = grid(tmp_path / "short.tif", 10, 10, step=10)
     descending = tmp_path / "descending.tif"
     with rasterio.open(files[3]) as file, rasterio.open(descending, "w", **upside_down(file)) as other:
@@ -342,8 +338,8 @@ def upside_down(file):
     return file.profile | {"transform": Affine(place.a, 0, place.c, 0, -place.e, place.f + file.height * place.e)}
 
 
-def test_triangulate_command__warns_of_models_that_nearly_fit(small_run, tmp_path):
-    out, files = small_run
+def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_path):
+    out, files = level_run
     shifted = grid(tmp_path / "shifted.tif", 40, 50, offset=1.5)
     result = run("triangulate", out, *given([*files[:3], shifted]), "--quiet")
     assert result.exit_code == 0, result.output
@@ -352,8 +348,8 @@ def test_triangulate_command__warns_of_models_that_nearly_fit(small_run, tmp_pat
     assert run("triangulate", out, *given(files)).stderr == ""
 
 
-def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(small_run, tmp_path):
-    out, files = small_run
+def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path):
+    out, files = level_run
     files = [*files[:2], grid(tmp_path / "holed.tif", 40, 50, step=4), files[3]]
     with rasterio.open(files[2], "r+") as file:
         positions = file.read()
