@@ -140,7 +140,14 @@ def _regularized(
     top, bottom = max(0, first - settings.depth), last + settings.depth
     low = low_confidence(confidence[top:bottom], settings.threshold, settings.kernel)
     lower, upper = regularize(
-        lower[top:bottom], upper[top:bottom], low, settings.depth, settings.quantile, first - top, last - top
+        lower[top:bottom],
+        upper[top:bottom],
+        low,
+        config.disparity.minimum,
+        settings.depth,
+        settings.quantile,
+        first - top,
+        last - top,
     )
     return lower, upper, low[first - top : last - top]
 

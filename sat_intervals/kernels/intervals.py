@@ -127,24 +127,20 @@ def _quantile(counts, size, quantile):
 
 
 @njit(nogil=True)
-def _half_pixels(lower, upper, low):
-    """Bounds as steps of half a pixel above the least one: the least one, the number of steps, both as steps.
+def _half_pixels(lower, upper, low, minimum):
+    """Bounds as steps of half a pixel above ``minimum``: the number of steps, both bounds as steps.
 
     uint16, in half the time of int32: no two disparities lie more than 32000 pixels apart.
     """
     rows, columns = low.shape
-    least, most = np.float32(np.inf), np.float32(-np.inf)
-    for r in range(rows):
-        for c in range(columns):
-            if low[r, c]:
-                least, most = min(least, lower[r, c]), max(most, upper[r, c])
+    least = most = np.float32(minimum)
     lower_steps, upper_steps = np.empty(low.shape, np.uint16), np.empty(low.shape, np.uint16)
     for r in range(rows):
         for c in range(columns):  # selections, not branches: they vectorise
+            most = max(most, upper[r, c] if low[r, c] else most)
             lower_steps[r, c] = np.uint16(2 * (lower[r, c] - least)) if low[r, c] else 0
             upper_steps[r, c] = np.uint16(2 * (upper[r, c] - least)) if low[r, c] else 0
-    bins = int(2 * (most - least)) + 1 if most >= least else 0
-    return least, bins, lower_steps, upper_steps
+    return int(2 * (most - least)) + 1, lower_steps, upper_steps
 
 
 @njit(nogil=True)
@@ -155,7 +151,7 @@ def _same_neighbours(s, t, above, below):
 
 
 @njit(nogil=True, cache=True)
-def regularize(lower, upper, low, depth, quantile, first, last):
+def regularize(lower, upper, low, minimum, depth, quantile, first, last):
     """Widen the intervals of low-confidence areas to quantiles of the area's bounds (paper section 3.5).
 
     A segment's area is made of the segments reached in at most ``depth`` steps between segments of adjacent rows
@@ -168,6 +164,9 @@ def regularize(lower, upper, low, depth, quantile, first, last):
         and means of two) wherever ``low``, so that quantiles come from counts.
     low
         bool of the same shape: low-confidence pixels.
+    minimum
+        No bound of theirs is less: the first disparity of the search range. Steps are counted from it, and not from the
+        least bound of these rows, so that a pixel's quantile is rounded alike whatever rows it comes with.
     depth
         Steps, and so the rows above and below a row that its areas reach.
     quantile
@@ -188,7 +187,7 @@ def regularize(lower, upper, low, depth, quantile, first, last):
     for r in range(row_start.size - 1):
         segment_row[row_start[r] : row_start[r + 1]] = r
     visited, area = np.full(segments, -1, np.int64), np.empty(segments, np.int64)
-    base, bins, lower_steps, upper_steps = _half_pixels(lower, upper, low)
+    bins, lower_steps, upper_steps = _half_pixels(lower, upper, low, minimum)
     lower_counts, upper_counts = np.empty(bins, np.int32), np.empty(bins, np.int32)
     new_lower, new_upper = lower[first:last].copy(), upper[first:last].copy()
     low_bound = high_bound = 0.0
@@ -199,8 +198,8 @@ def regularize(lower, upper, low, depth, quantile, first, last):
         if not (depth > 1 and s > row_start[segment_row[s]] and _same_neighbours(s - 1, s, above, below)):
             members = _area(s, depth, above, below, visited, area)
             size = _count(lower_steps, upper_steps, segment_row, start, stop, area, members, lower_counts, upper_counts)
-            low_bound = base + 0.5 * _quantile(lower_counts, size, 1.0 - quantile)
-            high_bound = base + 0.5 * _quantile(upper_counts, size, quantile)
+            low_bound = minimum + 0.5 * _quantile(lower_counts, size, 1.0 - quantile)
+            high_bound = minimum + 0.5 * _quantile(upper_counts, size, quantile)
         new_lower[segment_row[s] - first, start[s] : stop[s]] = low_bound
         new_upper[segment_row[s] - first, start[s] : stop[s]] = high_bound
     return new_lower, new_upper
