@@ -1,6 +1,5 @@
 """Memory of a worker, from the sizes of what it holds; and the tile that fits in a given one."""
 
-import os
 import re
 
 from sat_intervals.config import Config, ConfigError, Mccnn
@@ -27,11 +26,6 @@ def parse_bytes(text: str) -> int:
     if not found or found[2] not in _UNITS:
         raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
     return int(float(found[1]) * _UNITS[found[2]])
-
-
-def machine_bytes() -> int:
-    """Memory of this machine."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _lanes(config: Config) -> int:
