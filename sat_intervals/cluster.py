@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from dask.utils import parse_timedelta
+from dask.utils import parse_bytes, parse_timedelta
 from distributed import Client, LocalCluster, Status
 from distributed.utils import silence_logging_cmgr
 
-from sat_intervals.config import Cluster
+from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 
@@ -116,6 +116,23 @@ def _undisturbed() -> Iterator[None]:
             signal.signal(number, handler or signal.SIG_DFL)
         for late in came:
             signal.raise_signal(late)
+
+
+def parse_memory(text: str) -> int:
+    """Bytes of a size such as ``4GB``, ``512 MiB`` or ``3e9``, as dask reads it.
+
+    Raises
+    ------
+    ConfigError
+        When it is no size, or not above zero.
+    """
+    try:
+        size = parse_bytes(text) if any(map(str.isdigit, text)) else 0  # dask takes "GB" for 1 GB
+    except (ValueError, OverflowError):
+        size = 0
+    if size <= 0:
+        raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
+    return size
 
 
 def tiles_at_once(settings: Cluster) -> int:

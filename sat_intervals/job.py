@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.cluster import parse_memory
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.features import load_network, weights_file
@@ -19,7 +20,7 @@ from sat_intervals.folders import folder_at
 from sat_intervals.inputs import identity, pixels_digest
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores, usable_memory
-from sat_intervals.memory import fitted_to_jobs, volume_bytes
+from sat_intervals.memory import fitted, volume_bytes
 from sat_intervals.normalization import Scale as ImageScale
 from sat_intervals.normalization import Scales
 from sat_intervals.patch import match_patch
@@ -143,6 +144,20 @@ def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: 
     for one in (before, now):
         one["inputs"].get("weights", {}).pop("onnxruntime", None)
     return list(differences(before, json.loads(json.dumps(now))))
+
+
+def fitted_to_jobs(config: Config) -> Config:
+    """The settings with tiles that fit in the memory that they give a job of a batch system.
+
+    Raises
+    ------
+    ConfigError
+        As of `fitted` and `parse_memory`.
+    """
+    if config.cluster.memory is None:
+        return config
+    # dask kills a worker that takes 95 % of its memory
+    return fitted(config, 9 * parse_memory(config.cluster.memory) // 10, config.cluster.cores)
 
 
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
