@@ -43,12 +43,12 @@ def plan(
 
     Takes the options of match, and those of its settings that matter, such as the jobs of a batch system.
     """
+    from sat_intervals.cluster import parse_memory
     from sat_intervals.config import load_config
-    from sat_intervals.memory import parse_bytes
     from sat_intervals.plan import plan as make_plan
 
     config = load_config(config_file, with_range(given, disparity))
-    made = make_plan(*images(left, right), config, window=window, memory=parse_bytes(memory) if memory else None)
+    made = make_plan(*images(left, right), config, window=window, memory=parse_memory(memory) if memory else None)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     lines = {
         "tiles": f"{made.tiles} of {made.tile_size} px{smaller}, overlap {config.tiles.overlap} px",

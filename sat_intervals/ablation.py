@@ -15,7 +15,8 @@ from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.memory import PROCESS_BYTES, machine_bytes, volume_bytes
+from sat_intervals.machine import usable_memory
+from sat_intervals.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.normalization import Scales, measure
 from sat_intervals.pairs import Pair
 from sat_intervals.patch import kernel_settings, match_patch
@@ -86,15 +87,15 @@ def _scales(left: Reader, right: Reader, left_image: Image, right_image: Image, 
 
 
 def _check_memory(whole: Window, config: Config) -> None:
-    """Hold that the machine has room for the volume, the right view's own if there is one, and the bands."""
+    """Refuse a pair without memory for the volume, the right view's own if there is one, and the bands."""
     pixels, count = whole.height * whole.width, config.disparity.count
     beyond = count - 1 if config.cross_check and config.cross_check.method == "accurate" else 0
     needed = PROCESS_BYTES + volume_bytes(whole.height, whole.width + beyond, config) + _PIXEL_BYTES * pixels
-    memory = machine_bytes()
+    memory = usable_memory()
     if needed > memory:
         raise SatIntervalsError(
             f"{whole.height} x {whole.width} pixels x {count} disparities need {needed / 1e9:.1f} GB, "
-            f"the machine has {memory / 1e9:.1f} GB: cut the pair"
+            f"this process may use {memory / 1e9:.1f} GB: cut the pair"
         )
 
 

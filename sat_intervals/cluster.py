@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from dask.utils import parse_timedelta
+from dask.utils import parse_bytes, parse_timedelta
 from distributed import Client, LocalCluster, Status
 from distributed.utils import silence_logging_cmgr
 
-from sat_intervals.config import Cluster
+from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.machine import usable_cores
 
 # Seconds without a job in the queue after which none is waited for.
 JOBS_GONE = 30.0
@@ -79,13 +80,8 @@ def _client_of(address: str | None) -> Client:
         raise SatIntervalsError(f"no dask scheduler answers at {address}: {error}") from error
 
 
-def available_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _local(settings: Cluster) -> LocalCluster:
-    workers = settings.workers or available_cores()
+    workers = settings.workers or usable_cores()
     processes = settings.kind == "processes"
     return LocalCluster(
         n_workers=workers if processes else 1,
@@ -122,10 +118,27 @@ def _undisturbed() -> Iterator[None]:
             signal.raise_signal(late)
 
 
+def parse_memory(text: str) -> int:
+    """Bytes of a size such as ``4GB``, ``512 MiB`` or ``3e9``, as dask reads it.
+
+    Raises
+    ------
+    ConfigError
+        When it is no size, or not above zero.
+    """
+    try:
+        size = parse_bytes(text) if any(map(str.isdigit, text)) else 0  # dask takes "GB" for 1 GB
+    except (ValueError, OverflowError):
+        size = 0
+    if size <= 0:
+        raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
+    return size
+
+
 def tiles_at_once(settings: Cluster) -> int:
-    """Tiles in work at once; of a scheduler that is there, as many as this machine had."""
+    """Tiles in work at once; of a scheduler that is there, as if on this machine."""
     if settings.kind in ("threads", "processes", "address"):
-        return settings.workers or available_cores()
+        return settings.workers or usable_cores()
     return (settings.maximum_jobs or settings.jobs) * settings.cores
 
 

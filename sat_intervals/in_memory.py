@@ -10,7 +10,8 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.finish import Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.memory import machine_bytes, volume_bytes
+from sat_intervals.machine import usable_memory
+from sat_intervals.memory import volume_bytes
 from sat_intervals.normalization import Scales, measure
 from sat_intervals.patch import match_patch
 from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
@@ -109,11 +110,11 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
             f"columns, out of the right, {right.shape[1]}: check their sign, x_right = x_left + disparity"
         )
     rows, columns = left.shape
-    needed, there = volume_bytes(rows, columns, config), machine_bytes()
+    needed, there = volume_bytes(rows, columns, config), usable_memory()
     if needed > there:
         raise SatIntervalsError(
             f"{rows} x {columns} pixels x {search.count} disparities "
-            f"need {needed / 1e9:.1f} GB, the machine has {there / 1e9:.1f} GB: "
+            f"need {needed / 1e9:.1f} GB, this process may use {there / 1e9:.1f} GB: "
             "write the arrays to files and use match_pair, which works in tiles"
         )
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.cluster import available_cores
+from sat_intervals.cluster import parse_memory
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.features import load_network, weights_file
@@ -19,7 +19,8 @@ from sat_intervals.finish import Rows, Scale, finish_strips
 from sat_intervals.folders import folder_at
 from sat_intervals.inputs import identity, pixels_digest
 from sat_intervals.kernels import FINGERPRINT
-from sat_intervals.memory import fitted_to_jobs, machine_bytes, volume_bytes
+from sat_intervals.machine import usable_cores, usable_memory
+from sat_intervals.memory import fitted, volume_bytes
 from sat_intervals.normalization import Scale as ImageScale
 from sat_intervals.normalization import Scales
 from sat_intervals.patch import match_patch
@@ -145,6 +146,20 @@ def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: 
     return list(differences(before, json.loads(json.dumps(now))))
 
 
+def fitted_to_jobs(config: Config) -> Config:
+    """The settings with tiles that fit in the memory that they give a job of a batch system.
+
+    Raises
+    ------
+    ConfigError
+        As of `fitted` and `parse_memory`.
+    """
+    if config.cluster.memory is None:
+        return config
+    # dask kills a worker that takes 95 % of its memory
+    return fitted(config, 9 * parse_memory(config.cluster.memory) // 10, config.cluster.cores)
+
+
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
     """Open the images of a pair and check that they can be matched."""
     left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
@@ -206,16 +221,16 @@ def checked_region(left: Image, window: Window | None) -> Window:
 
 
 def check_memory(config: Config, region: Window) -> None:
-    """Refuse tiles that this machine cannot hold; what jobs and the workers of a scheduler have is theirs to know."""
+    """Refuse tiles that this process cannot hold; what jobs and the workers of a scheduler have is theirs to know."""
     if config.cluster.kind not in ("threads", "processes"):
         return
     height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
-    workers = min(config.cluster.workers or available_cores(), len(Grid(region, config.tiles.size)))
-    needed, there = workers * volume_bytes(height, width, config), machine_bytes()
+    workers = min(config.cluster.workers or usable_cores(), len(Grid(region, config.tiles.size)))
+    needed, there = workers * volume_bytes(height, width, config), usable_memory()
     if needed > there:
         raise SatIntervalsError(
             f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {workers} at once, need "
-            f"{needed / 1e9:.1f} GB, the machine has {there / 1e9:.1f} GB: "
+            f"{needed / 1e9:.1f} GB, this process may use {there / 1e9:.1f} GB: "
             "choose a smaller --tile-size or fewer --workers"
         )
 

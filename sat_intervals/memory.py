@@ -1,8 +1,5 @@
 """Memory of a worker, from the sizes of what it holds; and the tile that fits in a given one."""
 
-import os
-import re
-
 from sat_intervals.config import Config, ConfigError, Mccnn
 
 # A process before its first tile, its libraries and compiled kernels; measured 240 MB.
@@ -12,26 +9,6 @@ PROCESS_BYTES = 300 * 10**6
 _PATCH_BYTES, _CORE_BYTES = 40, 60
 # Per column of a patch: what the network of MC-CNN holds of a strip of rows, and the features of both images.
 _NETWORK_BYTES = 140_000
-_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
-
-
-def parse_bytes(text: str) -> int:
-    """Bytes of a figure such as ``4GB``, ``512 MiB`` or ``3e9``.
-
-    Raises
-    ------
-    ConfigError
-        For what is none.
-    """
-    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]*)?(?:e[0-9]{1,2})?)\s*([KMGT]?I?)B?\s*", text.upper().replace("E", "e"))
-    if not found or found[2] not in _UNITS:
-        raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
-    return int(float(found[1]) * _UNITS[found[2]])
-
-
-def machine_bytes() -> int:
-    """Memory of this machine."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _lanes(config: Config) -> int:
@@ -78,17 +55,3 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
         f"{tiles_at_once} at once, need {needed / 1e6:.0f} MB, given are {memory / 1e6:.0f} MB: "
         "give more memory or fewer workers"
     )
-
-
-def fitted_to_jobs(config: Config) -> Config:
-    """The settings with tiles that fit in the memory that they give a job of a batch system.
-
-    Raises
-    ------
-    ConfigError
-        As of `fitted`.
-    """
-    if config.cluster.memory is None:
-        return config
-    # dask kills a worker that takes 95 % of its memory
-    return fitted(config, 9 * parse_bytes(config.cluster.memory) // 10, config.cluster.cores)

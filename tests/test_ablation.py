@@ -164,8 +164,8 @@ def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
     with pytest.raises(SatIntervalsError, match=r"short.tif has 89 x 110 pixels, .*left.tif 90 x 110"):
         ablate_pair(Pair("short", "all", **files, **search))
     volume = volume_bytes(90, 110, load_config({"disparity": search}))
-    monkeypatch.setattr(ablation, "machine_bytes", lambda: PROCESS_BYTES + volume)  # none for the bands
-    with pytest.raises(SatIntervalsError, match=r"90 x 110 pixels x .* the machine has 0.3 GB: cut the pair"):
+    monkeypatch.setattr(ablation, "usable_memory", lambda: PROCESS_BYTES + volume)  # none for the bands
+    with pytest.raises(SatIntervalsError, match=r"90 x 110 pixels x .* this process may use 0.3 GB: cut the pair"):
         ablate_pair(pair)
 
 

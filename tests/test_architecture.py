@@ -39,7 +39,7 @@ FLOORS = [
         "tables",
     },
     {"folders"},
-    {"tiling", "products", "errors", "configs"},
+    {"tiling", "products", "errors", "configs", "machine"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 

@@ -1,0 +1,222 @@
+"""Memory and cores in containers and jobs: made-up trees of cgroups of both versions, and the kernel's own limits."""
+
+import os
+import re
+import resource
+import subprocess
+import sys
+import sysconfig
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sat_intervals import machine
+from sat_intervals.raster import north_up, write_layer
+
+COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
+GB = 10**9
+PHYSICAL = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+NO_LIMIT = 9223372036854771712  # what version 1 says of none
+
+# Lines of mountinfo, to be completed by the cgroup at the top of the mount, and by the place of version 1's.
+V2 = "31 23 0:28 {0} /sys/fs/cgroup rw,relatime shared:4 - cgroup2 cgroup2 rw,nsdelegate"
+HYBRID = "41 31 0:38 {0} /sys/fs/cgroup/unified rw shared:9 master:1 - cgroup2 cgroup2 rw"
+MEMORY = "35 31 0:32 {0} /sys/fs/cgroup/memory rw,relatime - cgroup cgroup rw,memory"
+CPU = "32 31 0:29 {0} /sys/fs/cgroup/cpu,cpuacct rw,relatime - cgroup cgroup rw,cpu,cpuacct"
+DISK = "22 1 8:1 / / rw,relatime - ext4 /dev/root rw"
+
+IN_JOB = "9:memory:/slurm/job_7/step_0\n4:cpu,cpuacct:/slurm/job_7/step_0\n0::/"
+
+
+def made_up(root, groups, mounts, limits):
+    """A tree with what the kernel says of this process, and files of limits by their path below ``/sys/fs/cgroup``."""
+    (root / "proc/self").mkdir(parents=True)
+    (root / "proc/self/cgroup").write_text(groups + "\n")
+    (root / "proc/self/mountinfo").write_text("\n".join([DISK, *mounts]) + "\n")
+    for name, text in limits.items():
+        file = root / "sys/fs/cgroup" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"{text}\n")
+    return root
+
+
+@pytest.mark.parametrize(
+    ("groups", "mounts", "limits", "expected"),
+    [
+        pytest.param("0::/a/b", [V2.format("/")], {"a/b/memory.max": GB, "a/memory.max": 2 * GB}, GB, id="v2 own"),
+        pytest.param("0::/a/b", [V2.format("/")], {"a/b/memory.max": 2 * GB, "a/memory.max": GB}, GB, id="v2 parent"),
+        pytest.param("0::/a/b/c", [V2.format("/")], {"a/b/c/memory.max": "max", "a/memory.max": GB}, GB, id="v2 far"),
+        pytest.param("0::/a", [V2.format("/")], {"a/memory.max": "max", "b/memory.max": GB}, None, id="v2 of others"),
+        pytest.param("0::/a (deleted)", [V2.format("/")], {"memory.max": GB}, GB, id="v2 own is gone"),
+        pytest.param("0::/", [V2.format("/")], {"memory.max": GB}, GB, id="v2 namespace"),
+        pytest.param("0::/", [V2.format("/..")], {"memory.max": GB}, GB, id="mounted from above the namespace"),
+        pytest.param("0::/a", [V2.format("/../..")], {"memory.max": GB, "a/memory.max": 1}, GB, id="names not known"),
+        pytest.param("0::/../b", [V2.format("/..")], {"b/memory.max": GB}, GB, id="process and mount from above"),
+        pytest.param("0::/../b", [V2.format("/")], {"memory.max": 1, "b/memory.max": 1}, None, id="process outside"),
+        pytest.param("0::/a", [V2.format("/../b")], {"memory.max": 1, "a/memory.max": 1}, None, id="a sibling's mount"),
+        pytest.param("0::/docker/x/a", [V2.format("/docker/x")], {"a/memory.max": GB}, GB, id="v2 part is mounted"),
+        pytest.param("0::/docker/xy", [V2.format("/docker/x")], {"memory.max": 1}, None, id="v2 other part is mounted"),
+        pytest.param(
+            IN_JOB,
+            [MEMORY.format("/"), CPU.format("/")],
+            {
+                "memory/memory.limit_in_bytes": NO_LIMIT,
+                "memory/slurm/job_7/memory.limit_in_bytes": GB,
+                "memory/slurm/job_7/step_0/memory.limit_in_bytes": NO_LIMIT,
+            },
+            GB,
+            id="v1 parent",
+        ),
+        pytest.param(
+            "5:memory:/docker/x\n1:name=systemd:/docker/x",
+            [MEMORY.format("/docker/x")],
+            {"memory/memory.limit_in_bytes": GB},
+            GB,
+            id="v1 container",
+        ),
+        pytest.param(
+            IN_JOB,
+            [HYBRID.format("/"), CPU.format("/"), MEMORY.format("/")],
+            {"memory/slurm/memory.limit_in_bytes": GB, "unified/cgroup.procs": 1},
+            GB,
+            id="hybrid, memory in v1",
+        ),
+        pytest.param(
+            "4:cpu,cpuacct:/\n0::/a",
+            [CPU.format("/"), HYBRID.format("/")],
+            {"unified/a/memory.max": GB},
+            GB,
+            id="hybrid, memory in v2",
+        ),
+        pytest.param("0::/a", [], {"memory.max": 1, "a/memory.max": 1}, None, id="nothing is mounted"),
+    ],
+)
+def test_memory_limits__are_those_of_the_cgroup_and_its_ancestors(tmp_path, groups, mounts, limits, expected):
+    found = machine._memory_limits(made_up(tmp_path, groups, mounts, limits))
+    assert min((limit for limit in found if limit < NO_LIMIT), default=None) == expected
+
+
+def test_memory_limits__reads_mount_points_with_spaces(tmp_path):
+    mounts = [V2.format("/").replace("/sys/fs/cgroup", r"/sys/fs/cgroup/my\040groups")]
+    limits = {"my groups/a/memory.max": GB}
+    assert list(machine._memory_limits(made_up(tmp_path, "0::/a", mounts, limits))) == [GB]
+
+
+def test_memory_limits__there_are_none_without_cgroups(tmp_path):
+    assert list(machine._memory_limits(tmp_path)) == []
+    (tmp_path / "proc/self").mkdir(parents=True)
+    for name in ("cgroup", "mountinfo"):
+        (tmp_path / "proc/self" / name).touch()
+    assert list(machine._memory_limits(tmp_path)) == []
+
+
+@pytest.mark.parametrize(
+    ("groups", "mounts", "limits", "expected"),
+    [
+        pytest.param(
+            "0::/a/b", [V2.format("/")], {"a/b/cpu.max": "max 100000", "a/cpu.max": "300000 100000"}, [3], id="v2"
+        ),
+        pytest.param("0::/a", [V2.format("/")], {"a/cpu.max": "150000 100000"}, [2], id="rounded up"),
+        pytest.param("0::/a", [V2.format("/")], {"a/cpu.max": "1000 100000"}, [1], id="at least one"),
+        pytest.param(
+            IN_JOB,
+            [MEMORY.format("/"), CPU.format("/")],
+            {
+                "cpu,cpuacct/cpu.cfs_quota_us": -1,
+                "cpu,cpuacct/cpu.cfs_period_us": 100_000,
+                "cpu,cpuacct/slurm/cpu.cfs_quota_us": 100_000,
+                "cpu,cpuacct/slurm/cpu.cfs_period_us": 50_000,
+                "cpu,cpuacct/slurm/job_7/cpu.cfs_quota_us": 400_000,
+                "cpu,cpuacct/slurm/job_7/cpu.cfs_period_us": 100_000,
+            },
+            [4, 2],
+            id="v1",
+        ),
+    ],
+)
+def test_core_limits__are_quotas_over_periods(tmp_path, groups, mounts, limits, expected):
+    assert list(machine._core_limits(made_up(tmp_path, groups, mounts, limits))) == expected
+
+
+def test_usable_memory_and_cores__are_the_least_of_all_limits(tmp_path, monkeypatch):
+    limits = {"a/memory.max": GB // 2, "a/cpu.max": "100000 100000"}
+    monkeypatch.setattr(machine, "_ROOT", made_up(tmp_path / "tight", "0::/a", [V2.format("/")], limits))
+    assert (machine.usable_memory(), machine.usable_cores()) == (GB // 2, 1)
+    limits = {"a/memory.max": 2**60, "a/cpu.max": "100000000 1000"}
+    monkeypatch.setattr(machine, "_ROOT", made_up(tmp_path / "wide", "0::/a", [V2.format("/")], limits))
+    assert machine.usable_memory() <= PHYSICAL
+    assert machine.usable_cores() == len(os.sched_getaffinity(0))
+
+
+def told(what, prepare):
+    """What a new process says of its memory or cores, after it called ``prepare``."""
+    code = f"from sat_intervals.machine import {what}; print({what}())"
+    command = [sys.executable, "-c", code]
+    return int(subprocess.run(command, preexec_fn=prepare, capture_output=True, check=True, timeout=60).stdout)
+
+
+def test_usable_memory__is_at_most_the_address_space():
+    assert told("usable_memory", partial(resource.setrlimit, resource.RLIMIT_AS, (2**28, 2**28))) == 2**28
+
+
+def test_usable_cores__are_at_most_those_of_the_affinity():
+    assert told("usable_cores", partial(os.sched_setaffinity, 0, {min(os.sched_getaffinity(0))})) == 1
+
+
+@pytest.fixture
+def cgroup(request):
+    """A real cgroup below that of this process, and what a process calls to enter it."""
+    controller = request.param
+    above = list(machine._cgroups(Path("/"), controller))
+    if not above or above[0].parent in above:  # a cgroup belongs to the service that made it, with all below
+        pytest.skip(f"the {controller} cgroup of this process is not the top one in sight: {[*map(str, above)]}")
+    folder = above[0] / f"sat_intervals_{os.getpid()}"
+    try:
+        folder.mkdir()
+    except OSError as error:
+        pytest.skip(f"no cgroup can be made: {error}")
+    yield folder, lambda: (folder / "cgroup.procs").write_text(str(os.getpid()))
+    folder.rmdir()
+
+
+def limit(folder, figures):
+    """Write those of the limits that a cgroup knows."""
+    there = {name: text for name, text in figures.items() if (folder / name).exists()}
+    if not there:
+        pytest.skip(f"{folder} has none of {', '.join(figures)}")
+    for name, text in there.items():
+        (folder / name).write_text(text)
+
+
+@pytest.mark.parametrize("cgroup", ["memory"], indirect=True)
+def test_usable_memory__is_at_most_the_limit_of_a_real_cgroup(cgroup):
+    folder, enter = cgroup
+    limit(folder, {"memory.max": str(2**28), "memory.limit_in_bytes": str(2**28)})
+    assert told("usable_memory", enter) == 2**28
+
+
+@pytest.mark.parametrize("cgroup", ["cpu"], indirect=True)
+def test_usable_cores__are_at_most_the_quota_of_a_real_cgroup(cgroup):
+    folder, enter = cgroup
+    limit(folder, {"cpu.max": "90000 100000", "cpu.cfs_quota_us": "90000"})
+    assert told("usable_cores", enter) == 1
+
+
+def test_match__refuses_tiles_that_do_not_fit_in_what_a_job_may_use(tmp_path):
+    write_layer(tmp_path / "image.tif", np.ones((4096, 4096), np.uint8), 0, north_up(32631, 0, 0, 0.5))
+    pair = [tmp_path / "image.tif", tmp_path / "image.tif", tmp_path / "out", "--disparity", "-255", "0"]
+    may = 8 * 10**9
+    done = subprocess.run(
+        [COMMAND, "match", *pair, "--tile-size", "4096", "--workers", "1"],
+        preexec_fn=partial(resource.setrlimit, resource.RLIMIT_AS, (may, may)),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    refusal = r"4096 x 4096 pixels x 256 disparities, 1 at once, need 8\.6 GB, this process may use (.*) GB:"
+    said = re.search(refusal, done.stderr)
+    assert said, done.stderr
+    assert float(said[1]) <= may / 1e9
