@@ -5,7 +5,6 @@ The library is imported by the command that needs it: help and usage errors do n
 
 import atexit
 import gc
-import traceback
 from typing import Any
 
 import click
@@ -25,11 +24,6 @@ from sat_intervals.cli.signals import Ended, armed
 from sat_intervals.cli.status import status
 from sat_intervals.cli.triangulate import triangulate
 
-# The libraries make two hundred thousand objects that live as long as the process. To look for garbage among them
-# takes a fifth of a second while they are imported, and half a second at the end.
-gc.set_threshold(5000)
-atexit.register(gc.freeze)
-
 FAILED, USER_ERROR = 1, 2
 RESUMED = ("match", "demo", "batch")
 
@@ -38,6 +32,10 @@ class _Commands(click.Group):
     """Turns whatever goes wrong in a command into one line and an exit status."""
 
     def invoke(self, context: click.Context) -> Any:
+        # The libraries make two hundred thousand objects that live as long as the process. To look for garbage among
+        # them takes a fifth of a second while they are imported, and half a second at the end.
+        gc.set_threshold(5000)
+        atexit.register(gc.freeze)
         try:
             with armed():
                 return super().invoke(context)
@@ -51,8 +49,6 @@ class _Commands(click.Group):
             again = "; the same command goes on from the tiles that are done" if resumed else ""
             return _end(ended.status, f"{ended}{again}")
         except Exception as error:
-            if context.meta.get("sat_intervals.debug"):
-                traceback.print_exception(error)
             return _end(*_explained(error))
 
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from sat_intervals.cli.options import debug_option, path, quiet_option
+from sat_intervals.cli.options import log_options, path, quiet_option
 
 
 @click.command(short_help="A surface model with an interval for every cell, of one or several runs.")
@@ -28,7 +28,7 @@ from sat_intervals.cli.options import debug_option, path, quiet_option
     help="The file to write; default dsm.tif in the first OUT. A surface model there is replaced.",
 )
 @quiet_option
-@debug_option
+@log_options
 def dsm(
     outs: tuple[Path, ...],
     resolution: float,

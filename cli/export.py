@@ -4,14 +4,14 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import debug_option, path
+from sat_intervals.cli.options import log_options, path
 
 
 @click.command(short_help="Write a run as the files of CARS, ASP, s2p or OTB.")
 @click.argument("out", callback=path)
 @click.argument("target", callback=path)
 @click.option("--to", "form", type=click.Choice(["cars", "asp", "s2p", "otb"]), required=True, help="Whose files.")
-@debug_option
+@log_options
 def export(out: Path, target: Path, form: str) -> None:
     """Write the finished run in the folder OUT to the folder TARGET in the form of another tool.
 

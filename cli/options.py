@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from sat_intervals.cli.logs import logged
+
 if TYPE_CHECKING:
     from sat_intervals.raster import Image
 
@@ -32,14 +34,7 @@ def path(context: click.Context, parameter: click.Parameter, value: str | None) 
     return None if value is None else Path(str(named(context, parameter, value)))
 
 
-def _debug(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    context.meta["sat_intervals.debug"] = value
-
-
 quiet_option = click.option("--quiet", is_flag=True, help="Print errors only.")
-debug_option = click.option(
-    "--debug", is_flag=True, expose_value=False, callback=_debug, help="Show tracebacks of errors."
-)
 cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
 disparity_option = click.option(
     "--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched."
@@ -158,7 +153,22 @@ def run_options(command: Command) -> Command:
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
         click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
         quiet_option,
-        debug_option,
+        log_options,
+    )
+
+
+def log_options(command: Command) -> Command:
+    """Options that show and keep what is logged while the command is at work."""
+
+    @wraps(command)
+    def with_log(*, debug: bool, log_file: Path | None, **others: Any) -> Any:
+        with logged(debug, log_file):
+            return command(**others)
+
+    return _with(
+        with_log,
+        click.option("--debug", is_flag=True, help="Show all that is done, and tracebacks of errors."),
+        click.option("--log-file", callback=path, metavar="FILE", help="Add to FILE all that --debug shows."),
     )
 
 

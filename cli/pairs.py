@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import debug_option
+from sat_intervals.cli.options import log_options
 
 if TYPE_CHECKING:
     from sat_intervals.tables import Scene
@@ -40,7 +40,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Truth so far outside an interval still counts as inside; for truth given in steps, half a step.",
         ),
         click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
-        debug_option,
+        log_options,
     ]
     for option in reversed(options):
         command = option(command)

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.options import (
-    debug_option,
     disparity_option,
     image_options,
+    log_options,
     named,
     settings_options,
     with_range,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @image_options
 @click.option("--memory", metavar="SIZE", help="What a worker may take, such as 4GB: tiles get smaller until they fit.")
 @settings_options
-@debug_option
+@log_options
 def plan(
     left: str,
     right: str,

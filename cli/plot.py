@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import debug_option
+from sat_intervals.cli.options import log_options
 
 _FILE = click.Path(path_type=Path)
 
@@ -16,7 +16,7 @@ _FILE = click.Path(path_type=Path)
 @click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
 @click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
 @click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots an inch: larger files.")
-@debug_option
+@log_options
 def plot(
     out: Path,
     truth: Path | None,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import debug_option
+from sat_intervals.cli.options import log_options
 
 _FILE = click.Path(path_type=Path)
 
@@ -12,7 +12,7 @@ _FILE = click.Path(path_type=Path)
 @click.command(short_help="Make a page of a finished run to look at in a browser.")
 @click.argument("out", type=_FILE)
 @click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if there is one.")
-@debug_option
+@log_options
 def report(out: Path, truth: Path | None) -> None:
     """Write OUT/report.html: one file for any browser, which needs no network and nothing beside it.
 

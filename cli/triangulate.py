@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import debug_option, path, quiet_option
+from sat_intervals.cli.options import log_options, path, quiet_option
 
 # Metres between lines of sight.
 _DOUBTFUL = 0.1
@@ -19,7 +19,7 @@ _DOUBTFUL = 0.1
 @click.option("--left-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the left image.")
 @click.option("--right-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the right image.")
 @quiet_option
-@debug_option
+@log_options
 def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path, quiet: bool) -> None:
     """Triangulate the disparity and both bounds of the finished run in the folder OUT.
 

@@ -4,6 +4,7 @@ The public names are loaded on first use, so that ``import sat_intervals`` and `
 for neither numba nor dask.
 """
 
+import logging
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,8 @@ __all__ = [
     "match_pair",
     "open_image",
 ]
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())  # who uses the library says where its words go
 
 _HOMES = {
     "Config": "config",

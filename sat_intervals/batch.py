@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import logging
 import os
 import resource
 import threading
@@ -28,6 +29,8 @@ from sat_intervals.run import check_failures, held, matched, measure_images
 from sat_intervals.store import remove_tiles
 
 REPORT = "batch.json"
+
+_LOG = logging.getLogger(__name__)
 
 _IMAGES = ("left", "right", "left_mask", "right_mask")
 # Names in the folder of a batch that are not those of pairs.
@@ -167,6 +170,8 @@ def match_batch(
         progress = stack.enter_context(held(cluster.store, progress))
 
         def note(states: Mapping[str, dict[str, Any]]) -> None:
+            for name, how in states.items():
+                _LOG.info("pair %s: %s", name, how.get("error", how["state"]))
             ended.update(states)
             LocalFolder(out).write(REPORT, json.dumps(ended, indent=1) + "\n")
 

@@ -1,5 +1,6 @@
 """Where tiles are matched: threads or processes of this machine, a dask scheduler, or jobs of a batch system."""
 
+import gc
 import logging
 import os
 import re
@@ -9,13 +10,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
 import dask
 from dask.utils import parse_bytes, parse_timedelta
-from distributed import Client, LocalCluster, Status
+from distributed import Client, LocalCluster, Status, Worker, WorkerPlugin
 from distributed.utils import silence_logging_cmgr
 
 from sat_intervals.config import Cluster, ConfigError
@@ -34,14 +36,7 @@ _CHARGE_PROJECTS = "lsf", "sge"
 
 _LOOPBACK = "127.0.0.1"
 
-
-def _is_news(record: logging.LogRecord) -> bool:
-    """A wait that distributed forgets when it closes is none, and asyncio tells it on stderr."""
-    error = record.exc_info[1] if record.exc_info else None
-    return not (isinstance(error, TimeoutError) and "never retrieved" in record.getMessage())
-
-
-logging.getLogger("asyncio").addFilter(_is_news)
+_LOG = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -56,6 +51,53 @@ def connected(settings: Cluster, out: Path) -> Iterator[Client]:
     SatIntervalsError
         When a scheduler does not answer, or the extra for batch systems is not installed.
     """
+    with _forgotten_waits_untold(), _client(settings, out) as client:
+        _LOG.info("connected to %s", client)
+        is_heard = logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG)
+        is_heard = is_heard and settings.kind not in ("threads", "address")  # in this process, and not ours
+        if is_heard or settings.kind == "processes":
+            client.register_plugin(_WorkerLog(is_heard))
+        for name in ("sat_intervals", "distributed") if is_heard else ():
+            client.forward_logging(name)
+        yield client
+    _LOG.info("disconnected")
+
+
+class _WorkerLog(WorkerPlugin):
+    """Of forgotten waits worker processes say nothing either; of all else everything, if the client hears it."""
+
+    name = "sat-intervals-log"
+
+    def __init__(self, is_heard: bool) -> None:
+        self._is_heard = is_heard
+
+    def setup(self, worker: Worker) -> None:
+        """Called on every worker as it starts."""
+        logging.getLogger("asyncio").addFilter(_is_news)
+        if self._is_heard:
+            logging.getLogger("sat_intervals").setLevel(logging.DEBUG)
+
+
+@contextmanager
+def _forgotten_waits_untold() -> Iterator[None]:
+    """Keep to itself what asyncio says of waits that distributed forgets when it closes."""
+    logger = logging.getLogger("asyncio")
+    news = partial(_is_news)  # one for each block: several threads may be connected
+    logger.addFilter(news)
+    try:
+        yield
+    finally:
+        gc.collect(1)  # what was forgotten is told of when it is collected
+        logger.removeFilter(news)
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    error = record.exc_info[1] if record.exc_info else None
+    return not (isinstance(error, TimeoutError) and "never retrieved" in record.getMessage())
+
+
+@contextmanager
+def _client(settings: Cluster, out: Path) -> Iterator[Client]:
     if settings.kind == "address":
         with silence_logging_cmgr(logging.CRITICAL), _client_of(settings.address) as client:
             yield client

@@ -20,7 +20,7 @@ from sat_intervals.products import FLAGS
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
 from sat_intervals.seams import seam_report
 from sat_intervals.summary import Tally
-from sat_intervals.tile import timed
+from sat_intervals.tile import logged_stage
 
 Item = TypeVar("Item")
 
@@ -58,7 +58,7 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
     with _going_on(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
-        with timed(seconds, "bands"):
+        with logged_stage(seconds, "bands"):
             strips = (Rows(**strip) for strip in store.strips(STRIP_PIXELS // region.width))
             row = 0
             for final in _ahead(finish_strips(_ahead(strips), scale, config)):
@@ -66,7 +66,7 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
                 tally.add(final.intervals, final.validity)
                 row += final.validity.shape[0]
                 progress("bands", row, region.height)
-        with timed(seconds, "files"):
+        with logged_stage(seconds, "files"):
             progress("files", 0, 1)
             writer.build()
             progress("files", 0, 1)  # so that a run that is to end, or has lost its store, does so before it publishes

@@ -1,5 +1,6 @@
 """Tasks on their way through a cluster, a bounded number of them at a time, whatever becomes of its workers."""
 
+import logging
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -16,6 +17,8 @@ from sat_intervals.errors import RunError
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
 _LOOK_AGAIN = 2.0
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class Flight:
         self._flying: dict[str, tuple[Task, bool, Future[Any]]] = {}
         self._suspects: list[Task] = []
         self._width, self._looked = 2, float("-inf")
+        self._workers: set[str] = set()
 
     def __iter__(self) -> Iterator[Landing | None]:
         self._fill()
@@ -81,6 +85,7 @@ class Flight:
             future.release()
             is_blamed = isinstance(error, KilledWorker) and not is_alone
             if is_blamed:
+                _LOG.info("%s of %s: its workers died; it is tried again, alone", task.function.__name__, task.label)
                 self._suspects.append(task)
             self._fill()
             if not self._flying and self._suspects:
@@ -100,13 +105,20 @@ class Flight:
         """Submit tasks until two are in flight for every core that there is now."""
         if time.monotonic() - self._looked > _LOOK_AGAIN:
             with _scheduler_needed():
-                self._width = 2 * max(1, sum(self._client.nthreads().values()))
+                cores = self._client.nthreads()
+            self._width = 2 * max(1, sum(cores.values()))
+            self._note_workers(set(cores))
             self._looked = time.monotonic()
         while len(self._flying) < self._width:
             following = next(self._tasks, None)
             if following is None:
                 return
             self._submit(following)
+
+    def _note_workers(self, workers: set[str]) -> None:
+        for worker in sorted(workers ^ self._workers):
+            _LOG.info("worker %s %s", worker, "joined" if worker in workers else "left")
+        self._workers = workers
 
     def _submit(self, task: Task, *, is_alone: bool = False) -> None:
         self._submitted += 1

@@ -1,6 +1,7 @@
 """All tiles of a pair, all pairs of a batch, a bounded number of them in flight."""
 
 import errno
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,11 +18,13 @@ from sat_intervals.folders import folder_at
 from sat_intervals.job import Job, compile_kernels, prepare
 from sat_intervals.normalization import Moments, Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
-from sat_intervals.tile import match_tile, measure_block, timed
+from sat_intervals.tile import logged_stage, match_tile, measure_block
 from sat_intervals.tiling import Window
 
 # Errors of a disk, or of a user's share of it.
 _FULL = errno.ENOSPC, errno.EDQUOT
+
+_LOG = logging.getLogger(__name__)
 
 
 def match_pair(
@@ -67,18 +70,18 @@ def match_pair(
         Tiles that failed; no output has its final name.
     """
     seconds: dict[str, float] = {}
-    with timed(seconds, "start"):
+    with logged_stage(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
     with held(job.store.home, progress), held(job.store.elsewhere, progress) as progress:
         job.begin(overwrite=overwrite)
-        with timed(seconds, "kernels"):
+        with logged_stage(seconds, "kernels"):
             progress("kernels", 0, 1)
             compile_kernels(job.config)
             progress("kernels", 1, 1)
-        with timed(seconds, "tiles"):
+        with logged_stage(seconds, "tiles"):
             if job.waiting():
                 with connected(job.config.cluster, job.out) as client:
-                    with timed(seconds, "tiles.images"):
+                    with logged_stage(seconds, "tiles.images"):
                         measure_images(client, job, progress)
                     for _, failures in matched(client, [job], progress):
                         check_failures(job, failures)
@@ -178,6 +181,7 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
         if error is not None:
             failures[i][tile.name] = error
             jobs[i].store.write_failure(tile.name, reason(error))
+        _LOG.debug("%s: tile %s %s", jobs[i].out, tile.name, f"failed: {reason(error)}" if error else "done")
         left[i] -= 1
         done += 1
         progress("tiles", done, total)

@@ -1,5 +1,6 @@
 """One tile on a worker: read, match, leave behind what the strips need."""
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +21,8 @@ from sat_intervals.raster import Image, read_window
 from sat_intervals.seams import seam_lines
 from sat_intervals.tiling import Tile, Window
 
+_LOG = logging.getLogger(__name__)
+
 
 @contextmanager
 def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
@@ -27,6 +30,16 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     started = time.perf_counter()
     yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
+
+
+@contextmanager
+def logged_stage(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Like `timed`, and say in the log when the stage begins and ends."""
+    _LOG.info("stage %s begins", stage)
+    before = seconds.get(stage, 0.0)
+    with timed(seconds, stage):
+        yield
+    _LOG.info("stage %s ended after %.1f s", stage, seconds[stage] - before)
 
 
 def measure_block(image: Image, block: Window) -> Moments:
@@ -42,8 +55,12 @@ def match_tile(job: Job, tile: Tile) -> None:
     """Match one tile and write what it leaves behind; runs on a worker."""
     try:
         _match_tile(job, tile)
-    except SatIntervalsError as error:
-        error.__cause__ = error.__context__ = None  # GDAL's, which do not survive the way back from the worker
+    except Exception as error:
+        _LOG.info(
+            "tile %s failed; it is tried again, %d times at most", tile.name, job.config.cluster.retries, exc_info=True
+        )
+        if isinstance(error, SatIntervalsError):
+            error.__cause__ = error.__context__ = None  # GDAL's, which do not survive the way back from the worker
         raise
 
 
@@ -77,6 +94,7 @@ def _match_tile(job: Job, tile: Tile) -> None:
         job.store.write_arrays(tile, left_behind)
         job.store.check(job.manifest)
     job.store.write_record(tile, {"usable_pixels": usable, "pixels_read": pixels_read, "seconds": seconds})
+    _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
 
 def _checked_scales(job: Job) -> Scales | None:

@@ -176,3 +176,54 @@ def test_packages__equal_the_folders() -> None:
 def test_entry_point__is_not_hidden_by_a_module() -> None:
     package, command = PYPROJECT["project"]["scripts"]["sat-intervals"].split(":")
     assert f"{package}.{command}" not in MODULES
+
+
+# What the interpreter and the libraries are set to.
+STATE = """
+import gc, importlib, logging, signal, sys, warnings
+from numba import config
+
+def state():
+    loggers = [logging.root, *(x for x in logging.root.manager.loggerDict.values() if isinstance(x, logging.Logger))]
+    return {
+        **{f"numba's {name}": repr(getattr(config, name)) for name in dir(config) if not name.startswith("_")},
+        **{f"signal {number}": signal.getsignal(number) for number in signal.valid_signals()},
+        **{
+            f"logger {one.name}": (one.level, one.propagate, one.disabled, one.handlers[:], one.filters[:])
+            for one in loggers
+            if one.name.partition(".")[0] != "sat_intervals"
+        },
+        "warnings": warnings.filters[:],
+        "garbage": (gc.isenabled(), gc.get_threshold()),
+        "hooks": (sys.excepthook, sys.unraisablehook),
+    }
+"""
+IMPORT_ALL = f"""
+import importlib
+for name in {[name.removesuffix(".__init__") for name in MODULES]!r}:
+    importlib.import_module(name)
+"""
+
+
+def test_modules__importing_them_changes_nothing_of_others() -> None:
+    """Other libraries may set at import what they like: theirs are imported before."""
+    others = run_python(f"{IMPORT_ALL}import sys; print(*[name for name in sys.modules if name[:4] != 'sat_'])").split()
+    script = f"""{STATE}
+for name in {others!r}:
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        pass
+before = state()
+{IMPORT_ALL}
+after = state()
+for name, value in before.items():
+    if after[name] != value:
+        print(name, "was", value, "and is", after[name])
+"""
+    assert run_python(script) == ""
+
+
+def run_python(script: str) -> str:
+    """What a script prints, in a process of its own."""
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout

@@ -1,6 +1,7 @@
 """The command as a person meets it: what is refused and how, what is printed, what files others find."""
 
 import json
+import logging
 import os
 import pty
 import re
@@ -25,6 +26,7 @@ from rio_cogeo.cogeo import cog_validate
 from sat_intervals import load_config, match_arrays
 from sat_intervals.cli import main
 from sat_intervals.config import preset_names, preset_text
+from sat_intervals.errors import RunError
 from sat_intervals.products import BANDS, FLAGS, INVALID
 from sat_intervals.scene import make_scene
 
@@ -342,6 +344,112 @@ def test_match__tells_what_nobody_foresaw_in_one_line(folder, tmp_path, monkeypa
 
     monkeypatch.setattr("sat_intervals.run.match_pair", fail)
     assert_refused(invoke(*matching(folder, tmp_path / "out")), says, status=status)
+
+
+# ---- What is logged ---------------------------------------------------------------------------------------------
+LINE = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (?:DEBUG  |INFO   |WARNING|ERROR  ) (\S+): (.*)"
+
+
+def logged(text):
+    """Logger and message of every line that has them."""
+    return re.findall(f"^{LINE}$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("cluster", ["threads", "processes"])
+def test_debug__shows_stages_tiles_and_workers_and_what_dask_says(folder, tmp_path, cluster):
+    options = ["--quiet", "--tile-size", 128, "--cluster", cluster, "--workers", 2, "--debug"]
+    result = command(*matching(folder, tmp_path / "out", *options))
+    assert (result.returncode, result.stdout) == (0, "")
+    words = logged(result.stderr)
+    assert len(words) == len(result.stderr.splitlines())
+    for stage in ("start", "kernels", "tiles", "bands", "files"):
+        assert [message for _, message in words if re.fullmatch(rf"stage {stage} begins", message)]
+        assert [message for _, message in words if re.fullmatch(rf"stage {stage} ended after \d+\.\d s", message)]
+    tiles = [f"{row}_{column}" for row in range(2) for column in range(3)]
+    done = [message for name, message in words if name == "sat_intervals.run"]
+    assert sorted(done) == [f"{tmp_path / 'out'}: tile {tile} done" for tile in tiles]
+    took = [re.match(r"tile (\d_\d): read \d+\.\d\d s, match \d+\.\d\d s", message) for _, message in words]
+    assert sorted(match[1] for match in took if match) == tiles
+    joined = [message for name, message in words if re.fullmatch(r"worker \S+ joined", message)]
+    assert len(joined) == (2 if cluster == "processes" else 1)
+    assert "distributed.scheduler" in {name for name, _ in words}
+    assert re.fullmatch(r"sat-intervals match ended after \d+\.\d s", words[-1][1])
+
+
+def test_log_file__keeps_what_debug_shows_and_what_it_held(folder, tmp_path):
+    log = tmp_path / "run.log"
+    log.write_text("mine\n")
+    options = ["--quiet", "--tile-size", 64, "--overlap", 5, "--cluster", "processes", "--workers", 1]
+    arguments = matching(folder, tmp_path / "out", *options, "--log-file", log, left="cut.tif")
+    result = command(*arguments)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert all(line.startswith(("sat-intervals: ", "  tile ")) for line in result.stderr.splitlines())
+    kept = log.read_text()
+    assert kept.startswith("mine\n")
+    words = logged(kept)
+    assert {"sat_intervals.tile", "sat_intervals.flight", "distributed.scheduler"} <= {name for name, _ in words}
+    assert len([message for _, message in words if message.endswith("tile 3_4 done")]) == 0
+    assert len([message for _, message in words if "tile 3_4 failed: " in message]) == 1
+    retries = load_config(folder / "settings.yaml").cluster.retries
+    tries = [message for _, message in words if message.startswith("tile 3_4 failed; ")]
+    assert tries == [f"tile 3_4 failed; it is tried again, {retries} times at most"] * (1 + retries)
+    assert "Traceback (most recent call last)" in kept
+    assert "\nsat_intervals.errors.RunError: " in kept
+    command(*arguments)
+    assert log.read_text().startswith(kept)
+    assert len(log.read_text()) > len(kept)
+
+
+@pytest.mark.parametrize("options", [[], ["--debug"], ["--debug", "--log-file", "run.log"]])
+def test_commands__leave_logging_as_it_was(folder, tmp_path, monkeypatch, options):
+    """Whether they succeed or fail."""
+
+    def fail(*arguments, **options):
+        logging.getLogger("sat_intervals.run").warning("two\nlines")
+        raise RunError("in vain")
+
+    def state():
+        loggers = map(logging.getLogger, ("root", "sat_intervals", "distributed", "asyncio"))
+        return [(logger.level, logger.handlers[:], logger.filters[:]) for logger in loggers]
+
+    monkeypatch.chdir(tmp_path)
+    before = state()
+    assert invoke(*matching(folder, tmp_path / "out"), *options).exit_code == 0
+    monkeypatch.setattr("sat_intervals.run.match_pair", fail)
+    assert invoke(*matching(folder, tmp_path / "out"), *options).exit_code == 1
+    assert state() == before
+
+
+def test_match__shows_a_warning_in_a_line(folder, tmp_path, monkeypatch):
+    def warn(*arguments, **options):
+        log = logging.getLogger("sat_intervals.run")
+        log.info("nobody asked")
+        log.warning("%d doubts", 3)
+        raise RunError("in vain")
+
+    monkeypatch.setattr("sat_intervals.run.match_pair", warn)
+    arguments = matching(folder, tmp_path / "out")
+    assert invoke(*arguments).stderr == "sat-intervals: 3 doubts\nsat-intervals: in vain\n"
+    words = logged(invoke(*arguments, "--debug").stderr)
+    assert words == [
+        ("sat_intervals.cli.logs", "main match begins"),
+        ("sat_intervals.run", "nobody asked"),
+        ("sat_intervals.run", "3 doubts"),
+        ("sat_intervals.cli.logs", "main match failed"),
+    ]
+
+
+def test_log_file__that_cannot_be_written_is_refused(folder, tmp_path):
+    log = tmp_path / "none" / "run.log"
+    result = invoke(*matching(folder, tmp_path / "out", "--log-file", log))
+    assert_refused(result, f"{log} cannot be written: No such file or directory: choose another --log-file")
+    assert not (tmp_path / "out").exists()
+
+
+def test_log_file__on_a_full_disk_does_not_stop_the_run(folder, tmp_path):
+    result = invoke(*matching(folder, tmp_path / "out", "--log-file", "/dev/full"))
+    assert result.exit_code == 0, result.output
+    assert result.stderr == "sat-intervals: /dev/full: No space left on device: the log ends here\n"
 
 
 # ---- A run that is ended ----------------------------------------------------------------------------------------

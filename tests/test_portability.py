@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sat_intervals
-from sat_intervals.kernels import FINGERPRINT, _fingerprint
+from sat_intervals.kernels.compiled import FINGERPRINT, fingerprint
 
 TESTS = Path(__file__).parent
 
@@ -43,10 +43,10 @@ def test_fingerprint__follows_every_source_that_decides_what_kernels_do(tmp_path
     package = Path(sat_intervals.__file__).parent
     shutil.copytree(package / "kernels", tmp_path / "kernels")
     shutil.copy(package / "products.py", tmp_path)
-    assert _fingerprint(tmp_path) == FINGERPRINT
+    assert fingerprint(tmp_path) == FINGERPRINT
     with (tmp_path / changed).open("a") as source:
         source.write("# changed\n")
-    assert _fingerprint(tmp_path) != FINGERPRINT
+    assert fingerprint(tmp_path) != FINGERPRINT
 
 
 def test_kernels__plain_ones_equal_their_twins_without_compilation(tmp_path):
@@ -60,9 +60,52 @@ def test_kernels__plain_ones_equal_their_twins_without_compilation(tmp_path):
     )
 
 
-def test_kernels__where_none_can_be_kept_leave_nothing_behind(tmp_path):
-    script = "from sat_intervals import kernels; from numba import config; print(config.CACHE_DIR)"
-    environment = os.environ | {"NUMBA_CACHE_DIR": "/proc/no-folder", "TMPDIR": str(tmp_path)}
-    run = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
-    assert Path(run.stdout.strip()).parent == tmp_path
+# Tells how often machine code was found, how often it was made, and where.
+USE_A_KERNEL = """
+import numpy as np
+def use():
+    from sat_intervals.kernels.lattice import interpolate
+    interpolate(np.zeros((2, 2, 2, 1)), np.ones(3), np.zeros(3), np.zeros((2, 2), np.float32))
+    stats = interpolate.stats
+    return sum(stats.cache_hits.values()), sum(stats.cache_misses.values()), stats.cache_path
+"""
+
+
+def use_a_kernel(script, **environment):
+    """What a script that has `use` prints, in a process of its own."""
+    command = [sys.executable, "-c", USE_A_KERNEL + script]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_cached__a_kernel_is_compiled_once_for_all_processes(tmp_path):
+    on_a_worker = """
+if __name__ == "__main__":
+    from distributed import Client, LocalCluster
+    with LocalCluster(1, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
+        print(*client.submit(use).result())
+"""
+    first, second, worker = (
+        use_a_kernel(script, NUMBA_CACHE_DIR=str(tmp_path))
+        for script in ("print(*use())", "print(*use())", on_a_worker)
+    )
+    assert first[:2] == ["0", "1"]
+    assert second[:2] == worker[:2] == ["1", "0"]
+    assert {Path(place).parent for *_, place in (first, second, worker)} == {tmp_path / "sat-intervals" / FINGERPRINT}
+
+
+def test_cached__functions_of_others_stay_out_of_its_folder(tmp_path):
+    (tmp_path / "stranger.py").write_text(
+        "from numba import njit\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"
+    )
+    script = "use()\nimport stranger\nprint(stranger.double.stats.cache_path)"
+    cache = tmp_path / "cache"
+    (path,) = use_a_kernel(script, NUMBA_CACHE_DIR=str(cache), PYTHONPATH=str(tmp_path))
+    assert Path(path).parent == cache
+
+
+def test_cached__where_none_can_be_kept_leaves_nothing_behind(tmp_path):
+    used = use_a_kernel("print(*use())", NUMBA_CACHE_DIR="/proc/no-folder", TMPDIR=str(tmp_path))
+    assert used == ["0", "1", "None"]
     assert list(tmp_path.iterdir()) == []

@@ -1,6 +1,7 @@
 """Files to files on real workers: the laws of tiles, resume, reports."""
 
 import json
+import logging
 import shutil
 import warnings
 
@@ -9,7 +10,8 @@ import pytest
 import rasterio
 
 from sat_intervals import match_arrays, match_pair, run
-from sat_intervals.config import load_config
+from sat_intervals.cluster import connected
+from sat_intervals.config import Cluster, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.job import prepare
 from sat_intervals.products import INVALID, NO_DATA
@@ -241,3 +243,20 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
     assert differs[0].sum() / judged.sum() <= 0.001
     assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.0025
+
+
+def test_connected__asyncio_is_heard_again_afterwards(tmp_path, caplog):
+    def forget_a_wait():
+        try:
+            raise TimeoutError
+        except TimeoutError:
+            logging.getLogger("asyncio").exception("Task exception was never retrieved")
+
+    with connected(Cluster(workers=1), tmp_path):
+        with connected(Cluster(workers=1), tmp_path):
+            forget_a_wait()
+        forget_a_wait()
+        logging.getLogger("asyncio").error("news")
+        assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == ["news"]
+    forget_a_wait()
+    assert caplog.records[-1].getMessage() == "Task exception was never retrieved"

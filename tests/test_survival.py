@@ -382,14 +382,18 @@ def test_match__does_only_what_is_missing_after_a_truncated_input_is_mended(pair
 
 
 def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tmp_path):
-    out = tmp_path / "out"
+    out, log = tmp_path / "out", tmp_path / "log"
     with scheduler(tmp_path) as (address, _):
         # of which dask leaves 95 %; a worker takes 270 MiB between tiles
         with (
             worker(address, tmp_path, "--memory-limit", "430MiB"),
-            started(uneven, out, "--cluster", address) as command,
+            started(uneven, out, "--cluster", address, "--log-file", str(log)) as command,
         ):
             assert command.end() == 1, command.output
+            alone = (
+                r"match_tile of \(0, Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried again, alone"
+            )
+            assert re.search(alone, log.read_text())
             assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
             assert "give workers more, or choose smaller tiles" in command.output
         assert_nothing_final(out)

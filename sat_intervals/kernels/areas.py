@@ -4,12 +4,12 @@ Letters: r row, c column, s and t segments: runs of low-confidence pixels in a r
 """
 
 import numpy as np
-from numba import njit
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.intervals import find_segments, find_touching
 
 
-@njit(nogil=True, cache=True)
+@cached
 def area_maximum(values, low, depth):
     """The largest value over the low-confidence area around each low-confidence pixel (paper eq. 16).
 

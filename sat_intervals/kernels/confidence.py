@@ -6,6 +6,7 @@ Letters: r row, c column, k disparity index.
 import numpy as np
 from numba import njit
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.products import IMPOSSIBLE_COST
 
 
@@ -59,7 +60,7 @@ def percentiles(histogram: np.ndarray) -> tuple[float, float]:
     return percentile(0.01), percentile(0.99)
 
 
-@njit(nogil=True, cache=True)
+@cached
 def normalize(ambiguity, searched, p1, p99):
     """Confidence in [0, 1] from ambiguity: ``1 - clip((A - p1) / (p99 - p1), 0, 1)``.
 
@@ -92,7 +93,7 @@ def normalize(ambiguity, searched, p1, p99):
     return confidence
 
 
-@njit(nogil=True, cache=True)
+@cached
 def low_confidence(confidence, threshold, kernel):
     """Pixels whose smallest confidence over ``1 x kernel`` is at most the threshold (paper eq. 12 and 13).
 

@@ -6,6 +6,7 @@ Letters: r row, c column, k disparity index, x = c + k column of the right featu
 import numpy as np
 from numba import njit
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.vector import LANES, load_floats, multiply_add, splat_float, store_rounded
 from sat_intervals.products import COSINE_STEPS
 
@@ -40,7 +41,7 @@ def _correlate_four(here, there, c, start, curves):
         store_rounded(curves, 3 * size + x, total_4)
 
 
-@njit(nogil=True, cache=True)
+@cached
 def _correlate(left, right, steps, costs, here, there, curves):
     rows, columns, size = costs.shape
     for r in range(rows):

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit, types
 from numba.extending import overload
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, load_bytes, store
 
 
@@ -59,7 +60,7 @@ def between(left: Codes, right: Codes) -> Costs:
     return Costs(left.words, words, left.state, right.state)
 
 
-@njit(nogil=True, cache=True)
+@cached
 def _census_words(pixels, radius, words):
     """Shift one bit a neighbour into each word, row by row, so that columns vectorise."""
     bits = words.itemsize * 8
@@ -77,7 +78,7 @@ def _census_words(pixels, radius, words):
                 neighbour += 1
 
 
-@njit(nogil=True, cache=True)
+@cached
 def _window_union(state, radius, union):
     """Union of the states under each window, one axis after the other."""
     rows, columns = union.shape

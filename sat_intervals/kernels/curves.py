@@ -8,6 +8,7 @@ Letters: r row, c column, k disparity index (disparity = minimum + k).
 import numpy as np
 from numba import njit
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.disparity import vfit
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
@@ -23,7 +24,7 @@ def _least(curve):
     return least
 
 
-@njit(nogil=True, cache=True)
+@cached
 def read_winners(volume, minimum, weights, refine):
     """Winner, refined disparity and ambiguity of every curve.
 
@@ -46,7 +47,7 @@ def read_winners(volume, minimum, weights, refine):
     return winner, disparity, doubt
 
 
-@njit(nogil=True, cache=True)
+@cached
 def read_right_winners(volume, minimum):
     """The right view's winners along the diagonals of the left volume; the largest disparity at ties.
 
@@ -75,7 +76,7 @@ def _extremes(curve, limit):
     return first, last
 
 
-@njit(nogil=True, cache=True)
+@cached
 def read_alpha_cuts(volume, minimum, cut_level, refine):
     """Bounds of the alpha-cut of every curve (paper eq. 5 to 9), pushed out for refinement.
 
@@ -99,7 +100,7 @@ def read_alpha_cuts(volume, minimum, cut_level, refine):
     return lower, upper
 
 
-@njit(nogil=True, cache=True)
+@cached
 def read_baseline(volume, minimum, part, whole):
     """The paper's baseline (its section 4.1): each curve normalised by its own minimum and maximum.
 

@@ -7,6 +7,7 @@ faces the first left column at the minimum: ``x = c + k``.
 import numpy as np
 from numba import njit
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.products import IMPOSSIBLE_COST, MISMATCH, NO_DISPARITY, OCCLUSION
 
 
@@ -26,7 +27,7 @@ def vfit(curve, k, count):
     return (before - after) / (2 * (steepest - here)), True
 
 
-@njit(nogil=True, cache=True)
+@cached
 def cross_check(winner, right_winner, minimum, tolerance):
     """Rejected pixels: a left winner that the winner of the right pixel it points to does not confirm.
 
@@ -160,7 +161,7 @@ def _median_3(values, kept):
     return result
 
 
-@njit(nogil=True, cache=True)
+@cached
 def median(values, kept, size):
     """Median of the kept pixels of each kept pixel's window; the other pixels keep their value.
 

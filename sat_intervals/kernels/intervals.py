@@ -6,6 +6,7 @@ Letters: r row, c column, k disparity index, s segment: a run of low-confidence 
 import numpy as np
 from numba import njit
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.vector import LANES, first_lane, lanes_above_last, lanes_at_most, load
 
 
@@ -150,7 +151,7 @@ def _same_neighbours(s, t, above, below):
     return same and (above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1])
 
 
-@njit(nogil=True, cache=True)
+@cached
 def regularize(lower, upper, low, minimum, depth, quantile, first, last):
     """Widen the intervals of low-confidence areas to quantiles of the area's bounds (paper section 3.5).
 

@@ -4,10 +4,11 @@ Letters: r row, c column, i, j, k node of the lattice along rows, columns and di
 """
 
 import numpy as np
-from numba import njit
+
+from sat_intervals.kernels.compiled import cached
 
 
-@njit(nogil=True, cache=True)
+@cached
 def interpolate(lattice, spacing, first, disparity):
     """Values at the disparities of some pixels.
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.cost import Costs, cost_curve, padded_to_lanes
 from sat_intervals.kernels.disparity import vfit
@@ -212,7 +213,7 @@ def _prepare(costs: Costs) -> _Patch:
     )
 
 
-@njit(nogil=True, cache=True)
+@cached
 def _sweep_down(patch, gradients, settings, row, column, volume):
     """Store the sums of the downward paths of the wanted pixels, which begin at ``row, column``."""
     left, right, left_state, right_state, barrier, possible, beyond, paths, lowest, curve = patch
@@ -253,7 +254,7 @@ def _explain(left_state, right_state, r, c, count, possible):
     return flags
 
 
-@njit(nogil=True, cache=True)
+@cached
 def _sweep_up(patch, gradients, settings, row, column, volume, keep, raw, core, index, right_cost, right_best):
     """Finish the curves of the wanted pixels and read them; ``core`` is what the right view is made of."""
     left, right, left_state, right_state, barrier, possible, beyond, paths, lowest, curve = patch

@@ -4,7 +4,8 @@ Letters: i, j row and column of a cell, u, v position of a point in cells from t
 """
 
 import numpy as np
-from numba import njit
+
+from sat_intervals.kernels.compiled import cached
 
 # What is gathered of a cell.
 WEIGHT, HEIGHT, CONFIDENCE, LOWER, UPPER, LEAST, MOST, COUNT, BOUNDED = range(9)
@@ -17,7 +18,7 @@ def empty_cells(rows: int, columns: int) -> np.ndarray:
     return cells
 
 
-@njit(nogil=True, cache=True)
+@cached
 def splat(column, row, height, lower, upper, confidence, radius, cells):
     """Let points reach the cell they fall in and all cells whose centre lies within a radius.
 

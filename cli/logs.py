@@ -1,0 +1,104 @@
+"""``--debug`` and ``--log-file``: what the library logs, on stderr and in a file, for the time of one command."""
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+import click
+
+from sat_intervals.cli.signals import Ended
+
+_LOG = logging.getLogger(__name__)
+_LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
+_WARNINGS = logging.Formatter("sat-intervals: %(message)s")
+
+
+class _Handler(logging.Handler):
+    """Writes lines to a file, or to what stderr is at the time: a progress bar takes its place to stay whole.
+
+    It is no StreamHandler: dask silences those of its own loggers.
+    """
+
+    def __init__(self, lines: logging.Formatter, file: IO[str] | None = None) -> None:
+        super().__init__()
+        self.setFormatter(lines)
+        self._file = file
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            click.echo(self.format(record), file=self._file, err=True)
+        except OSError as error:
+            if self._file:  # such as a full disk: the run goes on without its log
+                click.echo(f"sat-intervals: {self._file.name}: {error.strerror}: the log ends here", err=True)
+            self.setLevel(logging.CRITICAL + 1)
+        except Exception:  # as of any handler: a log stops nobody
+            self.handleError(record)
+
+
+@contextmanager
+def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
+    """For the time of the block: warnings on stderr, or all there is with ``debug``; and all of it in a file.
+
+    Raises
+    ------
+    SatIntervalsError
+        For a file that cannot be written.
+    """
+    ours = logging.getLogger("sat_intervals")
+    with ExitStack() as stack:
+        everything = [_Handler(_LINES, stack.enter_context(_opened(log_file)))] if log_file else []
+        if debug:
+            everything.append(_Handler(_LINES))
+        else:
+            warnings = _Handler(_WARNINGS)
+            warnings.setLevel(logging.WARNING)
+            stack.enter_context(_added(warnings, ours))
+        # dask gives its logger a handler of its own, and keeps the root's from it, unless the root has some by then
+        dasks = logging.getLogger("distributed")
+        for handler in everything:
+            stack.enter_context(_added(handler, logging.root))
+            if not dasks.propagate:
+                stack.enter_context(_added(handler, dasks))
+        if everything:
+            stack.callback(ours.setLevel, ours.level)
+            ours.setLevel(logging.DEBUG)
+        name, began = click.get_current_context().command_path, time.monotonic()
+        _LOG.info("%s begins", name)
+        try:
+            yield
+        except (click.ClickException, click.exceptions.Exit):
+            raise
+        except Ended as ended:
+            _LOG.info("%s %s", name, ended)
+            raise
+        except Exception as error:
+            _LOG.debug("%s failed", name, exc_info=error)
+            raise
+        _LOG.info("%s ended after %.1f s", name, time.monotonic() - began)
+
+
+@contextmanager
+def _added(handler: logging.Handler, logger: logging.Logger) -> Iterator[None]:
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+@contextmanager
+def _opened(log_file: Path) -> Iterator[IO[str]]:
+    try:
+        file = log_file.open("a", encoding="utf-8", errors="backslashreplace", buffering=1)
+    except OSError as error:
+        from sat_intervals.errors import SatIntervalsError
+
+        raise SatIntervalsError(f"{log_file} cannot be written: {error.strerror}: choose another --log-file") from error
+    try:
+        yield file
+    finally:
+        with suppress(OSError):  # of a full disk, which was told
+            file.close()
