@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
-from sat_intervals.cluster import Jobs
+from sat_intervals.cluster import cores_there
 from sat_intervals.errors import RunError
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
@@ -55,12 +55,11 @@ class Flight:
     Raises
     ------
     RunError
-        When the scheduler is gone, or all jobs of a batch system.
+        When the scheduler is gone, or all workers of a batch system.
     """
 
     def __init__(self, client: Client, tasks: Iterator[Task]) -> None:
         self._client, self._tasks = client, tasks
-        self._jobs = Jobs(client)
         self._name = uuid.uuid4().hex  # a scheduler may serve several runs, and takes equal keys for one task
         self._submitted = 0
         self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
@@ -93,14 +92,13 @@ class Flight:
         try:
             return self._ended.get(timeout=_LOOK_AGAIN)
         except Empty:
-            self._jobs.check()
             return None
 
     def _fill(self) -> None:
         """Submit tasks until two are in flight for every core that there is now."""
         if time.monotonic() - self._looked > _LOOK_AGAIN:
             with _scheduler_needed():
-                self._width = 2 * max(1, sum(self._client.nthreads().values()))
+                self._width = 2 * max(1, cores_there(self._client))
             self._looked = time.monotonic()
         while len(self._flying) < self._width:
             following = next(self._tasks, None)
