@@ -74,7 +74,7 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
         report = _report(job, scale, tally, seconds)
-        writer.publish({"run.json": json.dumps(report, indent=1) + "\n"})
+        writer.publish(report=("run.json", json.dumps(report, indent=1) + "\n"))
         progress("files", 1, 1)
     return report
 
