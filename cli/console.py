@@ -13,7 +13,6 @@ from sat_intervals.cli import signals
 
 STAGES = {
     "scene": "making a scene",
-    "lease": "waiting up to 20 s for a sign of life of the run that holds the store",
     "pairs": "looking at pairs",
     "pairs.files": "finishing pairs",
     "kernels": "preparing kernels (compiled once a machine, then about a second)",

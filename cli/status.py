@@ -30,10 +30,10 @@ def status(out: Path) -> None:
 
 
 def _tell(out: Path) -> None:
-    from sat_intervals.job import OUTPUTS
+    from sat_intervals.job import is_complete
     from sat_intervals.store import read_status
 
-    if all((out / name).exists() for name in OUTPUTS):
+    if is_complete(out):
         click.echo(f"{out}: complete")
         return
     now = read_status(out / "tiles")

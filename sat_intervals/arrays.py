@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import zarr
 from zarr.codecs import BloscCodec
+from zarr.errors import ContainsArrayError
 
 from sat_intervals.folders import Folder
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
@@ -69,11 +71,11 @@ class TileArrays:
         return self.grid.size + self.count - 1
 
     def create(self) -> None:
-        """Make them, empty."""
+        """Make those that are not there, empty; of several that do so at once, each makes the same."""
         size, height = self.grid.size, self.grid.rows * self.grid.size
         width = self.grid.columns * size
         together = math.gcd(size, _ROWS_TOGETHER)
-        group = zarr.create_group(self.folder.place(""), zarr_format=3)
+        group = zarr.open_group(self.folder.place(""), mode="a", zarr_format=3)
         for dtype, planes in _PLANES.items():
             count = len(planes)
             _create(group, dtype, (count, height, width), (count, size, size), (count, together, size), dtype)
@@ -211,9 +213,10 @@ def _create(
     dtype: npt.DTypeLike,
     fill: Any = 0,
 ) -> None:
-    group.create_array(
-        name, shape=shape, shards=shard, chunks=chunk, dtype=dtype, compressors=_COMPRESSOR, fill_value=fill
-    )  # fmt: skip
+    with suppress(ContainsArrayError):
+        group.create_array(
+            name, shape=shape, shards=shard, chunks=chunk, dtype=dtype, compressors=_COMPRESSOR, fill_value=fill
+        )  # fmt: skip
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:

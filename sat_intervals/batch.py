@@ -21,11 +21,11 @@ from sat_intervals.cluster import connected
 from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Cluster, Config, load_config, load_yaml
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.folders import LocalFolder, folder_at
-from sat_intervals.job import OUTPUTS, Job, changes_since, compile_kernels, prepare
+from sat_intervals.folders import LocalFolder
+from sat_intervals.job import Job, changes_since, compile_kernels, is_complete, prepare
 from sat_intervals.raster import Image, open_image
 from sat_intervals.results import open_run
-from sat_intervals.run import check_failures, held, matched, measure_images
+from sat_intervals.run import check_failures, matched, measure_images
 from sat_intervals.store import remove_tiles
 
 REPORT = "batch.json"
@@ -162,12 +162,9 @@ def match_batch(
     """
     ended: dict[str, dict[str, Any]] = {}
     cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
-    if cluster.store and folder_at(cluster.store) == folder_at(out):
-        raise SatIntervalsError(f"the store is {out} itself, where tiles lie by default: leave it out")
     _allow_files()
     with ExitStack() as stack:
-        stack.enter_context(held(out, progress))
-        progress = stack.enter_context(held(cluster.store, progress))
+        stack.enter_context(LocalFolder(out).locked())
 
         def note(states: Mapping[str, dict[str, Any]]) -> None:
             for name, how in states.items():
@@ -180,7 +177,7 @@ def match_batch(
         for number, pair in enumerate(pairs):
             progress("pairs", number, len(pairs))
             try:
-                settings = _settings(pair, config, overrides, cluster)
+                settings = load_config(config, {**(overrides or {}), **_merged(overrides or {}, pair.settings)})
                 before = None if overwrite else _done_before(pair, out, settings)
                 if before is None:
                     jobs[pair.name] = _begun(pair, out, settings, overwrite, stack)
@@ -207,13 +204,6 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
         raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: run the batch again") from error
 
 
-def _settings(pair: PairOfBatch, config: Any, overrides: Mapping[str, Any] | None, cluster: Cluster) -> Config:
-    """The settings of a pair, its tiles in a folder of its name where those of the batch lie elsewhere."""
-    settings = load_config(config, {**(overrides or {}), **_merged(overrides or {}, pair.settings)})
-    store = cluster.store and f"{cluster.store.rstrip('/')}/{pair.name}"
-    return settings.model_copy(update={"cluster": settings.cluster.model_copy(update={"store": store})})
-
-
 def _images(pair: PairOfBatch) -> tuple[Image, Image]:
     return open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
 
@@ -221,7 +211,7 @@ def _images(pair: PairOfBatch) -> tuple[Image, Image]:
 def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
     """What the run says that was made of a pair before, with the same settings and images; None where there is none."""
     folder = out / pair.name
-    if not all((folder / name).exists() for name in OUTPUTS):
+    if not is_complete(folder):
         return None
     report = open_run(folder).report
     if changes := changes_since(report, *_images(pair), settings):
@@ -232,11 +222,9 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job:
-    """The job of a pair, its store open and locked."""
-    job = prepare(*_images(pair), out / pair.name, settings, overwrite=overwrite)
-    for place in (job.store.home, job.store.elsewhere):
-        if place is not None and isinstance(folder_at(place), LocalFolder):  # of a bucket the batch has a lease
-            stack.enter_context(held(place, lambda stage, done, total: None))
+    """The job of a pair, its store open and its folder locked."""
+    job = prepare(*_images(pair), out / pair.name, settings, overwrite=overwrite, pair=pair.name)
+    stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin(overwrite=overwrite)
     return job
 
@@ -244,7 +232,7 @@ def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stac
 def _tidy(folder: Path, keep_tiles: bool) -> None:
     """Remove tiles that a death between the files and the end of their run left."""
     if not keep_tiles and (folder / "tiles").exists():
-        with held(folder / "tiles", lambda stage, done, total: None):
+        with LocalFolder(folder / "tiles").locked():
             remove_tiles(folder / "tiles")
 
 
@@ -281,7 +269,8 @@ def _matched(
         measured = {}
         for name, job in jobs.items():
             try:
-                measure_images(client, job, progress)
+                with job.store.needed(job.manifest):
+                    measure_images(client, job, progress)
                 measured[name] = job
             except RunError as error:
                 yield name, _failed(error)
@@ -322,8 +311,9 @@ def _kernels(config: Config) -> str:
 
 def _concluded(job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress) -> dict[str, Any]:
     try:
-        check_failures(job, failures)
-        report = conclude(job, {}, progress)
+        with job.store.needed(job.manifest):
+            check_failures(job, failures)
+            report = conclude(job, {}, progress)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # whatever is wrong with one pair, the others go on

@@ -3,9 +3,7 @@
 import gc
 import logging
 import os
-import re
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -16,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from dask.utils import parse_bytes, parse_timedelta
+from dask.utils import parse_bytes
 from distributed import Client, LocalCluster, Status, Worker, WorkerPlugin
 from distributed.utils import silence_logging_cmgr
 
@@ -24,12 +22,10 @@ from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 
-# Seconds without a job in the queue after which none is waited for.
-JOBS_GONE = 30.0
-# Seconds from one look at the queue to the next, which is shared by many.
-_ASKED_EVERY = 10.0
-# Directives that send jobs where squeue does not look.
-_OTHER_CLUSTERS = re.compile(r"^#SBATCH (-M|--cluster)", re.MULTILINE)
+# Seconds without any worker of a batch system, after there were some, at which a run ends.
+WORKERS_GONE = 300.0
+# Seconds from one word on the first worker, for which a run waits, to the next.
+_TOLD_EVERY = 60.0
 
 # Batch systems that know projects and no accounts.
 _CHARGE_PROJECTS = "lsf", "sge"
@@ -229,6 +225,7 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
 
     logged = given.get("log_directory") or own_logs or os.getcwd()
     own = {"job_cls": Job, "submitted": submitted, "refusals": refusals, "logged": logged}
+    own |= {"seen": None, "told": time.monotonic()}  # of `workers_there`: when a worker was, when the wait was told of
     batch_system = type(base.__name__, (base,), own)
     try:
         return batch_system(**given, silence_logs=logging.CRITICAL)
@@ -260,58 +257,39 @@ def job_script(settings: Cluster, out: Path) -> str:
     return script
 
 
-class Jobs:
-    """The jobs that a client waits for, if it does, so that it does not wait for ever."""
+def workers_there(client: Client) -> dict[str, int]:
+    """Addresses and cores of the workers that a client has. Called every few seconds, it ends a wait that is in vain.
 
-    def __init__(self, client: Client) -> None:
-        self._client = client
-        self._seen = self._asked = time.monotonic()
+    For the first worker of a batch system it waits without limit, and says so once a minute.
 
-    def check(self) -> None:
-        """Raise where no worker is there and none will come; to be called every few seconds.
-
-        dask submits a job again that ended after its worker came, and no other. What becomes of jobs in the queue only
-        SLURM is asked.
-
-        Raises
-        ------
-        SatIntervalsError
-            When the batch system took no job.
-        RunError
-            When all jobs are gone.
-        """
-        cluster: Any = self._client.cluster
-        now = time.monotonic()
-        if not hasattr(cluster, "refusals"):
-            return
-        if self._client.nthreads():
-            self._seen = now
-            return
-        if cluster.refusals and not cluster.submitted:
-            raise SatIntervalsError(
-                f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
-            )
-        if cluster.job_cls.config_name != "slurm" or _OTHER_CLUSTERS.search(cluster.job_header):
-            return
-        patience = JOBS_GONE + parse_timedelta(dask.config.get("distributed.deploy.lost-worker-timeout"))
-        if now - self._asked < _ASKED_EVERY:
-            return
-        self._asked = now
-        if _any_in_queue(cluster.submitted):  # all of them: dask's own list may lack one
-            self._seen = now
-        elif now - self._seen > patience:
-            raise RunError(
-                "no job is in the queue any more: they were cancelled, or ended before their worker came, of which "
-                f"their logs in {cluster.logged} tell; the same command goes on from the tiles that are done"
-            )
-
-
-def _any_in_queue(jobs: set[str]) -> bool:
-    """Whether SLURM has any of the jobs waiting or running; True where that cannot be told."""
-    try:
-        told = subprocess.run(
-            ["squeue", "--me", "--noheader", "--format=%A"], capture_output=True, text=True, check=True, timeout=60
+    Raises
+    ------
+    SatIntervalsError
+        When the batch system took no job.
+    RunError
+        When its last worker has gone, and none has come since for WORKERS_GONE seconds.
+    """
+    cores: dict[str, int] = client.nthreads()
+    cluster: Any = client.cluster
+    if not hasattr(cluster, "refusals"):
+        return cores
+    now = time.monotonic()
+    if cores:
+        cluster.seen = now
+    elif cluster.refusals and not cluster.submitted:
+        raise SatIntervalsError(
+            f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
         )
-    except (OSError, subprocess.SubprocessError):
-        return True
-    return not jobs.isdisjoint(told.stdout.split())
+    elif cluster.seen is None and now - cluster.told >= _TOLD_EVERY:
+        cluster.told = now
+        _LOG.warning(
+            "no worker has come yet: jobs wait in the queue of the batch system, or ended before, of which their logs "
+            "in %s tell",
+            cluster.logged,
+        )
+    elif cluster.seen is not None and now - cluster.seen > WORKERS_GONE:
+        raise RunError(
+            f"the last worker has gone and none has come for {WORKERS_GONE:.0f} s: of the jobs their logs in "
+            f"{cluster.logged} tell; the same command goes on from the tiles that are done"
+        )
+    return cores

@@ -19,6 +19,7 @@ from sat_intervals.job import Job
 from sat_intervals.products import FLAGS
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
 from sat_intervals.seams import seam_report
+from sat_intervals.store import mark_replaced
 from sat_intervals.summary import Tally
 from sat_intervals.tile import logged_stage
 
@@ -28,7 +29,7 @@ Item = TypeVar("Item")
 STRIP_PIXELS = 1 << 20
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage ("lease", "kernels", "images", "tiles", "bands", "files"), how much is done, how much in all."""
+"""Called with a stage ("kernels", "images", "tiles", "bands", "files"), how much is done, how much in all."""
 
 
 def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
@@ -69,12 +70,13 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
         with logged_stage(seconds, "files"):
             progress("files", 0, 1)
             writer.build()
-            progress("files", 0, 1)  # so that a run that is to end, or has lost its store, does so before it publishes
+            progress("files", 0, 1)  # so that a run that is to end does so before it publishes
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
         report = _report(job, scale, tally, seconds)
-        writer.publish({"run.json": json.dumps(report, indent=1) + "\n"})
+        writer.publish(report=("run.json", json.dumps(report, indent=1) + "\n"))
+        mark_replaced(store.home)
         progress("files", 1, 1)
     return report
 

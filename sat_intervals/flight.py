@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
-from sat_intervals.cluster import Jobs
+from sat_intervals.cluster import workers_there
 from sat_intervals.errors import RunError
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
@@ -58,12 +58,11 @@ class Flight:
     Raises
     ------
     RunError
-        When the scheduler is gone, or all jobs of a batch system.
+        When the scheduler is gone, or all workers of a batch system.
     """
 
     def __init__(self, client: Client, tasks: Iterator[Task]) -> None:
         self._client, self._tasks = client, tasks
-        self._jobs = Jobs(client)
         self._name = uuid.uuid4().hex  # a scheduler may serve several runs, and takes equal keys for one task
         self._submitted = 0
         self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
@@ -98,14 +97,13 @@ class Flight:
         try:
             return self._ended.get(timeout=_LOOK_AGAIN)
         except Empty:
-            self._jobs.check()
             return None
 
     def _fill(self) -> None:
         """Submit tasks until two are in flight for every core that there is now."""
         if time.monotonic() - self._looked > _LOOK_AGAIN:
             with _scheduler_needed():
-                cores = self._client.nthreads()
+                cores = workers_there(self._client)
             self._width = 2 * max(1, sum(cores.values()))
             self._note_workers(set(cores))
             self._looked = time.monotonic()

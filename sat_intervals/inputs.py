@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
-import numpy as np
-
 from sat_intervals.folders import object_tag
 
 # Names of GDAL, as rasterio takes them too, of objects in the stores that fsspec knows.
@@ -75,11 +73,3 @@ def is_changed(told: Mapping[str, Any]) -> bool:
     if "sha256" in told:
         return bool(now.get("sha256") != told["sha256"])
     return bool(now.get("etag", told.get("etag")) != told.get("etag"))
-
-
-def pixels_digest(pixels: np.ndarray, state: np.ndarray) -> str:
-    """Tells the pixels that a tile was made of from any others."""
-    digest = hashlib.sha256()
-    for array in (pixels, state):
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()

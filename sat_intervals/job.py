@@ -17,15 +17,15 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.features import load_network, weights_file
 from sat_intervals.finish import Rows, Scale, finish_strips
 from sat_intervals.folders import folder_at
-from sat_intervals.inputs import identity, pixels_digest
+from sat_intervals.inputs import identity
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores, usable_memory
 from sat_intervals.memory import fitted, volume_bytes
 from sat_intervals.normalization import Scale as ImageScale
 from sat_intervals.normalization import Scales
 from sat_intervals.patch import match_patch
-from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files, read_window
-from sat_intervals.store import LAYOUT, Store, differences
+from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files
+from sat_intervals.store import LAYOUT, Store, differences, digest, inputs_before, is_replacing
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Sections of the settings that no tile knows of.
@@ -61,39 +61,15 @@ class Job:
     @property
     def manifest(self) -> dict[str, Any]:
         """All that decides the bytes of a tile."""
-        return {
-            "version": version("sat-intervals"),
-            "kernels": FINGERPRINT,
-            "layout": LAYOUT,
-            "settings": self.config.model_dump(mode="json", exclude=_AFTER_THE_TILES),
-            "inputs": self.inputs,
-            "region": asdict(self.store.grid.region),
-        }
+        return _manifest(self.config, self.inputs, self.store.grid.region)
 
     def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store for what decides the bytes of a tile; to be called while its place is locked.
+        """Open the store for what decides the bytes of a tile; to be called while its folder is locked.
 
-        With ``overwrite`` the files of the run before go as well, so that this one can be resumed without it.
+        With ``overwrite`` the files of the run before stay until this one replaces them; it can be resumed without.
         """
         check_output(self.out, overwrite)  # again: another run may have ended here before the lock was free
-        if overwrite:
-            for name in OUTPUTS:
-                (self.out / name).unlink(missing_ok=True)
-        self.store.open(self.manifest, overwrite=overwrite, is_mended=self._reads_what_was_read)
-
-    def _reads_what_was_read(self) -> bool:
-        """Whether every tile that is done would read today the pixels that it was made of.
-
-        With MC-CNN all pixels have a part in every tile, by their mean.
-        """
-        if isinstance(self.config.cost, Mccnn):
-            return False
-        images = {"left": self.left, "right": self.right}
-        reads = (read for record in self.store.records().values() for read in record["pixels_read"])
-        return all(
-            pixels_digest(*read_window(images[read["side"]], Window(**read["window"]))) == read["digest"]
-            for read in reads
-        )
+        self.store.open(self.manifest, overwrite=overwrite)
 
     def waiting(self) -> list[Tile]:
         """The tiles that are not done."""
@@ -109,20 +85,38 @@ def prepare(
     *,
     window: Window | None = None,
     overwrite: bool = False,
+    pair: str = "",
 ) -> Job:
-    """Check all that can be checked before a pixel is read; parameters as of `match_pair`."""
+    """Check all that can be checked before a pixel is read; parameters as of `match_pair`.
+
+    ``pair`` keeps pairs of a batch apart that are the same in all else, where their tiles lie elsewhere.
+    """
     config, out = fitted_to_jobs(load_config(config)), Path(out)
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
     check_memory(config, region)
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
-    home, elsewhere = out / "tiles", config.cluster.store
-    if elsewhere and folder_at(elsewhere) == folder_at(home):
-        elsewhere = None
+    home, elsewhere = out / "tiles", None
+    inputs = _inputs(left, right, config, inputs_before(home))
+    if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
+        name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
+        elsewhere = str(folder_at(config.cluster.store).inside(name))
     grid = Grid(region, config.tiles.size)
     store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
-    return Job(left, right, config, store, out, _inputs(left, right, config, store.inputs()))
+    return Job(left, right, config, store, out, inputs)
+
+
+def _manifest(config: Config, inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
+    """All that decides the bytes of a tile."""
+    return {
+        "version": version("sat-intervals"),
+        "kernels": FINGERPRINT,
+        "layout": LAYOUT,
+        "settings": config.model_dump(mode="json", exclude=_AFTER_THE_TILES),
+        "inputs": inputs,
+        "region": asdict(region),
+    }
 
 
 def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: Config) -> list[str]:
@@ -179,7 +173,8 @@ def check_output(out: Path, overwrite: bool) -> None:
     try:
         there = [name for name in OUTPUTS if (out / name).exists()]
         # run.json is the last: without it, but with tiles, a run was killed between the names of its files
-        if there and not overwrite and ("run.json" in there or not (out / "tiles").exists()):
+        is_under_way = is_replacing(out / "tiles") if "run.json" in there else (out / "tiles").exists()
+        if there and not overwrite and not is_under_way:
             raise SatIntervalsError(
                 f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite"
             )
@@ -189,6 +184,11 @@ def check_output(out: Path, overwrite: bool) -> None:
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise SatIntervalsError(f"{out} cannot be written: {error.strerror}: choose another folder") from error
+
+
+def is_complete(out: Path) -> bool:
+    """Whether a folder holds all files of a run, and none has begun that is to replace them."""
+    return all((out / name).exists() for name in OUTPUTS) and not is_replacing(out / "tiles")
 
 
 def compile_kernels(config: Config) -> None:

@@ -3,7 +3,6 @@
 import errno
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
 from sat_intervals.flight import Flight, Task, reason
-from sat_intervals.folders import folder_at
+from sat_intervals.folders import LocalFolder
 from sat_intervals.job import Job, compile_kernels, prepare
 from sat_intervals.normalization import Moments, Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
@@ -54,7 +53,7 @@ def match_pair(
     keep_tiles
         Whether the raw products of the tiles stay.
     overwrite
-        Whether a run in ``out`` is replaced and tiles there are dropped.
+        Whether a run in ``out`` is replaced, once this one is complete, and tiles there are dropped.
     progress
         Called from time to time.
 
@@ -72,20 +71,21 @@ def match_pair(
     seconds: dict[str, float] = {}
     with logged_stage(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
-    with held(job.store.home, progress), held(job.store.elsewhere, progress) as progress:
+    with LocalFolder(job.store.home).locked():
         job.begin(overwrite=overwrite)
         with logged_stage(seconds, "kernels"):
             progress("kernels", 0, 1)
             compile_kernels(job.config)
             progress("kernels", 1, 1)
-        with logged_stage(seconds, "tiles"):
-            if job.waiting():
-                with connected(job.config.cluster, job.out) as client:
-                    with logged_stage(seconds, "tiles.images"):
-                        measure_images(client, job, progress)
-                    for _, failures in matched(client, [job], progress):
-                        check_failures(job, failures)
-        report = conclude(job, seconds, progress)
+        with job.store.needed(job.manifest):
+            with logged_stage(seconds, "tiles"):
+                if job.waiting():
+                    with connected(job.config.cluster, job.out) as client:
+                        with logged_stage(seconds, "tiles.images"):
+                            measure_images(client, job, progress)
+                        for _, failures in matched(client, [job], progress):
+                            check_failures(job, failures)
+            report = conclude(job, seconds, progress)
         if not keep_tiles:
             job.store.remove()
     return report
@@ -119,34 +119,13 @@ def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Sca
     return scale_of(found[i] for i in range(len(windows)))
 
 
-@contextmanager
-def held(place: str | Path | None, progress: Progress) -> Iterator[Progress]:
-    """Keep every other run out of a folder or fsspec URL; the progress that it yields raises where that was in vain.
-
-    Raises
-    ------
-    SatIntervalsError
-        When another run is at work there, or the place cannot be used.
-    """
-    if place is None:
-        yield progress
-        return
-    with folder_at(place).locked(lambda: progress("lease", 0, 1)) as check:
-
-        def checked(stage: str, done: int, total: int) -> None:
-            check()
-            progress(stage, done, total)
-
-        yield checked
-
-
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
     """Raise a RunError that names every tile that failed, if there are any."""
     if failures:
         lines = "\n".join(f"  tile {name}: {reason(error)}" for name, error in sorted(failures.items()))
         raise RunError(
             f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept; mend the cause and run the "
-            f"same command again:\n{lines}"
+            f"same command again, with --overwrite where an input changed:\n{lines}"
         )
 
 

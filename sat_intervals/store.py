@@ -2,14 +2,16 @@
 
 A tile's arrays lie in files of its own, written by whoever computed the tile, and its record comes last: a tile is done
 when its record and its files are there. Writing a tile again writes the same bytes. The manifest holds everything that
-decides the bytes; a store with another manifest is never mixed in.
+decides the bytes; a store with another manifest is never mixed in. Runs with the same manifest may share a store that
+lies elsewhere than in the folder of one of them: they write the same bytes.
 """
 
 import errno
+import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,16 +20,18 @@ import numpy as np
 
 from sat_intervals.arrays import DamagedTilesError, TileArrays
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.folders import Folder, folder_at
+from sat_intervals.folders import Folder, LocalFolder, folder_at
 from sat_intervals.tiling import Grid, Tile, Window
 
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
-LAYOUT = 3
+LAYOUT = 4
 
 _MANIFEST, _ARRAYS, _RECORDS, _FAILURES = "manifest.json", "arrays.zarr", "records", "failures"
 _NORMALIZATION = "normalization.json"
 # In the folder of the run where its tiles lie elsewhere: it says where.
 _PLACE = "store.json"
+# In the folder of the run from the beginning of one that replaces another to its end.
+_REPLACING = "replacing"
 
 
 class StoreError(SatIntervalsError):
@@ -67,87 +71,83 @@ class Store:
     def _arrays(self) -> TileArrays:
         return TileArrays(self.folder.inside(_ARRAYS), self.grid, self.count, self.ambiguities)
 
-    def open(
-        self, manifest: Mapping[str, Any], *, overwrite: bool = False, is_mended: Callable[[], bool] = lambda: False
-    ) -> None:
-        """Create the store, or go on with the one that is there; to be called while its place is locked.
+    def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
+        """Create the store, or go on with the one that is there; to be called while ``home`` is locked.
 
         Parameters
         ----------
         manifest
             All that decides the bytes of a tile; ``region`` and ``settings`` tell the tiles.
         overwrite
-            Whether what is there is dropped.
-        is_mended
-            Asked where tiles failed and nothing but the content of the inputs changed since: whether what is done would
-            be the same with these inputs. If so, the run goes on with them.
+            Whether what is there is dropped, wherever it lies, and the files of a run before are to be replaced.
 
         Raises
         ------
         StoreError
-            When the store that is there was begun with other settings, inputs or versions.
+            When the store that is there was begun with other settings, inputs or versions, or lies in another place, or
+            cannot be used.
         """
-        self._check_place(overwrite)
-        folder, text = self.folder, json.dumps(manifest, indent=1)
-        before = None if overwrite else folder.read(_MANIFEST)
-        if before is not None:
-            changed = list(differences(_parsed(before, folder), json.loads(text)))
-            if changed and self._is_mendable(before, text) and is_mended():
-                folder.write(_MANIFEST, text)
-            elif changed:
-                raise StoreError(
-                    f"{folder} holds the tiles of another run: {'; '.join(changed)} "
-                    "(use the same settings and inputs to go on, --overwrite to start afresh)"
-                )
-            return
-        _drop(folder)
-        folder.make(_RECORDS)
-        folder.make(_FAILURES)
-        self._arrays.create()
-        folder.write(_MANIFEST, text)
+        home, folder, before = folder_at(self.home), self.folder, _place(self.home)
+        try:
+            text = None if overwrite else before.read(_MANIFEST)
+            if text is not None:
+                _check_same(text, before, manifest)
+                if before != folder:
+                    raise StoreError(
+                        f"the tiles of the run in {self.home.parent} lie in {before}, not in {folder}: give the same "
+                        "--store to go on, or none where there was none, --overwrite to start afresh"
+                    )
+            folder.make("")  # so that what cannot be used is told before anything is dropped
+            if overwrite:
+                with suppress(OSError):  # what cannot be reached stays
+                    _drop(before)
+            if overwrite or (text is None and not self.elsewhere):
+                _drop(folder)
+            for name in ("", _RECORDS, _FAILURES):
+                folder.make(name)
+            home.make("")
+            if overwrite:
+                home.write(_REPLACING, "")
+            if self.elsewhere:
+                home.write(_PLACE, json.dumps(str(folder)))
+            else:
+                home.delete(_PLACE)
+            self._arrays.create()
+            if not folder.create(_MANIFEST, json.dumps(manifest, indent=1)):
+                self.check(manifest)
+        except OSError as error:
+            raise StoreError(
+                f"{folder} cannot be used: {error.strerror or error}: check the path or URL, the credentials, and that "
+                "the package of its file system is installed (sat-intervals[remote] for s3://)"
+            ) from error
 
     def check(self, manifest: Mapping[str, Any]) -> None:
-        """Hold that the store is that of a run still: a worker may outlive its run and find the next in its place.
+        """Hold that the store is that of a run still: others may have removed it, or begun another in its place.
 
         Raises
         ------
+        RunError
+            When it is gone.
         StoreError
             When it is another's.
         """
         there = self.folder.read(_MANIFEST)
         if there is None:
-            raise StoreError(f"{self.folder} holds the tiles of no run any more")
-        if changed := list(differences(json.loads(there), json.loads(json.dumps(manifest)))):
-            raise StoreError(f"{self.folder} holds the tiles of another run: {'; '.join(changed)}")
-
-    def _check_place(self, overwrite: bool) -> None:
-        """Hold that the tiles of the run do not lie in another place, and note in which they do."""
-        home, wanted = folder_at(self.home), str(self.folder)
-        noted = home.read(_PLACE)
-        there = json.loads(noted) if noted else str(home) if home.read(_MANIFEST) else wanted
-        if there != wanted and not overwrite:
-            raise StoreError(
-                f"the tiles of the run in {self.home.parent} lie in {there}, not in {wanted}: give the same --store to "
-                "go on, or none where there was none, --overwrite to start afresh"
+            raise RunError(
+                f"the tiles in {self.folder} are gone, as where another run of the same images and settings ended: "
+                "run the same command again, it matches them anew"
             )
-        if there != wanted:
-            with suppress(OSError):  # what cannot be reached stays
-                _drop(folder_at(there))
-        if self.elsewhere:
-            home.write(_PLACE, json.dumps(wanted))
-        else:
-            home.delete(_PLACE)
+        _check_same(there, self.folder, manifest)
 
-    def _is_mendable(self, there: str, wanted: str) -> bool:
-        """Whether tiles failed, and nothing but the content of the inputs changed since."""
-        return bool(self.failures()) and _without_content(json.loads(there)) == _without_content(json.loads(wanted))
-
-    def inputs(self) -> dict[str, Any]:
-        """What the manifest that is there says of the inputs; nothing where it cannot be read."""
+    @contextmanager
+    def needed(self, manifest: Mapping[str, Any]) -> Iterator[None]:
+        """A block that fails because the store is gone fails with just that, see `check`."""
         try:
-            return dict(json.loads(self.folder.read(_MANIFEST) or "{}").get("inputs", {}))
-        except (OSError, AttributeError, TypeError, ValueError):
-            return {}
+            yield
+        except Exception:
+            with suppress(OSError):
+                self.check(manifest)
+            raise
 
     def done(self) -> set[str]:
         """Names of the tiles that are complete: their record is there, and all that was written before it still is."""
@@ -155,9 +155,16 @@ class Store:
         there = arrays.files()
         return {tile.name for tile in self.grid if tile.name in records and arrays.files_of(tile) <= there}
 
-    def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write what a tile leaves behind, see `TileArrays.write`."""
-        self._arrays.write(tile, arrays)
+    def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> None:
+        """Write what a tile leaves behind, see `TileArrays.write`, into the store of a manifest and no other."""
+        self.check(manifest)
+        try:
+            self._arrays.write(tile, arrays)
+            self.check(manifest)
+        except Exception:
+            if self.folder.read(_MANIFEST) is None:  # it was removed meanwhile, and what came later would stay for ever
+                _drop(self.folder)
+            raise
 
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
@@ -175,7 +182,8 @@ class Store:
     def write_failure(self, tile: str, reason: str) -> None:
         """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
         with suppress(OSError):  # a full disk is reason enough for a tile to fail, but not for the run to end at once
-            self.folder.write(f"{_FAILURES}/{tile}.json", json.dumps(reason))
+            if self.folder.read(_MANIFEST) is not None:  # else a bucket would keep it for ever
+                self.folder.write(f"{_FAILURES}/{tile}.json", json.dumps(reason))
 
     def failures(self) -> dict[str, str]:
         """Why tiles failed that are not done since, by name."""
@@ -234,10 +242,33 @@ class Store:
 
 def remove_tiles(home: Path) -> None:
     """Delete the tiles of the run to whose folder ``home`` belongs, wherever they lie."""
-    here = folder_at(home)
-    place = here.read(_PLACE)
-    _drop(folder_at(json.loads(place)) if place else here)
-    here.delete(_PLACE)
+    _drop(_place(home))
+    for name in (_PLACE, _REPLACING):
+        folder_at(home).delete(name)
+
+
+def mark_replaced(home: Path) -> None:
+    """Note that the files of the run before have been replaced, see `is_replacing`."""
+    folder_at(home).delete(_REPLACING)
+
+
+def is_replacing(home: Path) -> bool:
+    """Whether a run has begun that is to replace the files of one before, and has not done so yet."""
+    return folder_at(home).read(_REPLACING) is not None
+
+
+def inputs_before(home: Path) -> dict[str, Any]:
+    """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
+    try:
+        return dict(json.loads(_place(home).read(_MANIFEST) or "{}").get("inputs", {}))
+    except (OSError, AttributeError, TypeError, ValueError):
+        return {}
+
+
+def _place(home: Path) -> Folder:
+    """Where the tiles lie of the run to whose folder ``home`` belongs."""
+    noted = folder_at(home).read(_PLACE)
+    return folder_at(json.loads(noted) if noted else home)
 
 
 @dataclass(frozen=True)
@@ -273,9 +304,7 @@ def read_status(home: Path) -> Status:
     StoreError
         Where there is no store.
     """
-    here = folder_at(home)
-    place = here.read(_PLACE)
-    folder = folder_at(json.loads(place)) if place else here
+    folder = _place(home)
     text = folder.read(_MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")
@@ -284,8 +313,8 @@ def read_status(home: Path) -> Status:
         grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
     except (LookupError, TypeError) as error:
         raise StoreError(f"{folder}/{_MANIFEST} is no manifest of a run: --overwrite starts afresh") from error
-    store = Store(home, grid, 1, 0, str(folder) if place else None)
-    return Status(len(grid), len(store.done()), store.failures(), here.is_locked() or folder.is_locked())
+    store = Store(home, grid, 1, 0, str(folder))
+    return Status(len(grid), len(store.done()), store.failures(), LocalFolder(home).is_locked())
 
 
 def _parsed(manifest: str, folder: Folder) -> dict[str, Any]:
@@ -295,11 +324,31 @@ def _parsed(manifest: str, folder: Folder) -> dict[str, Any]:
         raise StoreError(f"{folder}/{_MANIFEST} cannot be read, {error}: --overwrite starts afresh") from error
 
 
+def _check_same(there: str, folder: Folder, manifest: Mapping[str, Any]) -> None:
+    """Hold that the manifest in a folder is that of the run."""
+    if changed := list(differences(_parsed(there, folder), json.loads(json.dumps(manifest)))):
+        raise StoreError(
+            f"{folder} holds the tiles of another run: {'; '.join(changed)} "
+            "(use the same settings and inputs to go on, --overwrite to start afresh)"
+        )
+
+
 def _drop(folder: Folder) -> None:
-    """Delete the tiles in a folder."""
+    """Delete the tiles in a folder, and the folder where nothing else is in it."""
     # The manifest first: without it nothing of the rest counts.
     for name in (_MANIFEST, _ARRAYS, _RECORDS, _FAILURES, _NORMALIZATION):
         folder.delete(name)
+    folder.delete_if_empty()
+
+
+def digest(manifest: Mapping[str, Any]) -> str:
+    """A name of 32 digits that only manifests share in which `differences` finds none."""
+
+    def without_times(there: dict[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in there.items() if key != "modified"}
+
+    same = json.dumps(json.loads(json.dumps(manifest), object_hook=without_times), sort_keys=True)
+    return hashlib.sha256(same.encode()).hexdigest()[:32]
 
 
 def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
@@ -312,18 +361,3 @@ def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
             yield from differences(*pair, f"{path}.{place}")
     elif there != wanted and not path.endswith(".modified"):  # when does not matter where SHA-256 agrees
         yield f"{path} was {json.dumps(there)}, now {json.dumps(wanted)}"
-
-
-def _without_content(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """A manifest without what tells the content of its inputs."""
-
-    def without(there: Any) -> Any:
-        if isinstance(there, list):
-            return [without(value) for value in there]
-        if not isinstance(there, dict):
-            return there
-        return {
-            key: without(value) for key, value in there.items() if key not in ("bytes", "modified", "sha256", "etag")
-        }
-
-    return {**manifest, "inputs": without(manifest["inputs"])}

@@ -4,14 +4,12 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.inputs import pixels_digest
 from sat_intervals.job import Job, weights_identity
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.normalization import Moments, Scales, moments
@@ -65,18 +63,16 @@ def match_tile(job: Job, tile: Tile) -> None:
 
 
 def _match_tile(job: Job, tile: Tile) -> None:
+    job.store.check(job.manifest)
     job.store.check_space(tile)
     seconds: dict[str, float] = {}
     usable = {"left": 0, "right": 0}
-    pixels_read: list[dict[str, Any]] = []
 
     def reader(image: Image, side: str) -> Any:
         def read(window: Window) -> tuple[np.ndarray, np.ndarray]:
             with timed(seconds, "read"):
                 pixels, state = read_window(image, window)
-                digest = pixels_digest(pixels, state)
             usable[side] += int((state == 0).sum())
-            pixels_read.append({"side": side, "window": asdict(window), "digest": digest})
             return pixels, state
 
         return read
@@ -89,11 +85,8 @@ def _match_tile(job: Job, tile: Tile) -> None:
     patch = match_patch(*readers, tile.core, grid.region, image, config, scales)
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with timed(seconds, "write"):
-        left_behind = _left_behind(patch, tile, job)
-        job.store.check(job.manifest)
-        job.store.write_arrays(tile, left_behind)
-        job.store.check(job.manifest)
-    job.store.write_record(tile, {"usable_pixels": usable, "pixels_read": pixels_read, "seconds": seconds})
+        job.store.write_arrays(tile, _left_behind(patch, tile, job), job.manifest)
+    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,12 @@ import rasterio
 import yaml
 from click.testing import CliRunner
 
-from sat_intervals.batch import match_batch, read_batch
+from sat_intervals import batch
+from sat_intervals.batch import PairOfBatch, match_batch, read_batch
 from sat_intervals.cli import main
 from sat_intervals.cluster import connected, parse_memory
 from sat_intervals.config import Cluster, ConfigError, load_config
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.folders import LocalFolder
 from sat_intervals.job import prepare
 from sat_intervals.memory import fitted, tile_bytes
@@ -186,14 +188,48 @@ def test_locked__ends_where_no_folder_can_be_made():
         pass
 
 
-def test_match_batch__holds_the_stores_of_its_pairs(images, tmp_path):
-    config = {"cluster": {"store": str(tmp_path / "store")}}
-    with LocalFolder(tmp_path / "store" / "pair1").locked():
-        report = match_batch(read_batch(rows(images)), tmp_path / "out", config)
+def test_match_batch__holds_the_folders_of_its_pairs(images, tmp_path):
+    with LocalFolder(tmp_path / "pair1" / "tiles").locked():
+        report = match_batch(read_batch(rows(images)), tmp_path)
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
     assert "another run is at work in" in report["pair1"]["error"]
-    with pytest.raises(SatIntervalsError, match="where tiles lie by default: leave it out"):
-        match_batch(read_batch(rows(images)), tmp_path / "store", config)
+
+
+def test_match_batch__keeps_the_tiles_of_equal_pairs_apart_and_goes_on_where_those_of_one_vanish(images, tmp_path):
+    pair = PairOfBatch("first", str(images / "left1.tif"), str(images / "right1.tif"))
+    config = {"disparity": {"minimum": -18, "maximum": 40}, "cluster": {"store": str(tmp_path / "store")}}
+    vanished = []
+
+    def progress(stage, done, total):
+        if stage == "tiles" and not vanished:
+            vanished.extend((tmp_path / "store").glob("first-*"))
+            shutil.rmtree(vanished[0])
+
+    report = match_batch([pair, replace(pair, name="second")], tmp_path / "out", config, progress=progress)
+    assert {name: end["state"] for name, end in report.items()} == {"first": "failed", "second": "done"}
+    assert report["first"]["error"].startswith(f"the tiles in {vanished[0]} are gone")
+    assert not list((tmp_path / "store").iterdir())
+
+
+def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, monkeypatch):
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path)
+    before = bytes_of(tmp_path / "pair1")
+
+    def fail(*arguments):
+        raise RunError("no more disk")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch, "conclude", fail)
+        report = match_batch(pairs, tmp_path, {"median": None}, overwrite=True)
+    assert {end["state"] for end in report.values()} == {"failed"}
+    assert bytes_of(tmp_path / "pair1") == before
+    told = CliRunner().invoke(main, ["status", str(tmp_path / "pair1")])
+    assert "1 of 1 tiles done, 0 failed, 0 left; no run is at work" in told.stdout
+    report = match_batch(pairs, tmp_path, {"median": None})
+    assert {end["state"] for end in report.values()} == {"done"}
+    assert bytes_of(tmp_path / "pair1") != before
+    assert not list(tmp_path.glob("*/tiles"))
 
 
 @pytest.mark.parametrize("damage", ["manifest", "record", "shard"])

@@ -1,6 +1,5 @@
 """Rasters in and out, on real files: what is refused, what is read, what is written, what is left behind."""
 
-import errno
 import itertools
 import os
 import pickle
@@ -468,18 +467,18 @@ def products() -> tuple[np.ndarray, np.ndarray]:
     return intervals, validity
 
 
-def produce(folder: Path, products, *, where=None, rows=256, tags=None, publish=True, texts=None) -> None:
+def produce(folder: Path, products, *, where=None, rows=256, tags=None, publish=True, report=None) -> None:
     intervals, validity = products
     with OutputWriter(folder, RUN_FILES, *validity.shape, where or Georeferencing(), tags or {}, threads=2) as output:
         for row in range(0, len(validity), rows):
             output.write(row, intervals[:, row : row + rows], validity[row : row + rows])
         if publish:
-            output.publish(texts)
+            output.publish(report)
 
 
 @pytest.mark.parametrize("rows", [37, 256, HEIGHT])
 def test_output_writer__writes_what_it_is_given(tmp_path, products, rows):
-    produce(tmp_path / "out", products, rows=rows, texts={"run.json": "{}\n"})
+    produce(tmp_path / "out", products, rows=rows, report=("run.json", "{}\n"))
     np.testing.assert_array_equal(look(tmp_path / "out" / "intervals.tif"), products[0])
     np.testing.assert_array_equal(look(tmp_path / "out" / "validity.tif")[0], products[1])
     assert (tmp_path / "out" / "run.json").read_text() == "{}\n"
@@ -597,17 +596,33 @@ def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products):
     assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
 
 
-@pytest.mark.parametrize("links", [True, False])
-def test_output_writer__publishes_all_or_nothing(tmp_path, products, monkeypatch, links):
-    if not links:
-        monkeypatch.setattr(os, "link", lambda *places: (_ for _ in ()).throw(OSError(errno.EPERM, "no links")))
-    (tmp_path / "validity.tif").write_text("of another")
-    (tmp_path / "run.json").mkdir()
-    with pytest.raises(OutputError) as failure:
-        produce(tmp_path, products, texts={"run.json": "{}"})
-    message(failure, tmp_path / "run.json", "Is a directory")
-    assert left_behind(tmp_path) == ["run.json", "validity.tif"]
-    assert (tmp_path / "validity.tif").read_text() == "of another"
+def publish_where_the_last_fails(folder: Path, products, report=None) -> None:
+    intervals, validity = products
+    with OutputWriter(folder, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
+        output.write(0, intervals, validity)
+        (folder / "validity.tif").mkdir()
+        with pytest.raises(OutputError) as failure:
+            output.publish(report)
+    message(failure, folder / "validity.tif", "Is a directory")
+
+
+@pytest.mark.parametrize("before", [["intervals.tif"], []])
+def test_output_writer__publishes_all_or_nothing(tmp_path, products, before):
+    for name in before:
+        (tmp_path / name).write_text("of another")
+    publish_where_the_last_fails(tmp_path, products)
+    assert left_behind(tmp_path) == [*before, "validity.tif"]
+    assert [(tmp_path / name).read_text() for name in before] == ["of another"] * len(before)
+
+
+def test_output_writer__publishes_no_report_of_files_that_failed(tmp_path, products):
+    (tmp_path / "run.json").write_text("of the run before")
+    publish_where_the_last_fails(tmp_path, products, ("run.json", "{}"))
+    assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
+    (tmp_path / "validity.tif").rmdir()
+    produce(tmp_path, products, report=("run.json", "{}"))
+    assert (tmp_path / "run.json").read_text() == "{}"
+    np.testing.assert_array_equal(look(tmp_path / "validity.tif")[0], products[1])
 
 
 def test_output_writer__refuses_a_name_that_is_no_files_before_the_work(tmp_path, products):

@@ -1,9 +1,12 @@
 """Files to files on real workers: the laws of tiles, resume, reports."""
 
+import errno
 import json
 import logging
+import os
 import shutil
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -13,10 +16,13 @@ from sat_intervals import match_arrays, match_pair, run
 from sat_intervals.cluster import connected
 from sat_intervals.config import Cluster, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.job import prepare
+from sat_intervals.folders import LocalFolder
+from sat_intervals.job import is_complete, prepare
 from sat_intervals.products import INVALID, NO_DATA
 from sat_intervals.raster import open_image, read_window
+from sat_intervals.results import open_run
 from sat_intervals.scene import make_scene
+from sat_intervals.store import digest
 from sat_intervals.tile import match_tile
 from sat_intervals.tiling import Window
 
@@ -164,6 +170,99 @@ def test_match_pair__never_mixes_runs(pair, tmp_path):
     match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}), overwrite=True)
 
 
+def test_match_pair__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(pair, tmp_path, monkeypatch):
+    left, right, settings = pair
+    out, old, new = tmp_path / "out", in_tiles(settings, 128), in_tiles(settings, 128, sgm={"p1": 7, "p2": 32})
+    match_pair(left, right, out, old, keep_tiles=True)
+    before = {name: (out / name).read_bytes() for name in ("intervals.tif", "validity.tif", "run.json")}
+
+    def fail(job, tile):
+        if tile.name == "1_2":
+            raise OSError("disk gone")
+        return match_tile(job, tile)
+
+    for settings in (old, new):
+        with monkeypatch.context() as patch:
+            patch.setattr(run, "match_tile", fail)
+            with pytest.raises(RunError, match="tile 1_2: disk gone"):
+                match_pair(left, right, out, settings, overwrite=True)
+        assert {name: (out / name).read_bytes() for name in before} == before
+        assert open_run(out).report == json.loads(before["run.json"])
+        assert not is_complete(out)
+    done = {file: file.stat().st_mtime_ns for file in (out / "tiles" / "records").glob("[0-9]*.json")}
+    assert len(done) == 11
+    match_pair(left, right, out, new, keep_tiles=True)
+    assert {file: file.stat().st_mtime_ns for file in done} == done, "tiles done twice"
+    assert open_run(out).config.sgm.p1 == 7
+    assert is_complete(out)
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(left, right, out, new)
+    match_pair(left, right, tmp_path / "alone", new)
+    for name in ("intervals.tif", "validity.tif"):
+        assert (out / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+
+
+def test_match_pair__ends_where_another_run_of_the_same_removes_the_tiles(pair, tmp_path):
+    left, right, settings = pair
+    store = tmp_path / "store"
+    settings = in_tiles(settings, 128) | {"cluster": {"store": str(store), "workers": 1}}
+
+    def progress(stage, done, total):
+        if (stage, done) == ("tiles", 3):
+            assert len(list(store.glob("*/records/*.json"))) >= 3
+            match_pair(left, right, tmp_path / "other", settings)
+            assert not list(store.iterdir())
+
+    with pytest.raises(RunError, match=rf"^the tiles in {store}/\w{{32}} are gone, .*: run the same command again.*$"):
+        match_pair(left, right, tmp_path / "out", settings, progress=progress)
+    assert not list((tmp_path / "out").glob("*.*"))
+    assert not list(store.iterdir())
+    match_pair(left, right, tmp_path / "out", settings)
+    for name in ("intervals.tif", "validity.tif"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+
+
+def test_match_pair__names_what_differs_from_the_tiles_elsewhere_and_removes_only_its_own(pair, tmp_path):
+    left, right, settings = pair
+    store, out = tmp_path / "store", tmp_path / "out"
+    settings = in_tiles(settings, 128) | {"cluster": {"store": str(store)}}
+    match_pair(left, right, out, settings, keep_tiles=True)
+    (place,) = store.iterdir()
+    (out / "run.json").unlink()
+    other = settings | {"sgm": {"p1": 7, "p2": 32}}
+    with pytest.raises(
+        SatIntervalsError, match=rf"{place} holds the tiles of another run: settings\.sgm\.p1 was 8, now 7"
+    ):
+        match_pair(left, right, out, other)
+    assert list(store.iterdir()) == [place]
+    (place / "notes.txt").write_text("mine")
+    match_pair(left, right, out, other, overwrite=True)
+    assert [str(path.relative_to(store)) for path in store.rglob("*")] == [place.name, f"{place.name}/notes.txt"]
+
+
+def test_digest__tells_what_differences_tell(tmp_path):
+    manifest = {"settings": {"p": 1}, "inputs": {"left": {"sha256": "a", "modified": "today"}, "files": [{"bytes": 3}]}}
+    later = {"inputs": {"files": [{"bytes": 3}], "left": {"modified": "now", "sha256": "a"}}, "settings": {"p": 1}}
+    other = {"settings": {"p": 1}, "inputs": {"left": {"sha256": "a", "modified": "today"}, "files": [{"bytes": 4}]}}
+    assert digest(later) == digest(manifest)
+    assert digest(other) != digest(manifest)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_create__writes_a_file_once(tmp_path, monkeypatch, links):
+    def refuse(*places):
+        raise PermissionError(errno.EPERM, "no links here")
+
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    folder = LocalFolder(tmp_path)
+    with ThreadPoolExecutor(8 if links else 1) as threads:
+        created = list(threads.map(lambda number: folder.create("manifest.json", str(number)), range(8)))
+    assert created.count(True) == 1
+    assert created[int(folder.read("manifest.json"))]
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
 def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_path):
     left, right, settings = pair
     before = prepare(left, right, tmp_path, in_tiles(settings, 128))
@@ -177,7 +276,7 @@ def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_p
     assert now.store.done() == set()
     assert not list((tmp_path / "tiles" / "arrays.zarr" / "int16").glob("c/*/*/*"))
     now.store.remove()
-    with pytest.raises(SatIntervalsError, match="holds the tiles of no run any more"):
+    with pytest.raises(RunError, match=r"the tiles in .*tiles are gone"):
         match_tile(before, tile)
     assert not (tmp_path / "tiles" / "arrays.zarr").exists()
 
@@ -210,7 +309,7 @@ def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path,
     for name in ("intervals.tif", "validity.tif"):
         assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "out"]
+    assert not list(tmp_path.glob("elsewhere/*"))
 
 
 def test_match_pair__says_which_image_is_empty(pair, tmp_path):

@@ -4,10 +4,12 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import sysconfig
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -15,8 +17,9 @@ import rasterio
 import yaml
 
 from sat_intervals import SatIntervalsError, match_pair
-from sat_intervals.cluster import job_script
+from sat_intervals.cluster import job_script, workers_there
 from sat_intervals.config import Cluster
+from sat_intervals.errors import RunError
 from sat_intervals.scene import make_scene
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
@@ -64,9 +67,19 @@ def pair(tmp_path_factory):
 
 @contextmanager
 def submitted(
-    pair, folder: Path, status: int = 0, own: dict[str, object] | None = None, programs: str = "", **cluster: object
+    pair,
+    folder: Path,
+    status: int = 0,
+    own: dict[str, object] | None = None,
+    programs: str = "",
+    constants: dict[str, float] | None = None,
+    is_quiet: bool = True,
+    **cluster: object,
 ):
-    """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first."""
+    """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first.
+
+    ``constants`` are those of `sat_intervals.cluster`; where it ends well and ``is_quiet`` it must say nothing.
+    """
     images, settings = pair
     folder.mkdir(exist_ok=True)
     job = {"jobs": 1, "cores": 1, "memory": "2GB", "walltime": "00:05:00"} | cluster
@@ -76,7 +89,8 @@ def submitted(
         "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
         "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
     } | (own or {})
-    command = [SCRIPTS / "sat-intervals", "match", images / "left.tif", images / "right.tif", folder / "out"]
+    code = f"from sat_intervals import cluster, cli; vars(cluster).update({constants or {}}); cli.main()"
+    command = [sys.executable, "-c", code, "match", images / "left.tif", images / "right.tif", folder / "out"]
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
     with (folder / "log").open("w") as log:
         environment = os.environ | {f"DASK_{name}": str(value) for name, value in own.items()}
@@ -85,7 +99,7 @@ def submitted(
     try:
         yield process
         assert process.wait(150) == status, (folder / "log").read_text()
-        if status == 0:
+        if status == 0 and is_quiet:
             assert (folder / "log").read_text() == ""
     finally:
         process.kill()
@@ -150,15 +164,13 @@ def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_pat
 
 
 def test_match__goes_on_with_the_jobs_that_the_batch_system_took(slurm, pair, tmp_path):
-    programs, once = tmp_path / "programs", tmp_path / "refused"
-    programs.mkdir()
-    sbatch = programs / "sbatch"
-    sbatch.write_text(
-        f"#!/bin/sh\nif mkdir {once} 2> /dev/null; then echo too many jobs >&2; exit 1; fi\n"
-        f'exec {shutil.which("sbatch")} --begin=now+5 "$@"\n'  # the refusal is there for longer than jobs are not
+    once = tmp_path / "refused"
+    programs = sbatch(
+        tmp_path,
+        f"if mkdir {once} 2> /dev/null; then echo too many jobs >&2; exit 1; fi\n"
+        'exec $SBATCH --begin=now+5 "$@"',  # the refusal is there for longer than jobs are not
     )
-    sbatch.chmod(0o755)
-    with submitted(pair, tmp_path, programs=str(programs), jobs=2):
+    with submitted(pair, tmp_path, programs=programs, jobs=2):
         pass
     assert once.exists()
     assert_complete(pair, tmp_path / "out")
@@ -196,22 +208,65 @@ def test_job_script__says_what_is_set_as_each_batch_system_takes_it(tmp_path, ki
     assert not list(tmp_path.iterdir())
 
 
-def test_match__ends_when_no_worker_can_come(slurm, pair, tmp_path):
-    cancelled, broken, refused = (tmp_path / name for name in ("cancelled", "broken", "refused"))
-    errors = broken / "out" / "logs"
-    with submitted(pair, broken, 1, {"JOBQUEUE__SLURM__PYTHON": "/no/python"}):
-        wait_until(lambda: any("/no/python" in file.read_text() for file in errors.glob("*.err")), "end of the job", 60)
-        with submitted(pair, refused, 2, queue="nowhere"):
-            pass
-        with submitted(pair, cancelled, 1, directives=["--begin=now+1hour"]):
-            wait_until(lambda: jobs("PENDING"), "job", 60)
-            (job,) = jobs("PENDING")
-            subprocess.run(["scancel", job], check=True, timeout=30)
-    for folder in (cancelled, broken):
-        log = (folder / "log").read_text()
-        assert "no job is in the queue any more: they were cancelled, or ended before their worker came" in log
-        assert str(folder / "out" / "logs") in log
-        assert len(log.splitlines()) == 1
+def sbatch(folder: Path, script: str) -> str:
+    """A folder of programs whose ``sbatch`` does more than SLURM's, which it knows as $SBATCH."""
+    (folder / "programs").mkdir()
+    program = folder / "programs" / "sbatch"
+    program.write_text(f"#!/bin/sh\nSBATCH={shutil.which('sbatch')}\n{script}\n")
+    program.chmod(0o755)
+    return str(program.parent)
+
+
+def test_match__waits_for_the_first_worker_and_says_so(slurm, pair, tmp_path):
+    programs = sbatch(tmp_path, 'exec $SBATCH --begin=now+15 "$@"')
+    with submitted(pair, tmp_path, programs=programs, constants={"_TOLD_EVERY": 4, "WORKERS_GONE": 1}, is_quiet=False):
+        pass
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert 1 <= len(lines) <= 8
+    assert all("no worker has come yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_match__ends_when_the_last_worker_has_gone_and_goes_on_after(slurm, pair, tmp_path):
+    once = tmp_path / "once"
+    programs = sbatch(tmp_path, f'mkdir {once} 2> /dev/null || set -- --begin=now+1hour "$@"\nexec $SBATCH "$@"')
+    with submitted(pair, tmp_path, 1, programs=programs, constants={"WORKERS_GONE": 5}) as process:
+        wait_for_tiles(process, tmp_path, 5)
+        (job,) = jobs()
+        subprocess.run(["scancel", job], check=True, timeout=30)
+    (line,) = (tmp_path / "log").read_text().splitlines()
+    assert "the last worker has gone and none has come for 5 s" in line
+    assert str(tmp_path / "out" / "logs") in line
+    assert "the same command goes on from the tiles that are done" in line
+    images, settings = pair
+    match_pair(images / "left.tif", images / "right.tif", tmp_path / "out", settings)
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_workers_there__says_once_a_minute_that_no_worker_has_come_and_ends_minutes_after_the_last(monkeypatch, caplog):
+    seconds, cores = [0.0], {}
+    monkeypatch.setattr(time, "monotonic", lambda: seconds[0])
+    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs", seen=None, told=0.0)
+    client = SimpleNamespace(cluster=system, nthreads=lambda: cores)
+    for seconds[0] in range(0, 3600, 2):
+        assert workers_there(client) == {}
+    assert len(caplog.messages) == 59
+    assert "/logs" in caplog.messages[0]
+    cores["one"] = 2
+    assert sum(workers_there(client).values()) == 2
+    cores.clear()
+    seconds[0] += 300
+    assert workers_there(client) == {}
+    seconds[0] += 1
+    with pytest.raises(RunError, match=r"none has come for 300 s: .* /logs tell; the same command goes on"):
+        workers_there(client)
+    assert len(caplog.messages) == 59
+
+
+def test_match__ends_when_the_batch_system_takes_no_job(slurm, pair, tmp_path):
+    refused = tmp_path / "refused"
+    with submitted(pair, refused, 2, queue="nowhere"):
+        pass
     log = (refused / "log").read_text()
     assert log.startswith("sat-intervals: the batch system refuses the job: sbatch: error: invalid partition specified")
     assert len(log.splitlines()) == 1

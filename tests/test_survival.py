@@ -23,6 +23,7 @@ import yaml
 from distributed import Client, LocalCluster
 
 from sat_intervals import match_pair, run
+from sat_intervals.folders import LocalFolder
 from sat_intervals.job import prepare
 from sat_intervals.scene import make_scene
 
@@ -346,7 +347,7 @@ def test_match__ends_when_the_scheduler_dies_and_goes_on_elsewhere(pair, tmp_pat
     assert_complete(pair, out)
 
 
-def test_match__does_only_what_is_missing_after_a_truncated_input_is_mended(pair, tmp_path):
+def test_match__names_the_tiles_of_a_truncated_input_and_refuses_it_mended(pair, tmp_path):
     out, left = tmp_path / "out", tmp_path / "left.tif"
     shutil.copy(pair / "left.tif", left)
     whole = left.read_bytes()
@@ -365,19 +366,13 @@ def test_match__does_only_what_is_missing_after_a_truncated_input_is_mended(pair
     status = subprocess.run([SCRIPTS / "sat-intervals", "status", out], capture_output=True, text=True, check=True)
     assert f"{len(done)} of {TILES} tiles done, {len(failed)} failed, 0 left" in status.stdout
 
-    other = bytearray(whole)
-    other[len(whole) // 4] ^= 1  # not mended but changed, where tiles are done
-    left.write_bytes(other)
+    left.write_bytes(whole)
     with started(pair, out, left=left) as command:
         assert command.end() == 2
         assert "inputs.left.sha256 was" in command.output
-
-    left.write_bytes(whole)
-    before = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done}
-    with started(pair, out, "--keep-tiles", left=left) as command:
+        assert "--overwrite" in command.output
+    with started(pair, out, "--overwrite", left=left) as command:
         assert command.end() == 0, command.output
-    assert {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done} == before
-    shutil.rmtree(out / "tiles")
     assert_complete(pair, out)
 
 
@@ -468,7 +463,7 @@ def test_matched__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_pat
     image = tmp_path / "wide.tif"
     write_image(image, np.ones((64 * 20, 64 * 25), np.uint16))
     job = prepare(image, image, tmp_path / "out", yaml.safe_load((pair / "settings.yaml").read_text()))
-    with run.held(job.store.home, lambda stage, done, total: None):
+    with LocalFolder(job.store.home).locked():
         job.begin()
         with (
             LocalCluster(

@@ -1,7 +1,5 @@
 """Places where a run leaves small texts and arrays: folders of this machine, prefixes of any fsspec file system."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
@@ -29,8 +27,14 @@ class Folder(Protocol):
     def write(self, name: str, text: str) -> None:
         """Write a file that is either there as a whole or not at all."""
 
+    def create(self, name: str, text: str) -> bool:
+        """Write a file as a whole unless it is there; whether it was written."""
+
     def delete(self, name: str) -> None:
         """Delete a file, or a folder with all that is in it, if it is there."""
+
+    def delete_if_empty(self) -> None:
+        """Delete this folder, where nothing is in it."""
 
     def inside(self, folder: str) -> "Folder":
         """A folder in it."""
@@ -43,21 +47,6 @@ class Folder(Protocol):
 
     def free_bytes(self) -> int | None:
         """Room that is left, None where nobody can tell."""
-
-    def locked(self, waiting: Callable[[], None] = ...) -> AbstractContextManager[Callable[[], None]]:
-        """Keep every other run out until the block ends.
-
-        What is yielded is to be called now and then: it raises a RunError when the lock is no longer this run's.
-        ``waiting`` is called where it must be seen first whether the run that holds the lock lives.
-
-        Raises
-        ------
-        SatIntervalsError
-            When another run is at work there, or the place cannot be used.
-        """
-
-    def is_locked(self) -> bool:
-        """Whether a run is at work there."""
 
 
 def folder_at(place: str | Path) -> Folder:

@@ -5,7 +5,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ _PATIENCE = 0.2
 
 @dataclass(frozen=True)
 class LocalFolder:
-    """See `Folder`; files get their names when they are whole, and the lock is the operating system's."""
+    """See `Folder`; files get their names when they are whole. Runs keep each other out by the system's own lock."""
 
     path: Path
 
@@ -53,11 +53,30 @@ class LocalFolder:
 
     def write(self, name: str, text: str) -> None:
         """See `Folder`."""
+        with self._written(name, text) as (temporary, file):
+            os.replace(temporary, file)
+
+    def create(self, name: str, text: str) -> bool:
+        """See `Folder`."""
+        with self._written(name, text) as (temporary, file):
+            try:
+                os.link(temporary, file)
+            except FileExistsError:
+                return False
+            except OSError:  # a disk without links
+                if file.exists():
+                    return False
+                os.replace(temporary, file)
+        return True
+
+    @contextmanager
+    def _written(self, name: str, text: str) -> Iterator[tuple[Path, Path]]:
+        """A file with the text that lasts as long as the block, and the one that it is to become."""
         file = self.path / name
         temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
         try:
             temporary.write_text(text)
-            os.replace(temporary, file)
+            yield temporary, file
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(file)) from error
         finally:
@@ -69,6 +88,11 @@ class LocalFolder:
             shutil.rmtree(self.path / name, ignore_errors=True)
         else:
             (self.path / name).unlink(missing_ok=True)
+
+    def delete_if_empty(self) -> None:
+        """See `Folder`."""
+        with suppress(OSError):
+            self.path.rmdir()
 
     def inside(self, folder: str) -> "LocalFolder":
         """See `Folder`."""
@@ -87,16 +111,23 @@ class LocalFolder:
         return shutil.disk_usage(self.path).free
 
     @contextmanager
-    def locked(self, waiting: Callable[[], None] = lambda: None) -> Iterator[Callable[[], None]]:
-        """See `Folder`; the lock dies with its process, and a folder that is then empty goes."""
+    def locked(self) -> Iterator[None]:
+        """Keep every other run out until the block ends.
+
+        The lock dies with its process, and a folder that is then empty goes.
+
+        Raises
+        ------
+        SatIntervalsError
+            When another run is at work there, or the folder cannot be used.
+        """
         with self._lock() as lock:
             try:
-                yield lambda: None
+                yield
             finally:
                 # whoever opened it meanwhile sees that it is gone, see _lock
                 Path(lock.name).unlink(missing_ok=True)
-                with suppress(OSError):
-                    self.path.rmdir()
+                self.delete_if_empty()
 
     def _lock(self) -> TextIO:
         """The lock's file, open and locked, under its name."""
@@ -132,7 +163,7 @@ class LocalFolder:
             lock.close()  # it was removed, or replaced, before it was locked
 
     def is_locked(self) -> bool:
-        """See `Folder`."""
+        """Whether a run is at work there."""
         try:
             with (self.path / _LOCK).open() as lock:
                 fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -5,7 +5,7 @@ from its own environment variables and files (``AWS_ENDPOINT_URL``, ``~/.aws``) 
 """
 
 import errno
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -13,13 +13,10 @@ from typing import Any
 
 import fsspec
 
-from sat_intervals.errors import SatIntervalsError
-from sat_intervals.folders import lease
-
 
 @dataclass(frozen=True)
 class RemoteFolder:
-    """See `Folder`; the lock is a `lease`."""
+    """See `Folder`."""
 
     url: str
 
@@ -76,7 +73,7 @@ class RemoteFolder:
             system.pipe_file(path, text.encode())
 
     def create(self, name: str, text: str) -> bool:
-        """Write a file unless it is there, in one step where the service offers that, as S3 does; whether it was."""
+        """See `Folder`; one step where the service offers that, as S3 does."""
         try:
             with self._reached(name) as (system, path):
                 system.pipe_file(path, text.encode(), mode="create")
@@ -89,6 +86,12 @@ class RemoteFolder:
         with suppress(FileNotFoundError), self._reached(name) as (system, path):
             system.invalidate_cache(path)
             system.rm(path, recursive=True)
+
+    def delete_if_empty(self) -> None:
+        """See `Folder`; a bucket stays."""
+        with suppress(OSError), self._reached("") as (system, path):
+            if "/" in path.strip("/"):
+                system.rmdir(path.rstrip("/"))
 
     def inside(self, folder: str) -> "RemoteFolder":
         """See `Folder`."""
@@ -105,24 +108,6 @@ class RemoteFolder:
 
     def free_bytes(self) -> None:
         """See `Folder`."""
-
-    @contextmanager
-    def locked(self, waiting: Callable[[], None] = lambda: None) -> Iterator[Callable[[], None]]:
-        """See `Folder`."""
-        try:
-            self.make("")
-            held = lease.taken(self, waiting)
-        except OSError as error:
-            raise SatIntervalsError(
-                f"{self} cannot be used: {error.strerror or error}: check the URL, the credentials, and that the "
-                "package of its file system is installed (sat-intervals[remote] for s3://)"
-            ) from error
-        with held:
-            yield held.check
-
-    def is_locked(self) -> bool:
-        """See `Folder`."""
-        return lease.is_fresh(self)
 
 
 def object_tag(url: str) -> dict[str, Any]:

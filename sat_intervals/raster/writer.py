@@ -157,44 +157,41 @@ class OutputWriter:
             self._verify(whole, self._sums[name])
         os.unlink(strips.name)
 
-    def publish(self, texts: Mapping[str, str] | None = None) -> None:
-        """Give the files their names, with further text files (name to content) that belong to them."""
+    def publish(self, report: tuple[str, str] | None = None) -> None:
+        """Give the files their names, all of them or none.
+
+        With a ``report``, name and text of a file that tells that the others are whole, that of before goes first and
+        this one comes last: without it the others do not count, and nothing is put back where one fails.
+        """
         self.build()
-        texts = texts or {}
-        for name, text in texts.items():
+        names = [file.name for file in self._files]
+        if report:
+            name, text = report
+            names.append(name)
             with self._failing(self._folder / name):
                 (self._scratch / name).write_text(text, encoding="utf-8")
                 _flush(self._scratch / name)
-        reached: list[str] = []
+                (self._folder / name).unlink(missing_ok=True)
         try:
-            for name in (*(file.name for file in self._files), *texts):
+            for name in names:
                 with self._failing(self._folder / name):
-                    reached.append(name)
-                    self._put(name)
+                    if not report and name != names[-1]:  # after the last there is nothing to put back
+                        with suppress(FileNotFoundError):
+                            os.replace(self._folder / name, self._replaced / name)
+                    os.replace(self._scratch / name, self._folder / name)
         except BaseException:
-            for name in reached:
-                self._take_back(name)
+            if not report and (self._scratch / names[-1]).exists():
+                self._take_back(names)
             raise
 
-    def _put(self, name: str) -> None:
-        """Give a file its name; another that had it is kept until the end."""
-        before = self._folder / name
-        if before.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if before.exists():
-            try:
-                os.link(before, self._replaced / name)
-            except OSError:  # a disk without links: for a moment there is no file of that name
-                os.replace(before, self._replaced / name)
-        os.replace(self._scratch / name, before)
-
-    def _take_back(self, name: str) -> None:
-        """Put back the file that had the name before, or none."""
-        with suppress(OSError):
-            if (self._replaced / name).exists():
-                os.replace(self._replaced / name, self._folder / name)
-            elif not (self._scratch / name).exists():
-                os.unlink(self._folder / name)
+    def _take_back(self, names: Sequence[str]) -> None:
+        """Put back the files that had the names before."""
+        for name in names:
+            with suppress(OSError):
+                if (self._replaced / name).exists():
+                    os.replace(self._replaced / name, self._folder / name)
+                elif not (self._scratch / name).exists():
+                    os.unlink(self._folder / name)
 
     def _create(self, file: File) -> DatasetWriter:
         """A plain GeoTIFF for the strips, with all that is said of the file."""
