@@ -32,7 +32,7 @@ def ablate(
     from sat_intervals.ablation import ablate_pair
     from sat_intervals.cli.tables import show_groups
     from sat_intervals.config import load_config
-    from sat_intervals.pairs import find_pairs
+    from sat_intervals.config.pairs import find_pairs
     from sat_intervals.tables import Scene, table_2
 
     found = find_pairs(pairs)

@@ -16,7 +16,7 @@ from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
-    from sat_intervals.pairs import Pair
+    from sat_intervals.config.pairs import Pair
 
 _FILE = click.Path(path_type=Path)
 
@@ -128,8 +128,8 @@ def _sources(
     folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...], costs: tuple[str, ...]
 ) -> list[_Source]:
     """What the arguments name, in their order; pairs once for each cost."""
+    from sat_intervals.config.pairs import check_names, find_pairs, is_pair
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.pairs import check_names, find_pairs, is_pair
 
     pairs = [folder for folder in folders if is_pair(folder) and not (folder / "run.json").exists()]
     find_pairs(pairs)  # all at once, so that none is given twice
@@ -192,7 +192,7 @@ def _judge_pair(
 
 
 def _group(source: _Source) -> str:
-    from sat_intervals.pairs import group_beside
+    from sat_intervals.config.pairs import group_beside
     from sat_intervals.results import open_run
 
     if source.pair is not None:

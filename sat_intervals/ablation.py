@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.config import Config, Interval, Mccnn, load_config
+from sat_intervals.config.pairs import Pair
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows as Judgeable
 from sat_intervals.evaluation import evaluate, rules_of
@@ -18,7 +19,6 @@ from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.machine import usable_memory
 from sat_intervals.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.normalization import Scales, measure
-from sat_intervals.pairs import Pair
 from sat_intervals.patch import kernel_settings, match_patch
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY
 from sat_intervals.raster import Image, check_pair, open_image, read_window

@@ -11,7 +11,6 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.inputs import is_changed
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS
 from sat_intervals.raster import (
@@ -23,6 +22,7 @@ from sat_intervals.raster import (
     read_small_layers,
     read_window,
 )
+from sat_intervals.raster.identity import is_changed
 from sat_intervals.tiling import Window, strips
 
 # Pixels of a strip, and bands of the files.

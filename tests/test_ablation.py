@@ -15,13 +15,13 @@ from sat_intervals import ablation, match_arrays
 from sat_intervals.ablation import ablate_pair
 from sat_intervals.cli import main
 from sat_intervals.config import load_config
+from sat_intervals.config.pairs import Pair, find_pairs
+from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows, evaluate, rules_of
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.memory import PROCESS_BYTES, volume_bytes
-from sat_intervals.pairs import Pair, find_pairs
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
-from sat_intervals.scene import make_scene
 from sat_intervals.tables import METHODS, Scene, table_2
 
 some = settings(max_examples=60, derandomize=True, deadline=None)

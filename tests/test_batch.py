@@ -20,6 +20,7 @@ from sat_intervals.batch import PairOfBatch, match_batch, read_batch
 from sat_intervals.cli import main
 from sat_intervals.cluster import connected, parse_memory
 from sat_intervals.config import Cluster, ConfigError, load_config
+from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.folders import LocalFolder
 from sat_intervals.job import prepare
@@ -27,7 +28,6 @@ from sat_intervals.memory import fitted, tile_bytes
 from sat_intervals.plan import plan
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.run import match_pair, matched
-from sat_intervals.scene import make_scene
 from sat_intervals.tile import match_tile
 
 

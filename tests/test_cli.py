@@ -26,9 +26,9 @@ from rio_cogeo.cogeo import cog_validate
 from sat_intervals import load_config, match_arrays
 from sat_intervals.cli import main
 from sat_intervals.config import preset_names, preset_text
+from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
 from sat_intervals.products import BANDS, FLAGS, INVALID
-from sat_intervals.scene import make_scene
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]

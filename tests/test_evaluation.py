@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 
 from sat_intervals import match_pair
 from sat_intervals.cli import main
+from sat_intervals.config.pairs import find_pairs, group_beside
+from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows, evaluate, evaluate_run
 from sat_intervals.figures import Rules
-from sat_intervals.pairs import find_pairs, group_beside
 from sat_intervals.products import INVALID, OCCLUSION
-from sat_intervals.scene import make_scene
 from sat_intervals.tables import Scene, table_1
 from sat_intervals.tiling import Window
 

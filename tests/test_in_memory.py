@@ -6,8 +6,8 @@ import reference
 import xarray as xr
 
 from sat_intervals import SatIntervalsError, load_config, match_arrays
+from sat_intervals.demo import make_scene
 from sat_intervals.products import BANDS, FLAGS, NO_DATA
-from sat_intervals.scene import make_scene
 
 BAND_NAMES = [band.name for band in BANDS]
 

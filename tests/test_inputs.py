@@ -15,8 +15,8 @@ import pytest
 import rasterio
 
 from sat_intervals import match_pair
-from sat_intervals.inputs import identity
-from sat_intervals.scene import make_scene
+from sat_intervals.demo import make_scene
+from sat_intervals.raster.identity import identity
 from sat_intervals.tiling import Window
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"

@@ -15,6 +15,7 @@ from networks import random_weights, slow_features, trained_network, write_netwo
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
 from sat_intervals.batch import PairOfBatch, match_batch
 from sat_intervals.cli import main
+from sat_intervals.demo import make_scene
 from sat_intervals.features import Network, load_network, weights_file
 from sat_intervals.in_memory import _reader
 from sat_intervals.job import prepare
@@ -25,7 +26,6 @@ from sat_intervals.pictures.curve import read_curve
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.results import open_results
-from sat_intervals.scene import make_scene
 from sat_intervals.similarity import Area, compare
 from sat_intervals.tile import match_tile
 from sat_intervals.tiling import Window

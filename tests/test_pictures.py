@@ -21,6 +21,7 @@ from PIL import Image
 
 from sat_intervals import match_pair
 from sat_intervals.cli import main
+from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kinds import KINDS, ORANGE, SKY, VERMILION, classify
 from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
@@ -29,7 +30,6 @@ from sat_intervals.pictures.surface import _relief
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
-from sat_intervals.scene import make_scene
 from sat_intervals.tiling import Window
 
 WHITE, GREY = (255, 255, 255), (222, 222, 222)

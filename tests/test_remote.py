@@ -19,8 +19,8 @@ import pytest
 import yaml
 
 from sat_intervals import match_pair
+from sat_intervals.demo import make_scene
 from sat_intervals.raster import north_up, write_layer
-from sat_intervals.scene import make_scene
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]

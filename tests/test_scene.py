@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sat_intervals.scene import DATUM, GAIN, OFFSET, VIEWS, Scene, look, make_scene, profiles
+from sat_intervals.demo import DATUM, GAIN, OFFSET, VIEWS, Scene, look, make_scene, profiles
 
 ROWS, COLUMNS = 300, 420  # with a river, houses, blocks, wood and fields
 

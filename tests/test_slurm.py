@@ -19,8 +19,8 @@ import yaml
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.cluster import job_script, workers_there
 from sat_intervals.config import Cluster
+from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
-from sat_intervals.scene import make_scene
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 ROOT = Path(__file__).parents[1]

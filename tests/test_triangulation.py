@@ -14,8 +14,8 @@ from rasterio.warp import reproject
 
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.cli import main
+from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.products import INVALID, POINTS
-from sat_intervals.scene import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.surface import make_surface
 from sat_intervals.tiling import Window
 

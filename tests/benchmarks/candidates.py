@@ -24,7 +24,7 @@ SCENE = Path(__file__).with_name("scene.npz")
 def make_pair(rows, columns):
     """A procedural pair of any size: one scene of 1000 x 1000, side by side and mirrored downwards."""
     if not SCENE.exists():
-        from sat_intervals.scene import make_scene
+        from sat_intervals.demo import make_scene
 
         scene = make_scene(1000, 1000)
         np.savez(SCENE.with_suffix(".part.npz"), left=scene.left, right=scene.right)
