@@ -31,7 +31,7 @@ def status(out: Path) -> None:
 
 def _tell(out: Path) -> None:
     from sat_intervals.job import is_complete
-    from sat_intervals.store import read_status
+    from sat_intervals.store.tiles import read_status
 
     if is_complete(out):
         click.echo(f"{out}: complete")

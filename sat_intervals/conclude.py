@@ -19,7 +19,7 @@ from sat_intervals.job import Job
 from sat_intervals.products import FLAGS
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
 from sat_intervals.seams import seam_report
-from sat_intervals.store import mark_replaced
+from sat_intervals.store.tiles import mark_replaced
 from sat_intervals.summary import Tally
 from sat_intervals.tile import logged_stage
 

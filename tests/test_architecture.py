@@ -118,7 +118,7 @@ def imported_rooms(source: str, module: str) -> set[str]:
         ("from sat_intervals import match_pair, __version__", {"run"}),
         ("from ..run import match_pair", {"run"}),
         ("from . import cost", {"kernels"}),
-        ("def late():\n    from sat_intervals.store import Store", {"store"}),
+        ("def late():\n    from sat_intervals.store.tiles import Store", {"store"}),
         ("import sat_intervals", {"config", "errors", "in_memory", "raster", "run", "tiling"}),
     ],
 )

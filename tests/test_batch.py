@@ -22,12 +22,12 @@ from sat_intervals.cluster import connected, parse_memory
 from sat_intervals.config import Cluster, ConfigError, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.folders import LocalFolder
 from sat_intervals.job import prepare
 from sat_intervals.memory import fitted, tile_bytes
 from sat_intervals.plan import plan
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.run import match_pair, matched
+from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tile import match_tile
 
 
@@ -142,7 +142,7 @@ import os, sys, time
 from contextlib import suppress
 from pathlib import Path
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.folders import LocalFolder
+from sat_intervals.store.folder import LocalFolder
 from sat_intervals.job import prepare
 
 folder, inside, end = LocalFolder(Path(sys.argv[1])), sys.argv[1] + ".inside", time.monotonic() + 3

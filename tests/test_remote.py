@@ -253,7 +253,7 @@ def test_match__refuses_a_store_that_cannot_be_used(bucket, pair, tmp_path, stor
 def test_create__writes_an_object_once(bucket):
     code = """if True:
         from concurrent.futures import ThreadPoolExecutor
-        from sat_intervals.folders import RemoteFolder
+        from sat_intervals.store.folder import RemoteFolder
         folder = RemoteFolder("s3://bucket/contested")
         with ThreadPoolExecutor(8) as threads:
             created = list(threads.map(lambda number: folder.create("manifest.json", str(number)), range(8)))

@@ -24,8 +24,8 @@ from distributed import Client, LocalCluster
 
 from sat_intervals import match_pair, run
 from sat_intervals.demo import make_scene
-from sat_intervals.folders import LocalFolder
 from sat_intervals.job import prepare
+from sat_intervals.store.folder import LocalFolder
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
-from sat_intervals.folders import object_tag
+from sat_intervals.store.folder import object_tag
 
 # Names of GDAL, as rasterio takes them too, of objects in the stores that fsspec knows.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}

@@ -18,10 +18,10 @@ from rasterio.shutil import copy
 from rasterio.windows import Window as Area
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.folders import LocalFolder
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.store.folder import LocalFolder
 
 # Folder, beside the files, where they grow until they are whole; named after the first of them, and locked. What a
 # killed process left there is replaced.

@@ -12,8 +12,8 @@ import zarr
 from zarr.codecs import BloscCodec
 from zarr.errors import ContainsArrayError
 
-from sat_intervals.folders import Folder
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
+from sat_intervals.store.folder import Folder
 from sat_intervals.tiling import Grid, Tile
 
 # Raw products of the pixels of a core, in two arrays by their size, whose planes are read and written in one piece.

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Protocol
 
-from sat_intervals.folders.local import LocalFolder
-from sat_intervals.folders.remote import RemoteFolder, object_tag
+from sat_intervals.store.local import LocalFolder
+from sat_intervals.store.remote import RemoteFolder, object_tag
 
 __all__ = ["Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
 

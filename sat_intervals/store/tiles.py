@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.arrays import DamagedTilesError, TileArrays
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.folders import Folder, LocalFolder, folder_at
+from sat_intervals.store.folder import Folder, LocalFolder, folder_at
+from sat_intervals.store.zarr_arrays import DamagedTilesError, TileArrays
 from sat_intervals.tiling import Grid, Tile, Window
 
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
