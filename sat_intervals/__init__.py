@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sat_intervals.config import Config, load_config
     from sat_intervals.errors import RunError, SatIntervalsError
-    from sat_intervals.in_memory import match_arrays
+    from sat_intervals.match.in_memory import match_arrays
     from sat_intervals.raster import open_image
     from sat_intervals.run import match_pair
     from sat_intervals.tiling import Window
@@ -39,7 +39,7 @@ _HOMES = {
     "SatIntervalsError": "errors",
     "Window": "tiling",
     "load_config": "config",
-    "match_arrays": "in_memory",
+    "match_arrays": "match.in_memory",
     "match_pair": "run",
     "open_image": "raster",
 }

@@ -12,17 +12,17 @@ from sat_intervals.config.pairs import Pair
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows as Judgeable
 from sat_intervals.evaluation import evaluate, rules_of
-from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.machine import usable_memory
-from sat_intervals.memory import PROCESS_BYTES, volume_bytes
-from sat_intervals.normalization import Scales, measure
-from sat_intervals.patch import kernel_settings, match_patch
+from sat_intervals.match.matching_cost import Area, Reader, compare
+from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
+from sat_intervals.match.normalization import Scales, measure
+from sat_intervals.match.patch import kernel_settings, match_patch
+from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY
 from sat_intervals.raster import Image, check_pair, open_image, read_window
-from sat_intervals.similarity import Area, Reader, compare
 from sat_intervals.tables import METHODS
 from sat_intervals.tiling import Window, facing
 

@@ -106,7 +106,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         The whole range of the tile is searched in all its pixels; where CARS' memory does not allow it, it is cropped
         around nil as CARS does.
         """
-        from sat_intervals.in_memory import match_arrays  # not for every `import cars`: it sets up numba
+        from sat_intervals.match.in_memory import match_arrays  # not for every `import cars`: it sets up numba
 
         grids = dense_matching_algo.compute_disparity_grid(
             disp_range_grid.data, left_image_object, right_image_object, used_band, False

@@ -14,8 +14,8 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.finish import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.job import Job
+from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.products import FLAGS
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
 from sat_intervals.seams import seam_report

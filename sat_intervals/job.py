@@ -14,14 +14,14 @@ import numpy as np
 from sat_intervals.cluster import parse_memory
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.features import load_network, weights_file
-from sat_intervals.finish import Rows, Scale, finish_strips
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores, usable_memory
-from sat_intervals.memory import fitted, volume_bytes
-from sat_intervals.normalization import Scale as ImageScale
-from sat_intervals.normalization import Scales
-from sat_intervals.patch import match_patch
+from sat_intervals.match.mccnn import load_network, weights_file
+from sat_intervals.match.memory import fitted, volume_bytes
+from sat_intervals.match.normalization import Scale as ImageScale
+from sat_intervals.match.normalization import Scales
+from sat_intervals.match.patch import match_patch
+from sat_intervals.match.postprocess import Rows, Scale, finish_strips
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files
 from sat_intervals.raster.identity import identity
 from sat_intervals.store.folder import folder_at

@@ -9,7 +9,7 @@ from sat_intervals.cluster import tiles_at_once
 from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.job import check_memory, checked_pair, checked_region, fitted_to_jobs
-from sat_intervals.memory import PROCESS_BYTES, fitted, tile_bytes
+from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
 from sat_intervals.raster import Image
 from sat_intervals.run import match_pair
 from sat_intervals.tiling import Grid, Window

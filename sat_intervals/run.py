@@ -14,7 +14,7 @@ from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
 from sat_intervals.flight import Flight, Task, reason
 from sat_intervals.job import Job, compile_kernels, prepare
-from sat_intervals.normalization import Moments, Scale, Scales, blocks, scale_of
+from sat_intervals.match.normalization import Moments, Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tile import logged_stage, match_tile, measure_block

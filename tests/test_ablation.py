@@ -20,7 +20,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluation import Rows, evaluate, rules_of
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
-from sat_intervals.memory import PROCESS_BYTES, volume_bytes
+from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tables import METHODS, Scene, table_2
 

@@ -23,7 +23,7 @@ from sat_intervals.config import Cluster, ConfigError, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.job import prepare
-from sat_intervals.memory import fitted, tile_bytes
+from sat_intervals.match.memory import fitted, tile_bytes
 from sat_intervals.plan import plan
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.run import match_pair, matched

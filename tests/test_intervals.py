@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals.config import load_config
-from sat_intervals.finish import Rows, Scale, confidence_scale, finish_rows
-from sat_intervals.in_memory import match_arrays
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Settings, match
-from sat_intervals.patch import match_patch
+from sat_intervals.match.in_memory import match_arrays
+from sat_intervals.match.patch import match_patch
+from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import Window
 

@@ -16,17 +16,17 @@ from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays
 from sat_intervals.batch import PairOfBatch, match_batch
 from sat_intervals.cli import main
 from sat_intervals.demo import make_scene
-from sat_intervals.features import Network, load_network, weights_file
-from sat_intervals.in_memory import _reader
 from sat_intervals.job import prepare
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.normalization import Scale, Scales
-from sat_intervals.patch import kernel_settings
+from sat_intervals.match.in_memory import _reader
+from sat_intervals.match.matching_cost import Area, compare
+from sat_intervals.match.mccnn import Network, load_network, weights_file
+from sat_intervals.match.normalization import Scale, Scales
+from sat_intervals.match.patch import kernel_settings
 from sat_intervals.pictures.curve import read_curve
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.results import open_results
-from sat_intervals.similarity import Area, compare
 from sat_intervals.tile import match_tile
 from sat_intervals.tiling import Window
 
@@ -82,7 +82,7 @@ def test_weights_file__missing_extra_is_told(monkeypatch):
     def nowhere(name):
         raise metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr("sat_intervals.features.files", nowhere)
+    monkeypatch.setattr("sat_intervals.match.mccnn.files", nowhere)
     with pytest.raises(SatIntervalsError, match=r"needs the weights in MCCNN: pip install sat-intervals\[mccnn\]"):
         weights_file(None)
 

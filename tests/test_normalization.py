@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.normalization import BLOCK, Scale, blocks, measure, moments, scale_of
+from sat_intervals.match.normalization import BLOCK, Scale, blocks, measure, moments, scale_of
 from sat_intervals.tiling import Window
 
 

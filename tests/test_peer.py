@@ -21,14 +21,14 @@ from networks import trained_network
 
 from sat_intervals import load_config, match_arrays
 from sat_intervals.config import Config
-from sat_intervals.features import load_network, weights_file
-from sat_intervals.in_memory import _reader
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.normalization import Scales, measure
-from sat_intervals.patch import kernel_settings
+from sat_intervals.match.in_memory import _reader
+from sat_intervals.match.matching_cost import Area, compare
+from sat_intervals.match.mccnn import load_network, weights_file
+from sat_intervals.match.normalization import Scales, measure
+from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
-from sat_intervals.similarity import Area, compare
 from sat_intervals.tiling import Window
 
 # Our reading of the pairs, which have no georeferencing. Pandora and its plugin raise no warning.

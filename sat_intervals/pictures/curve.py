@@ -8,12 +8,12 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.normalization import Scales
-from sat_intervals.patch import kernel_settings
+from sat_intervals.match.matching_cost import Area, compare
+from sat_intervals.match.normalization import Scales
+from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import FLAGS, IMPOSSIBLE_COST
 from sat_intervals.raster import read_window
 from sat_intervals.results import Results
-from sat_intervals.similarity import Area, compare
 from sat_intervals.tiling import Window
 
 

@@ -75,7 +75,7 @@ def watch_network(name):
 
         method = "inference_func"
     else:
-        from sat_intervals.features import Network
+        from sat_intervals.match.mccnn import Network
 
         method = "__call__"
     spent, function = [0.0], getattr(Network, method)

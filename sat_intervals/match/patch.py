@@ -6,9 +6,9 @@ import numpy as np
 
 from sat_intervals.config import Config, Sgm
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match
-from sat_intervals.normalization import Scales
+from sat_intervals.match.matching_cost import Area, Reader, Similarity, compare
+from sat_intervals.match.normalization import Scales
 from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
-from sat_intervals.similarity import Area, Reader, Similarity, compare
 from sat_intervals.tiling import Window, facing
 
 

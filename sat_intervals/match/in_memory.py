@@ -8,14 +8,14 @@ import xarray as xr
 
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.finish import Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.machine import usable_memory
-from sat_intervals.memory import volume_bytes
-from sat_intervals.normalization import Scales, measure
-from sat_intervals.patch import match_patch
+from sat_intervals.match.matching_cost import Reader
+from sat_intervals.match.memory import volume_bytes
+from sat_intervals.match.normalization import Scales, measure
+from sat_intervals.match.patch import match_patch
+from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_rows
 from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
-from sat_intervals.similarity import Reader
 from sat_intervals.tiling import Window
 
 Array = np.ndarray | xr.DataArray

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, InverseSgm, Mccnn, MccnnSgm, NegativeSgm
-from sat_intervals.features import Network, load_network, weights_file
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
-from sat_intervals.normalization import Scale, Scales
+from sat_intervals.match.mccnn import Network, load_network, weights_file
+from sat_intervals.match.normalization import Scale, Scales
 from sat_intervals.tiling import Window, facing
 
 Reader = Callable[[Window], tuple[np.ndarray, np.ndarray]]
