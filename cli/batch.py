@@ -27,8 +27,8 @@ def batch(
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, and any setting such as sgm.p2. A pair that
     fails does not stop the others; OUT/batch.json says how each ended, and the status is 1 if any failed.
     """
-    from sat_intervals.batch import match_batch, read_batch
     from sat_intervals.cli.console import Console
+    from sat_intervals.run.batch import match_batch, read_batch
 
     rows = read_batch(pairs)
     with Console(quiet) as console:

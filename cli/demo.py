@@ -34,9 +34,9 @@ def demo(
     from sat_intervals.config import load_config
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluation import evaluate_run
-    from sat_intervals.job import check_output
     from sat_intervals.raster import north_up, write_once
-    from sat_intervals.run import match_pair
+    from sat_intervals.run.job import check_output
+    from sat_intervals.run.pair import match_pair
 
     check_output(out, run["overwrite"])
     somewhere = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)

@@ -184,7 +184,7 @@ def _judge_pair(
     judge: Callable[..., dict[str, Any]], source: _Source, pair: "Pair", config: "Config"
 ) -> dict[str, Any]:
     """Match a pair to files, as anyone would, and judge them."""
-    from sat_intervals.run import match_pair
+    from sat_intervals.run.pair import match_pair
 
     with TemporaryDirectory(prefix="sat-intervals-") as out:
         match_pair(pair.left, pair.right, out, config)

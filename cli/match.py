@@ -60,12 +60,12 @@ def match(
         raise click.UsageError("Missing search range: give --disparity MIN MAX, or a --config with it.")
     config = load_config(config_file, with_range(given, disparity))
     if dry_run:
-        from sat_intervals.cluster import job_script
+        from sat_intervals.run.cluster import job_script
 
         click.echo(job_script(config.cluster, out))
         return
     with Console(quiet) as console:
-        from sat_intervals.run import match_pair
+        from sat_intervals.run.pair import match_pair
 
         report = match_pair(
             *images(left, right),

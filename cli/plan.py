@@ -43,9 +43,9 @@ def plan(
 
     Takes the options of match, and those of its settings that matter, such as the jobs of a batch system.
     """
-    from sat_intervals.cluster import parse_memory
     from sat_intervals.config import load_config
-    from sat_intervals.plan import plan as make_plan
+    from sat_intervals.run.cluster import parse_memory
+    from sat_intervals.run.plan import plan as make_plan
 
     config = load_config(config_file, with_range(given, disparity))
     made = make_plan(*images(left, right), config, window=window, memory=parse_memory(memory) if memory else None)

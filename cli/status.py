@@ -12,8 +12,8 @@ def status(out: Path) -> None:
 
     Of the folder of a batch: the same of each of its pairs, and why pairs failed.
     """
-    from sat_intervals.batch import read_report
     from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.run.batch import read_report
 
     pairs = read_report(out)
     if pairs is None:
@@ -30,7 +30,7 @@ def status(out: Path) -> None:
 
 
 def _tell(out: Path) -> None:
-    from sat_intervals.job import is_complete
+    from sat_intervals.run.job import is_complete
     from sat_intervals.store.tiles import read_status
 
     if is_complete(out):

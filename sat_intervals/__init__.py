@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sat_intervals.errors import RunError, SatIntervalsError
     from sat_intervals.match.in_memory import match_arrays
     from sat_intervals.raster import open_image
-    from sat_intervals.run import match_pair
+    from sat_intervals.run.pair import match_pair
     from sat_intervals.tiling import Window
 
     __version__: str
@@ -40,7 +40,7 @@ _HOMES = {
     "Window": "tiling",
     "load_config": "config",
     "match_arrays": "match.in_memory",
-    "match_pair": "run",
+    "match_pair": "run.pair",
     "open_image": "raster",
 }
 

@@ -15,20 +15,20 @@ import rasterio
 import yaml
 from click.testing import CliRunner
 
-from sat_intervals import batch
-from sat_intervals.batch import PairOfBatch, match_batch, read_batch
 from sat_intervals.cli import main
-from sat_intervals.cluster import connected, parse_memory
 from sat_intervals.config import Cluster, ConfigError, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.job import prepare
 from sat_intervals.match.memory import fitted, tile_bytes
-from sat_intervals.plan import plan
 from sat_intervals.raster import north_up, write_layer
-from sat_intervals.run import match_pair, matched
+from sat_intervals.run import batch
+from sat_intervals.run.batch import PairOfBatch, match_batch, read_batch
+from sat_intervals.run.cluster import connected, parse_memory
+from sat_intervals.run.job import prepare
+from sat_intervals.run.pair import match_pair, matched
+from sat_intervals.run.plan import plan
+from sat_intervals.run.tile import match_tile
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.tile import match_tile
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ from contextlib import suppress
 from pathlib import Path
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.job import prepare
+from sat_intervals.run.job import prepare
 
 folder, inside, end = LocalFolder(Path(sys.argv[1])), sys.argv[1] + ".inside", time.monotonic() + 3
 count = 0

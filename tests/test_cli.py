@@ -342,7 +342,7 @@ def test_match__tells_what_nobody_foresaw_in_one_line(folder, tmp_path, monkeypa
     def fail(*arguments, **options):
         raise error
 
-    monkeypatch.setattr("sat_intervals.run.match_pair", fail)
+    monkeypatch.setattr("sat_intervals.run.pair.match_pair", fail)
     assert_refused(invoke(*matching(folder, tmp_path / "out")), says, status=status)
 
 
@@ -366,7 +366,7 @@ def test_debug__shows_stages_tiles_and_workers_and_what_dask_says(folder, tmp_pa
         assert [message for _, message in words if re.fullmatch(rf"stage {stage} begins", message)]
         assert [message for _, message in words if re.fullmatch(rf"stage {stage} ended after \d+\.\d s", message)]
     tiles = [f"{row}_{column}" for row in range(2) for column in range(3)]
-    done = [message for name, message in words if name == "sat_intervals.run"]
+    done = [message for name, message in words if name == "sat_intervals.run.pair"]
     assert sorted(done) == [f"{tmp_path / 'out'}: tile {tile} done" for tile in tiles]
     took = [re.match(r"tile (\d_\d): read \d+\.\d\d s, match \d+\.\d\d s", message) for _, message in words]
     assert sorted(match[1] for match in took if match) == tiles
@@ -387,7 +387,9 @@ def test_log_file__keeps_what_debug_shows_and_what_it_held(folder, tmp_path):
     kept = log.read_text()
     assert kept.startswith("mine\n")
     words = logged(kept)
-    assert {"sat_intervals.tile", "sat_intervals.flight", "distributed.scheduler"} <= {name for name, _ in words}
+    assert {"sat_intervals.run.tile", "sat_intervals.run.submit", "distributed.scheduler"} <= {
+        name for name, _ in words
+    }
     assert len([message for _, message in words if message.endswith("tile 3_4 done")]) == 0
     assert len([message for _, message in words if "tile 3_4 failed: " in message]) == 1
     retries = load_config(folder / "settings.yaml").cluster.retries
@@ -405,7 +407,7 @@ def test_commands__leave_logging_as_it_was(folder, tmp_path, monkeypatch, option
     """Whether they succeed or fail."""
 
     def fail(*arguments, **options):
-        logging.getLogger("sat_intervals.run").warning("two\nlines")
+        logging.getLogger("sat_intervals.run.pair").warning("two\nlines")
         raise RunError("in vain")
 
     def state():
@@ -415,26 +417,26 @@ def test_commands__leave_logging_as_it_was(folder, tmp_path, monkeypatch, option
     monkeypatch.chdir(tmp_path)
     before = state()
     assert invoke(*matching(folder, tmp_path / "out"), *options).exit_code == 0
-    monkeypatch.setattr("sat_intervals.run.match_pair", fail)
+    monkeypatch.setattr("sat_intervals.run.pair.match_pair", fail)
     assert invoke(*matching(folder, tmp_path / "out"), *options).exit_code == 1
     assert state() == before
 
 
 def test_match__shows_a_warning_in_a_line(folder, tmp_path, monkeypatch):
     def warn(*arguments, **options):
-        log = logging.getLogger("sat_intervals.run")
+        log = logging.getLogger("sat_intervals.run.pair")
         log.info("nobody asked")
         log.warning("%d doubts", 3)
         raise RunError("in vain")
 
-    monkeypatch.setattr("sat_intervals.run.match_pair", warn)
+    monkeypatch.setattr("sat_intervals.run.pair.match_pair", warn)
     arguments = matching(folder, tmp_path / "out")
     assert invoke(*arguments).stderr == "sat-intervals: 3 doubts\nsat-intervals: in vain\n"
     words = logged(invoke(*arguments, "--debug").stderr)
     assert words == [
         ("sat_intervals.cli.logs", "main match begins"),
-        ("sat_intervals.run", "nobody asked"),
-        ("sat_intervals.run", "3 doubts"),
+        ("sat_intervals.run.pair", "nobody asked"),
+        ("sat_intervals.run.pair", "3 doubts"),
         ("sat_intervals.cli.logs", "main match failed"),
     ]
 

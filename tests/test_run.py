@@ -12,18 +12,19 @@ import numpy as np
 import pytest
 import rasterio
 
-from sat_intervals import match_arrays, match_pair, run
-from sat_intervals.cluster import connected
+from sat_intervals import match_arrays, match_pair
 from sat_intervals.config import Cluster, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.job import is_complete, prepare
 from sat_intervals.products import INVALID, NO_DATA
 from sat_intervals.raster import open_image, read_window
 from sat_intervals.results import open_run
+from sat_intervals.run import pair as run
+from sat_intervals.run.cluster import connected
+from sat_intervals.run.job import is_complete, prepare
+from sat_intervals.run.tile import match_tile
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import digest
-from sat_intervals.tile import match_tile
 from sat_intervals.tiling import Window
 
 

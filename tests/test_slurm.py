@@ -17,10 +17,10 @@ import rasterio
 import yaml
 
 from sat_intervals import SatIntervalsError, match_pair
-from sat_intervals.cluster import job_script, workers_there
 from sat_intervals.config import Cluster
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
+from sat_intervals.run.cluster import job_script, workers_there
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 ROOT = Path(__file__).parents[1]
@@ -78,7 +78,7 @@ def submitted(
 ):
     """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first.
 
-    ``constants`` are those of `sat_intervals.cluster`; where it ends well and ``is_quiet`` it must say nothing.
+    ``constants`` are those of `sat_intervals.run.cluster`; where it ends well and ``is_quiet`` it must say nothing.
     """
     images, settings = pair
     folder.mkdir(exist_ok=True)

@@ -22,9 +22,10 @@ import rasterio
 import yaml
 from distributed import Client, LocalCluster
 
-from sat_intervals import match_pair, run
+from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
-from sat_intervals.job import prepare
+from sat_intervals.run import pair as run
+from sat_intervals.run.job import prepare
 from sat_intervals.store.folder import LocalFolder
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))

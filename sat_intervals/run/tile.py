@@ -10,13 +10,13 @@ import numpy as np
 
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.job import Job, weights_identity
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.normalization import Moments, Scales, moments
 from sat_intervals.match.patch import Patch, match_patch
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.raster import Image, read_window
-from sat_intervals.seams import seam_lines
+from sat_intervals.run.job import Job, weights_identity
+from sat_intervals.run.seams import seam_lines
 from sat_intervals.tiling import Tile, Window
 
 _LOG = logging.getLogger(__name__)

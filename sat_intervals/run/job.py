@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.cluster import parse_memory
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
@@ -24,6 +23,7 @@ from sat_intervals.match.patch import match_patch
 from sat_intervals.match.postprocess import Rows, Scale, finish_strips
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files
 from sat_intervals.raster.identity import identity
+from sat_intervals.run.cluster import parse_memory
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.tiles import LAYOUT, Store, differences, digest, inputs_before, is_replacing
 from sat_intervals.tiling import Grid, Tile, Window

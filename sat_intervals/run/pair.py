@@ -8,16 +8,16 @@ from typing import Any
 
 from distributed import Client
 
-from sat_intervals.cluster import connected
-from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
-from sat_intervals.flight import Flight, Task, reason
-from sat_intervals.job import Job, compile_kernels, prepare
 from sat_intervals.match.normalization import Moments, Scale, Scales, blocks, scale_of
 from sat_intervals.raster import Image
+from sat_intervals.run.assemble import Progress, conclude
+from sat_intervals.run.cluster import connected
+from sat_intervals.run.job import Job, compile_kernels, prepare
+from sat_intervals.run.submit import Flight, Task, reason
+from sat_intervals.run.tile import logged_stage, match_tile, measure_block
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.tile import logged_stage, match_tile, measure_block
 from sat_intervals.tiling import Window
 
 # Errors of a disk, or of a user's share of it.

@@ -17,14 +17,14 @@ from typing import Any
 
 import yaml
 
-from sat_intervals.cluster import connected
-from sat_intervals.conclude import Progress, conclude
 from sat_intervals.config import Cluster, Config, load_config, load_yaml
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.job import Job, changes_since, compile_kernels, is_complete, prepare
 from sat_intervals.raster import Image, open_image
 from sat_intervals.results import open_run
-from sat_intervals.run import check_failures, matched, measure_images
+from sat_intervals.run.assemble import Progress, conclude
+from sat_intervals.run.cluster import connected
+from sat_intervals.run.job import Job, changes_since, compile_kernels, is_complete, prepare
+from sat_intervals.run.pair import check_failures, matched, measure_images
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import remove_tiles
 

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.cluster import tiles_at_once
 from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.job import check_memory, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
 from sat_intervals.raster import Image
-from sat_intervals.run import match_pair
+from sat_intervals.run.cluster import tiles_at_once
+from sat_intervals.run.job import check_memory, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.pair import match_pair
 from sat_intervals.tiling import Grid, Window
 
 # Side of the window at the centre of the image that is matched to tell the time.

@@ -14,14 +14,14 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.job import Job
 from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.products import FLAGS
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
-from sat_intervals.seams import seam_report
+from sat_intervals.run.job import Job
+from sat_intervals.run.seams import seam_report
+from sat_intervals.run.statistics import Tally
+from sat_intervals.run.tile import logged_stage
 from sat_intervals.store.tiles import mark_replaced
-from sat_intervals.summary import Tally
-from sat_intervals.tile import logged_stage
 
 Item = TypeVar("Item")
 

@@ -1,0 +1,1 @@
+"""Many tiles, many pairs: plan, submit, match, assemble. The only home of dask."""
