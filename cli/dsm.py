@@ -48,7 +48,7 @@ def dsm(
     0.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.surface import make_surface
+    from sat_intervals.heights.dsm import make_surface
 
     output = output or outs[0] / "dsm.tif"
     with Console(quiet) as console:

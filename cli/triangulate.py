@@ -33,7 +33,7 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
     Needs shareloc: pip install 'sat-intervals[dsm]'.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.cli.console import Console
-    from sat_intervals.triangulation import triangulate
+    from sat_intervals.heights.triangulate import triangulate
 
     with Console(quiet) as console:
         report = triangulate(out, left_model, right_model, left_grid, right_grid, progress=console.progress)

@@ -15,10 +15,10 @@ from rasterio.transform import Affine
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.cli import main
+from sat_intervals.heights.dsm import make_surface
 from sat_intervals.kernels.splat import empty_cells, splat
 from sat_intervals.products import POINTS, SURFACE
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, Projection
-from sat_intervals.surface import make_surface
 
 TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
 BAND = {band.name: index for index, band in enumerate(SURFACE)}
@@ -155,9 +155,9 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     x, y = random.uniform(0, 40, (2, 12, 12))
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     whole, place, _ = surface_of([out], tmp_path)
-    monkeypatch.setattr("sat_intervals.cloud.WINDOW", 7)
-    monkeypatch.setattr("sat_intervals.surface._TILE_ROWS", 20)
-    monkeypatch.setattr("sat_intervals.surface._TILE_COLUMNS", 25)
+    monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 7)
+    monkeypatch.setattr("sat_intervals.heights.dsm._TILE_ROWS", 20)
+    monkeypatch.setattr("sat_intervals.heights.dsm._TILE_COLUMNS", 25)
     tiled, same_place, _ = surface_of([out], tmp_path)
     assert place == same_place
     assert_allclose(tiled, whole, atol=1e-4)

@@ -15,15 +15,15 @@ from rasterio.warp import reproject
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.cli import main
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
+from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
-from sat_intervals.surface import make_surface
 from sat_intervals.tiling import Window
 
 if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") != "1":
     pytest.importorskip("shareloc", reason="needs the extra [dsm]")
 
-from sat_intervals.geometry import Lattice, Sensors
-from sat_intervals.triangulation import triangulate
+from sat_intervals.heights.sensors import Lattice, Sensors
+from sat_intervals.heights.triangulate import triangulate
 
 # Epipolar images have no georeferencing.
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -298,7 +298,7 @@ def test_lattice__asks_shareloc_for_few_nodes_at_a_time_and_for_none_twice(share
     region = Window(0, 0, 1216, 1262)
     lattice = Lattice(sensors, region, 1262, -35, 18)
     disparity = np.full((region.height, 7), 3.25)
-    monkeypatch.setattr("sat_intervals.geometry._AT_ONCE", 40)
+    monkeypatch.setattr("sat_intervals.heights.sensors._AT_ONCE", 40)
     counts, ask = [], Sensors._triangulate
     monkeypatch.setattr(Sensors, "_triangulate", lambda self, some: counts.append(len(some)) or ask(self, some))
     strips = [lattice.points(Window(row, 30, 19, 7), disparity[row : row + 19])[0] for row in range(0, 1216, 19)]

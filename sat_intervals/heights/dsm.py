@@ -14,9 +14,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sat_intervals.cloud import WINDOW, Cells, Cloud, Extent
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.fusion import cells_of_run, fused
+from sat_intervals.heights.fusion import cells_of_run, fused
+from sat_intervals.heights.point_cloud import WINDOW, Cells, Cloud, Extent
 from sat_intervals.products import POINTS
 from sat_intervals.raster import (
     Georeferencing,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.geometry import Lattice, Points, Sensors
+from sat_intervals.heights.sensors import Lattice, Points, Sensors
 from sat_intervals.products import INVALID
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image
 from sat_intervals.results import Run, open_run
