@@ -29,11 +29,11 @@ def ablate(
     `group`), or a row of a CSV file of the columns left, right, truth, minimum, maximum and, if you like,
     name and group, its paths relative to it.
     """
-    from sat_intervals.ablation import ablate_pair
     from sat_intervals.cli.tables import show_groups
     from sat_intervals.config import load_config
     from sat_intervals.config.pairs import find_pairs
-    from sat_intervals.tables import Scene, table_2
+    from sat_intervals.evaluate.ablation import ablate_pair
+    from sat_intervals.evaluate.paper import Scene, table_2
 
     found = find_pairs(pairs)
     configs = [load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, cost)) for pair in found]

@@ -33,7 +33,7 @@ def demo(
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
     from sat_intervals.demo import PIXEL, make_scene
-    from sat_intervals.evaluation import evaluate_run
+    from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up, write_once
     from sat_intervals.run.job import check_output
     from sat_intervals.run.pair import match_pair

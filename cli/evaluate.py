@@ -86,8 +86,8 @@ def evaluate(
     if not folders:
         raise click.UsageError("Missing argument 'OUT...'.")
     from sat_intervals.cli.tables import show_groups, show_missed, show_scene
-    from sat_intervals.evaluation import evaluate_run
-    from sat_intervals.tables import Scene, table_1
+    from sat_intervals.evaluate.disparity import evaluate_run
+    from sat_intervals.evaluate.paper import Scene, table_1
 
     sources = _sources(folders, truth, mask, cost)
     configs = _configs(sources, config_file, accurate, cost)
@@ -115,7 +115,7 @@ def _evaluate_surface(folders: tuple[Path, ...], dsm: Path | None, reference: Pa
     if folders:
         raise click.UsageError(f"{folders[0]} is a run, --dsm a surface model: judge one kind at a time.")
     from sat_intervals.cli.tables import show_surface
-    from sat_intervals.surface_evaluation import evaluate_surface
+    from sat_intervals.evaluate.dsm import evaluate_surface
 
     report = evaluate_surface(dsm, reference)
     if as_json:

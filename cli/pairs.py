@@ -11,7 +11,7 @@ import click
 from sat_intervals.cli.options import log_options
 
 if TYPE_CHECKING:
-    from sat_intervals.tables import Scene
+    from sat_intervals.evaluate.paper import Scene
 
 
 def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:

@@ -7,7 +7,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from sat_intervals.tables import ACCURACY, OBJECTIVE, Row, Scene, look_up
+from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, Scene, look_up
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:

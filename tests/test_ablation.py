@@ -11,18 +11,19 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals import ablation, match_arrays
-from sat_intervals.ablation import ablate_pair
+from sat_intervals import match_arrays
 from sat_intervals.cli import main
 from sat_intervals.config import load_config
 from sat_intervals.config.pairs import Pair, find_pairs
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluation import Rows, evaluate, rules_of
+from sat_intervals.evaluate import ablation
+from sat_intervals.evaluate.ablation import ablate_pair
+from sat_intervals.evaluate.disparity import Rows, evaluate, rules_of
+from sat_intervals.evaluate.paper import METHODS, Scene, table_2
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
-from sat_intervals.tables import METHODS, Scene, table_2
 
 some = settings(max_examples=60, derandomize=True, deadline=None)
 X = IMPOSSIBLE_COST

@@ -19,10 +19,10 @@ from sat_intervals.cli import main
 from sat_intervals.config.pairs import find_pairs, group_beside
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluation import Rows, evaluate, evaluate_run
-from sat_intervals.figures import Rules
+from sat_intervals.evaluate.disparity import Rows, evaluate, evaluate_run
+from sat_intervals.evaluate.metrics import Rules
+from sat_intervals.evaluate.paper import Scene, table_1
 from sat_intervals.products import INVALID, OCCLUSION
-from sat_intervals.tables import Scene, table_1
 from sat_intervals.tiling import Window
 
 some = settings(max_examples=150, derandomize=True, deadline=None)
@@ -236,7 +236,7 @@ def test_evaluate_run__equals_the_slow_twin(pair, run, tmp_path, monkeypatch):
     same(found, expected, abs=0.003)  # of the bias, which decides where the truth lies in its interval
 
     monkeypatch.setattr("sat_intervals.results._STRIP", 9 * 90)
-    monkeypatch.setattr("sat_intervals.evaluation._JUDGED_PIXELS", 4 * 90)
+    monkeypatch.setattr("sat_intervals.evaluate.disparity._JUDGED_PIXELS", 4 * 90)
     same(
         evaluate_run(run, mask=tmp_path / "mask.tif", tolerance=0.25, remove_bias=True) | {"cost": 0},
         found | {"cost": 0},

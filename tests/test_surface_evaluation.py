@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 
 from sat_intervals.cli import main
-from sat_intervals.figures import Histogram
+from sat_intervals.evaluate.dsm import evaluate_surface
+from sat_intervals.evaluate.metrics import Histogram
 from sat_intervals.products import SURFACE
-from sat_intervals.surface_evaluation import evaluate_surface
 
 PLACE = Affine(1, 0, 370_000, 0, -1, 4_830_000)
 
@@ -71,7 +71,7 @@ def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkey
     inside = ((height - 1 <= truth) & (truth <= height + 2))[known]
     assert whole["all"]["accuracy"] == pytest.approx(inside.mean(), abs=2e-3)
     assert whole["all"]["bias"] == pytest.approx(np.median((height - truth)[known]), abs=0.01)
-    monkeypatch.setattr("sat_intervals.surface_evaluation._STRIP", 5 * 31 * 4)
+    monkeypatch.setattr("sat_intervals.evaluate.dsm._STRIP", 5 * 31 * 4)
     assert evaluate_surface(model, reference) == whole
 
 

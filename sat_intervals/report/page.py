@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluation import evaluate_run
+from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.report.contents import Counts, Pixels
 from sat_intervals.results import Results
 

@@ -10,8 +10,9 @@ import numpy as np
 from sat_intervals.config import Config, Interval, Mccnn, load_config
 from sat_intervals.config.pairs import Pair
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluation import Rows as Judgeable
-from sat_intervals.evaluation import evaluate, rules_of
+from sat_intervals.evaluate.disparity import Rows as Judgeable
+from sat_intervals.evaluate.disparity import evaluate, rules_of
+from sat_intervals.evaluate.paper import METHODS
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
@@ -23,7 +24,6 @@ from sat_intervals.match.patch import kernel_settings, match_patch
 from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY
 from sat_intervals.raster import Image, check_pair, open_image, read_window
-from sat_intervals.tables import METHODS
 from sat_intervals.tiling import Window, facing
 
 # The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).

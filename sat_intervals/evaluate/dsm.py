@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.figures import Histogram
+from sat_intervals.evaluate.metrics import Histogram
 from sat_intervals.raster import Georeferencing, is_surface, read_heights, read_layers, read_place, resolution_of
 from sat_intervals.tiling import Window, strips
 

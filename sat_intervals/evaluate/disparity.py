@@ -9,7 +9,7 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.figures import Figures, Judged, Rules, bias_histogram
+from sat_intervals.evaluate.metrics import Figures, Judged, Rules, bias_histogram
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID

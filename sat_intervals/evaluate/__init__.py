@@ -1,0 +1,1 @@
+"""Intervals against truth: figures of merit, the paper's tables."""
