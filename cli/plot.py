@@ -38,9 +38,9 @@ def plot(
     'sat-intervals[plot]'.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
     from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
+    from sat_intervals.show import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
 
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} are those of a profile: give its --row too")

@@ -19,7 +19,7 @@ def report(out: Path, truth: Path | None) -> None:
     Map and interval profile of any row, histograms, validity, tiles and seams, settings and times, and with a truth how
     often the intervals hold it. Of large images the map and the profiles show every n-th row and column.
     """
-    from sat_intervals.report import write_report
     from sat_intervals.results import open_results
+    from sat_intervals.show.report import write_report
 
     click.echo(write_report(open_results(out, truth)))

@@ -5,10 +5,10 @@ import json
 import numpy as np
 
 from sat_intervals.config import load_config
-from sat_intervals.kinds import KINDS
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION
 from sat_intervals.raster import RUN_FILES, OutputWriter, north_up, write_layer
 from sat_intervals.run.statistics import Tally
+from sat_intervals.show.legend import KINDS
 
 PLACE = north_up(32631, x=370_000, y=4_830_000, pixel=0.5)
 MINIMUM, MAXIMUM = -20, 10

@@ -21,13 +21,13 @@ from sat_intervals.match.matching_cost import Area, compare
 from sat_intervals.match.mccnn import Network, load_network, weights_file
 from sat_intervals.match.normalization import Scale, Scales
 from sat_intervals.match.patch import kernel_settings
-from sat_intervals.pictures.curve import read_curve
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run.batch import PairOfBatch, match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_tile
+from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.tiling import Window
 
 pytestmark = [

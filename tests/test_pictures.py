@@ -23,13 +23,13 @@ from sat_intervals import match_pair
 from sat_intervals.cli import main
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kinds import KINDS, ORANGE, SKY, VERMILION, classify
-from sat_intervals.pictures import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
-from sat_intervals.pictures.curve import read_curve
-from sat_intervals.pictures.surface import _relief
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
+from sat_intervals.show import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
+from sat_intervals.show.cost_curve import read_curve
+from sat_intervals.show.dsm import _relief
+from sat_intervals.show.legend import KINDS, ORANGE, SKY, VERMILION, classify
 from sat_intervals.tiling import Window
 
 WHITE, GREY = (255, 255, 255), (222, 222, 222)
@@ -106,7 +106,7 @@ def test_plot__says_in_one_line_what_is_wrong(tmp_path, arguments, message):
 
 def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
     out = write_run(tmp_path, *random_bands(40, 50)[:2])
-    for name in [name for name in sys.modules if name.startswith("sat_intervals.pictures")]:
+    for name in [name for name in sys.modules if name.startswith("sat_intervals.show")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     done = CliRunner().invoke(main, ["plot", str(out)])

@@ -22,11 +22,11 @@ from selenium.webdriver.support.wait import WebDriverWait
 from sat_intervals.cli import main
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import low_confidence
-from sat_intervals.kinds import classify
 from sat_intervals.products import INVALID
 from sat_intervals.raster import read_layers
-from sat_intervals.report import contents, write_report
 from sat_intervals.results import open_results
+from sat_intervals.show.legend import classify
+from sat_intervals.show.report import contents, write_report
 
 ROOT = Path(__file__).parents[1]
 
@@ -129,7 +129,7 @@ def test_write_report__takes_names_as_text(tmp_path):
 
 def test_package_data__holds_the_parts_of_the_page():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    patterns = project["tool"]["setuptools"]["package-data"]["sat_intervals.report"]
+    patterns = project["tool"]["setuptools"]["package-data"]["sat_intervals.show.report"]
     folder = ROOT / "sat_intervals" / "report"
     shipped = {file for pattern in patterns for file in folder.glob(pattern)}
     assert shipped == {file for file in folder.iterdir() if file.is_file() and file.suffix != ".py"}

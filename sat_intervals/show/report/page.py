@@ -8,8 +8,8 @@ from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.report.contents import Counts, Pixels
 from sat_intervals.results import Results
+from sat_intervals.show.report.contents import Counts, Pixels
 
 
 def write_report(results: Results) -> Path:
@@ -39,7 +39,7 @@ def write_report(results: Results) -> Path:
 
 
 def _asset(name: str) -> str:
-    return (resources.files("sat_intervals.report") / name).read_text(encoding="utf-8")
+    return (resources.files("sat_intervals.show.report") / name).read_text(encoding="utf-8")
 
 
 def _contents(results: Results) -> dict[str, Any]:

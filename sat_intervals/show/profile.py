@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from sat_intervals.kinds import BLUE, ORANGE, SKY, VERMILION
-from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
-from sat_intervals.pictures.curve import Curve, read_curve
 from sat_intervals.products import INVALID
 from sat_intervals.results import Bands, Results
+from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.show.cost_curve import Curve, read_curve
+from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION
 from sat_intervals.tiling import Window
 
 _WIDTH, _STRIP = 12.0, 1.0  # inches: of the page, and height of the image above a profile

@@ -12,10 +12,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kinds import KINDS, SKY, VERMILION, classify
-from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.products import INVALID
 from sat_intervals.results import Results
+from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.show.legend import KINDS, SKY, VERMILION, classify
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map: more pixels than its dots are thinned out
 _TEXT = 8.5  # inches that the words over a map take

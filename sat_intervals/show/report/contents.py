@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.kinds import FIRST_INVALID, KINDS, classify
 from sat_intervals.results import Bands, Results
+from sat_intervals.show.legend import FIRST_INVALID, KINDS, classify
 
 _PIXELS = 500_000  # on the page, at 5 to 8 bytes each once compressed and written as text
 _WIDTH_BARS, _CONFIDENCE_BARS = 60, 25

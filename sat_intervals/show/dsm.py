@@ -8,9 +8,9 @@ from matplotlib.colors import PowerNorm
 from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.pictures.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import is_surface, read_place, read_small_layers
+from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 
 _LONGEST = 5.5  # inches of the longer side of a map
 _STRETCHED = 5.0  # ratio of sides beyond which maps are cut to it
