@@ -26,7 +26,7 @@ def export(out: Path, target: Path, form: str) -> None:
 
     All have the size of the left image. Files of these names that are there are replaced.
     """  # noqa: D301 (click's mark of a paragraph to keep as it is)
-    from sat_intervals.export import export
+    from sat_intervals.interop.export import export
 
     for file in export(out, form, target):
         click.echo(file)

@@ -95,7 +95,7 @@ def read(path):
 
 def test_cars_plugin__of_another_version_leaves_cars_alone(tmp_path):
     (tmp_path / "cars").mkdir()
-    (tmp_path / "cars" / "__init__.py").write_text("import sat_intervals.cars_plugin\n")
+    (tmp_path / "cars" / "__init__.py").write_text("import sat_intervals.interop.cars_plugin\n")
     done = subprocess.run(
         [sys.executable, "-c", "import cars"], env=os.environ | {"PYTHONPATH": str(tmp_path)},
         capture_output=True, text=True, timeout=PATIENCE, check=False,
