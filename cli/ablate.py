@@ -33,14 +33,14 @@ def ablate(
     from sat_intervals.config import load_config
     from sat_intervals.config.pairs import find_pairs
     from sat_intervals.evaluate.ablation import ablate_pair
-    from sat_intervals.evaluate.paper import Scene, table_2
+    from sat_intervals.evaluate.paper import SceneMetrics, table_2
 
     found = find_pairs(pairs)
     configs = [load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, cost)) for pair in found]
     scenes = []
     for pair, config in zip(found, configs, strict=True):
         click.echo(f"matching {pair.name}", err=True)
-        scenes.append(Scene(pair.name, pair.group, ablate_pair(pair, config, tolerance=tolerance)))
+        scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, config, tolerance=tolerance)))
     if as_json:
         say_json(scenes)
     else:

@@ -87,7 +87,7 @@ def evaluate(
         raise click.UsageError("Missing argument 'OUT...'.")
     from sat_intervals.cli.tables import show_groups, show_missed, show_scene
     from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.evaluate.paper import Scene, table_1
+    from sat_intervals.evaluate.paper import SceneMetrics, table_1
 
     sources = _sources(folders, truth, mask, cost)
     configs = _configs(sources, config_file, accurate, cost)
@@ -99,7 +99,7 @@ def evaluate(
         else:
             click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
             report = _judge_pair(judge, source, source.pair, config)
-        scenes.append(Scene(source.name, group or _group(source), report))
+        scenes.append(SceneMetrics(source.name, group or _group(source), report))
     if as_json:
         say_json(scenes)
     elif len(scenes) == 1:

@@ -11,7 +11,7 @@ import click
 from sat_intervals.cli.options import log_options
 
 if TYPE_CHECKING:
-    from sat_intervals.evaluate.paper import Scene
+    from sat_intervals.evaluate.paper import SceneMetrics
 
 
 def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
@@ -55,7 +55,7 @@ def overrides(minimum: int, maximum: int, accurate: bool, cost: str | None = Non
     return sections | ({"cross_check": {"method": "accurate"}} if accurate else {})
 
 
-def say_json(scenes: "list[Scene]") -> None:
+def say_json(scenes: "list[SceneMetrics]") -> None:
     """Print the reports of scenes as JSON: of one, the report itself; of several, by name."""
     reports = {scene.name: scene.report for scene in scenes}
     click.echo(json.dumps(scenes[0].report if len(scenes) == 1 else reports, indent=1))

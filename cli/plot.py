@@ -40,7 +40,9 @@ def plot(
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
-    from sat_intervals.show import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
+    from sat_intervals.show.dsm import draw_surface
+    from sat_intervals.show.maps import draw_errors, draw_overview
+    from sat_intervals.show.profile import draw_curve, draw_profile
 
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} are those of a profile: give its --row too")

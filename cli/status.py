@@ -13,7 +13,7 @@ def status(out: Path) -> None:
     Of the folder of a batch: the same of each of its pairs, and why pairs failed.
     """
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.run.batch import read_report
+    from sat_intervals.run.status import read_report
 
     pairs = read_report(out)
     if pairs is None:
@@ -31,7 +31,7 @@ def status(out: Path) -> None:
 
 def _tell(out: Path) -> None:
     from sat_intervals.run.job import is_complete
-    from sat_intervals.store.tiles import read_status
+    from sat_intervals.run.status import read_status
 
     if is_complete(out):
         click.echo(f"{out}: complete")

@@ -7,7 +7,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, Scene, look_up
+from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
@@ -49,7 +49,7 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
         )
 
 
-def show_missed(scenes: Sequence[Scene]) -> None:
+def show_missed(scenes: Sequence[SceneMetrics]) -> None:
     """Name the scenes that miss the paper's objective."""
     accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
     missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
@@ -57,7 +57,7 @@ def show_missed(scenes: Sequence[Scene]) -> None:
         click.echo(f"below {OBJECTIVE}: {', '.join(missed)}")
 
 
-def show_scene(scene: Scene) -> None:
+def show_scene(scene: SceneMetrics) -> None:
     """Print all figures of one scene."""
     report = scene.report
     rows = _areas(report, "")

@@ -8,7 +8,7 @@ from sat_intervals.config import load_config
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION
 from sat_intervals.raster import RUN_FILES, OutputWriter, north_up, write_layer
 from sat_intervals.run.statistics import Tally
-from sat_intervals.show.legend import KINDS
+from sat_intervals.show.legend import PIXEL_CLASSES
 
 PLACE = north_up(32631, x=370_000, y=4_830_000, pixel=0.5)
 MINIMUM, MAXIMUM = -20, 10
@@ -73,7 +73,7 @@ def random_bands(height, width, seed=0):
     random = np.random.default_rng(seed)
     disparity = random.uniform(MINIMUM + 4, MAXIMUM - 4, (height, width))
     lower, upper = np.floor(disparity - random.integers(0, 4, disparity.shape)), np.ceil(disparity + 1)
-    validity = random.choice([0, *(kind.flag for kind in KINDS)], disparity.shape).astype(np.uint16)
+    validity = random.choice([0, *(kind.flag for kind in PIXEL_CLASSES)], disparity.shape).astype(np.uint16)
     bands = np.stack([disparity, lower, upper, random.random(disparity.shape)]).astype(np.float32)
     bands[:3, validity & INVALID != 0] = np.nan
     truth = disparity + random.normal(0, 1.5, disparity.shape)

@@ -19,9 +19,10 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate import ablation
 from sat_intervals.evaluate.ablation import ablate_pair
-from sat_intervals.evaluate.disparity import Rows, evaluate, rules_of
-from sat_intervals.evaluate.paper import METHODS, Scene, table_2
+from sat_intervals.evaluate.disparity import EvaluatedRows, criteria_of, evaluate
+from sat_intervals.evaluate.paper import METHODS, SceneMetrics, table_2
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
+from sat_intervals.match import memory
 from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 
@@ -121,8 +122,8 @@ def judged(scene, config):
     left, right = (np.ma.masked_equal(image, 0) for image in (scene.left, scene.right))
     bands = match_arrays(left, right, config)
     names = ("disparity", "lower", "upper", "confidence", "validity")
-    rows = Rows(*(bands[name].values for name in names), scene.truth.astype(np.float64))
-    return evaluate(lambda: [rows], rules_of(config))["all"]
+    rows = EvaluatedRows(*(bands[name].values for name in names), scene.truth.astype(np.float64))
+    return evaluate(lambda: [rows], criteria_of(config))["all"]
 
 
 @pytest.mark.parametrize("method", ["fast", "accurate"])
@@ -165,7 +166,7 @@ def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
     with pytest.raises(SatIntervalsError, match=r"short.tif has 89 x 110 pixels, .*left.tif 90 x 110"):
         ablate_pair(Pair("short", "all", **files, **search))
     volume = volume_bytes(90, 110, load_config({"disparity": search}))
-    monkeypatch.setattr(ablation, "usable_memory", lambda: PROCESS_BYTES + volume)  # none for the bands
+    monkeypatch.setattr(memory, "usable_memory", lambda: PROCESS_BYTES + volume)  # none for the bands
     with pytest.raises(SatIntervalsError, match=r"90 x 110 pixels x .* this process may use 0.3 GB: cut the pair"):
         ablate_pair(pair)
 
@@ -188,7 +189,7 @@ def test_ablate_pair__reproduces_the_reference(shared_data, year):
     for pair in find_pairs(sorted(shared_data.glob(f"mb{year}_*"))):
         search = {"minimum": pair.minimum, "maximum": pair.maximum}
         accurate = {"disparity": search, "cross_check": {"method": "accurate"}}
-        scenes.append(Scene(pair.name, pair.group, ablate_pair(pair, accurate)))
+        scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, accurate)))
     ours, paper, known = table_2(scenes)
     assert (ours.label, paper.label, known.label) == (f"middlebury{year}", "paper", "reference")
     for method in METHODS:

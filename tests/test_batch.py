@@ -220,7 +220,7 @@ def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, 
         raise RunError("no more disk")
 
     with monkeypatch.context() as patch:
-        patch.setattr(batch, "conclude", fail)
+        patch.setattr(batch, "assemble", fail)
         report = match_batch(pairs, tmp_path, {"median": None}, overwrite=True)
     assert {end["state"] for end in report.values()} == {"failed"}
     assert bytes_of(tmp_path / "pair1") == before

@@ -1,4 +1,4 @@
-"""Figures of merit against a slow twin, of maps, of runs on disk, of real pairs, and as the command prints them."""
+"""Metrics of merit against a slow twin, of maps, of runs on disk, of real pairs, and as the command prints them."""
 
 import json
 import re
@@ -19,9 +19,9 @@ from sat_intervals.cli import main
 from sat_intervals.config.pairs import find_pairs, group_beside
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.disparity import Rows, evaluate, evaluate_run
-from sat_intervals.evaluate.metrics import Rules
-from sat_intervals.evaluate.paper import Scene, table_1
+from sat_intervals.evaluate.disparity import EvaluatedRows, evaluate, evaluate_run
+from sat_intervals.evaluate.metrics import Criteria
+from sat_intervals.evaluate.paper import SceneMetrics, table_1
 from sat_intervals.products import INVALID, OCCLUSION
 from sat_intervals.tiling import Window
 
@@ -47,18 +47,18 @@ def same(found, expected, **tolerance):
 
 def rows_of(scene):
     flags = np.where(scene.valid, 0, OCCLUSION).astype(np.uint16)
-    return Rows(scene.disparity, scene.lower, scene.upper, scene.confidence, flags, scene.truth)
+    return EvaluatedRows(scene.disparity, scene.lower, scene.upper, scene.confidence, flags, scene.truth)
 
 
 def cut_into(rows, heights):
     """The rows in strips, lastly what the heights leave."""
     edges = [0, *np.cumsum(heights).clip(max=rows.truth.shape[0]), rows.truth.shape[0]]
-    return [Rows(*(band[a:b] for band in rows)) for a, b in pairwise(edges) if b > a]
+    return [EvaluatedRows(*(band[a:b] for band in rows)) for a, b in pairwise(edges) if b > a]
 
 
 @st.composite
 def scenes(draw):
-    """Maps of halves and quarters of a pixel, with holes, rules to judge them by, and heights of strips."""
+    """Maps of halves and quarters of a pixel, with holes, criteria to judge them by, and heights of strips."""
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     shape = int(random.integers(1, 12)), int(random.integers(1, 12))
     minimum, maximum = -4, draw(st.sampled_from([-4, 4, 12]))
@@ -80,18 +80,18 @@ def scenes(draw):
         truth=truth,
     )
     depth, kernel = draw(st.integers(0, 3)), draw(st.sampled_from([1, 3, 5]))
-    rules = Rules(minimum, maximum, 0.6, kernel, depth, draw(st.sampled_from([0.0, 0.25])))
-    return scene, rules, draw(st.lists(st.integers(1, 5), max_size=6))
+    criteria = Criteria(minimum, maximum, 0.6, kernel, depth, draw(st.sampled_from([0.0, 0.25])))
+    return scene, criteria, draw(st.lists(st.integers(1, 5), max_size=6))
 
 
 # ---- Maps --------------------------------------------------------------------------------------------------
 @some
 @given(scenes(), st.booleans(), st.booleans())
 def test_evaluate__equals_the_slow_twin(drawn, remove_bias, with_rejected):
-    scene, rules, heights = drawn
+    scene, criteria, heights = drawn
     how = {"remove_bias": remove_bias, "with_rejected": with_rejected}
-    found = evaluate(lambda: cut_into(rows_of(scene), heights), rules, **how)
-    expected = reference_evaluation.evaluate(scene, rules, **how)
+    found = evaluate(lambda: cut_into(rows_of(scene), heights), criteria, **how)
+    expected = reference_evaluation.evaluate(scene, criteria, **how)
     # ratios of errors and widths are counted to 0.001, everything else here is exact
     same(found, expected, abs=0.0005 + 1e-9)
     for report in (found, expected):
@@ -102,9 +102,9 @@ def test_evaluate__equals_the_slow_twin(drawn, remove_bias, with_rejected):
 @some
 @given(scenes(), st.booleans())
 def test_evaluate__strips_equal_the_whole(drawn, remove_bias):
-    scene, rules, heights = drawn
-    whole = evaluate(lambda: [rows_of(scene)], rules, remove_bias=remove_bias, with_rejected=True)
-    strips = evaluate(lambda: cut_into(rows_of(scene), heights), rules, remove_bias=remove_bias, with_rejected=True)
+    scene, criteria, heights = drawn
+    whole = evaluate(lambda: [rows_of(scene)], criteria, remove_bias=remove_bias, with_rejected=True)
+    strips = evaluate(lambda: cut_into(rows_of(scene), heights), criteria, remove_bias=remove_bias, with_rejected=True)
     same(strips, whole, rel=1e-12)
 
 
@@ -128,8 +128,8 @@ def test_evaluate__worked_example():
     #   1 - area / width: 1 - 3/1 = -2, 1 - 3/6 = .5, 1 - .5/1 = .5, 1 - 3/4 = .25: median .375
     #   with the rejected pixel, a miss of error 4 alone in its area, width 2: 1 - 4/2 = -1, median .25
     #   disparity - truth: 0 .5 3 . 0 / .5 3 -2 0: median .25
-    rules = Rules(-2, 8, 0.6, 1, 1)
-    report = evaluate(lambda: [rows_of(EXAMPLE)], rules, with_rejected=True)
+    criteria = Criteria(-2, 8, 0.6, 1, 1)
+    report = evaluate(lambda: [rows_of(EXAMPLE)], criteria, with_rejected=True)
     assert report["all"] == {"count": 8, "accuracy": 0.875, "relative_size": 0.2, "mean_width": 2.5}
     assert report["high"] == {"count": 4, "accuracy": 1, "relative_size": 0.2, "mean_width": 2}
     low = report["low"]
@@ -144,14 +144,14 @@ def test_evaluate__worked_example():
     assert [decile["confidence"][0] for decile in report["deciles"]] == [0.2, 0.5, 0.6, 0.7, 0.9, 1.0]
     assert [decile["count"] for decile in report["deciles"]] == [1, 2, 1, 1, 2, 1]
     assert [decile["accuracy"] for decile in report["deciles"]] == [1, 0.5, 1, 1, 1, 1]
-    assert evaluate(lambda: [rows_of(EXAMPLE)], rules, remove_bias=True)["bias"] == 0.25
+    assert evaluate(lambda: [rows_of(EXAMPLE)], criteria, remove_bias=True)["bias"] == 0.25
 
 
 def test_evaluate__bias_that_is_removed_leaves_the_figures_of_none():
     shifted = SimpleNamespace(**vars(EXAMPLE) | {"truth": EXAMPLE.truth - 3})
-    rules = Rules(-2, 8, 0.6, 1, 1)
+    criteria = Criteria(-2, 8, 0.6, 1, 1)
     one, other = (
-        evaluate(lambda scene=scene: [rows_of(scene)], rules, remove_bias=True) for scene in (EXAMPLE, shifted)
+        evaluate(lambda scene=scene: [rows_of(scene)], criteria, remove_bias=True) for scene in (EXAMPLE, shifted)
     )
     assert (one.pop("bias"), other.pop("bias")) == (0.25, 3.25)
     same(other, one, rel=1e-12)
@@ -159,7 +159,7 @@ def test_evaluate__bias_that_is_removed_leaves_the_figures_of_none():
 
 def test_evaluate__without_confidence_all_is_high():
     scene = SimpleNamespace(**vars(EXAMPLE) | {"confidence": np.full((2, 5), NAN, np.float32)})
-    report = evaluate(lambda: [rows_of(scene)], Rules(-2, 8, 0.6, 5, 2))
+    report = evaluate(lambda: [rows_of(scene)], Criteria(-2, 8, 0.6, 5, 2))
     assert report["high"] == report["all"]
     assert report["low"]["count"] == 0
     assert report["low"]["relative_overestimation"] is None
@@ -216,7 +216,7 @@ def scene_of(out, truth):
     )
 
 
-def rules_of(out, tolerance=0.0):
+def criteria_of(out, tolerance=0.0):
     report = json.loads((out / "run.json").read_text())["settings"]
     names = {"kernel", "threshold", "depth"}
     low = {name: value for name, value in report["regularization"].items() if name in names}
@@ -230,7 +230,7 @@ def test_evaluate_run__equals_the_slow_twin(pair, run, tmp_path, monkeypatch):
     found = evaluate_run(run, mask=tmp_path / "mask.tif", tolerance=0.25, remove_bias=True)
     assert found.pop("cost") == "census"
     scene = scene_of(run, np.where(mask != 0, truth, np.nan))
-    expected = reference_evaluation.evaluate(scene, rules_of(run, 0.25), remove_bias=True, with_rejected=True)
+    expected = reference_evaluation.evaluate(scene, criteria_of(run, 0.25), remove_bias=True, with_rejected=True)
     assert expected["all"]["count"] < expected["with_rejected"]["all"]["count"]
     assert found["bias"] == pytest.approx(expected["bias"], abs=0.0005)
     same(found, expected, abs=0.003)  # of the bias, which decides where the truth lies in its interval
@@ -285,7 +285,7 @@ def report_of(accuracy):
 
 def test_table_1__means_by_group_beside_the_paper():
     names = ("a", "middlebury2003"), ("b", "satellite"), ("c", "middlebury2003")
-    scenes = [Scene(*name, report_of(accuracy)) for name, accuracy in zip(names, (0.8, 0.9, 0.95), strict=True)]
+    scenes = [SceneMetrics(*name, report_of(accuracy)) for name, accuracy in zip(names, (0.8, 0.9, 0.95), strict=True)]
     rows = table_1(scenes)
     assert [row.label for row in rows] == ["middlebury2003", "paper", "reference", "satellite"]
     assert rows[0].figures["acc."] == pytest.approx(0.875)
@@ -297,7 +297,7 @@ def test_table_1__means_by_group_beside_the_paper():
 
 def test_table_1__costs_of_a_group_stand_together():
     names = ("a", "middlebury2003", "census"), ("b", "satellite", "census"), ("a", "middlebury2003", "mccnn")
-    rows = table_1([Scene(name, group, report_of(0.9) | {"cost": cost}) for name, group, cost in names])
+    rows = table_1([SceneMetrics(name, group, report_of(0.9) | {"cost": cost}) for name, group, cost in names])
     labels = [row.label for row in rows if row.scenes]
     assert labels == ["middlebury2003 census", "middlebury2003 mccnn", "satellite census"]
     assert [row.figures["acc."] for row in rows if row.label == "paper"] == [0.973, 0.954]

@@ -16,7 +16,7 @@ from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Settings, match
 from sat_intervals.match.in_memory import match_arrays
 from sat_intervals.match.patch import match_patch
-from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_rows
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import Window
 
@@ -363,17 +363,17 @@ def check(bands, validity, expected):
 
 @some
 @given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3))
-def test_finish_rows__of_a_patch_equals_reference(seed, config, holes):
+def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
     left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
     whole = Window(0, 0, *left.shape)
     patch = match_patch(reader(left, left_state), reader(right, right_state), whole, whole, whole, config)
     raw = patch.raw
-    rows = Rows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
-    scale = Scale(np.nan, np.nan)
+    rows = RawRows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
+    scale = ConfidenceScale(np.nan, np.nan)
     if config.ambiguity is not None:
         histogram = np.bincount(raw.ambiguity[raw.winner != N], minlength=config.largest_ambiguity + 1)
         scale = confidence_scale(config.ambiguity, histogram)
-    final = finish_rows(rows, 0, whole.height, scale, config)
+    final = postprocess_rows(rows, 0, whole.height, scale, config)
     expected = reference.match_arrays(left, right, left_state, right_state, config)
     check(final.intervals, final.validity, expected)
 

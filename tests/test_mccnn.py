@@ -17,9 +17,9 @@ from sat_intervals.cli import main
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.in_memory import _reader
-from sat_intervals.match.matching_cost import Area, compare
+from sat_intervals.match.matching_cost import Area, cost_areas
 from sat_intervals.match.mccnn import Network, load_network, weights_file
-from sat_intervals.match.normalization import Scale, Scales
+from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.raster import north_up, write_layer
@@ -140,17 +140,21 @@ def test_compare__costs_equal_reference(network_file, weights, mirrored):
     # Three strips of rows at most; pixels of no data are filled, and windows that meet them are impossible.
     left, right = masked_images(rows=150)
     config = settings(-6, 3, network_file, sgm=None)
-    scales = Scales(Scale(490.0, 75.0), Scale(510.0, 85.0))
+    statistics = PairStatistics(ImageStatistics(490.0, 75.0), ImageStatistics(510.0, 85.0))
     area = Area.mirror(Window(5, 2, 140, 30), config) if mirrored else Area.of(Window(5, 2, 140, 30), config)
-    (found,) = compare(_reader(left), _reader(right), [area], config, scales)
+    (found,) = cost_areas(_reader(left), _reader(right), [area], config, statistics)
     volume = cost_volume(found.costs, kernel_settings(config))
 
-    def features(image, scale, window):
+    def features(image, statistics, window):
         pixels, state = _reader(image)(window.grown(5, 5))
-        pixels = np.where(state == 0, (pixels - scale.mean) / scale.deviation, 0)
+        pixels = np.where(state == 0, (pixels - statistics.mean) / statistics.deviation, 0)
         return slow_features(weights, pixels), reference.window_state(state, 11)
 
-    images = ((right, scales.right), (left, scales.left)) if mirrored else ((left, scales.left), (right, scales.right))
+    images = (
+        ((right, statistics.right), (left, statistics.left))
+        if mirrored
+        else ((left, statistics.left), (right, statistics.right))
+    )
     (base, base_state), (there, there_state) = (
         features(*image, window) for image, window in zip(images, (area.base, area.facing), strict=True)
     )
@@ -165,9 +169,9 @@ def test_compare__penalties_follow_both_images(network_file):
     # The same penalties by the method's text: edges of normalised images, the right one where a candidate faces it.
     left, right = masked_images(rows=16, columns=22)
     config = settings(-2, 2, network_file, sgm={"p1": 0.5, "p2": 4, "q1": 2, "q2": 5, "v": 2, "d": 1.1, "span": 40})
-    scales = Scales(Scale(500.0, 80.0), Scale(500.0, 90.0))
+    statistics = PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 90.0))
     whole = Window(0, 0, *left.shape)
-    (found,) = compare(_reader(left), _reader(right), [Area.of(whole, config)], config, scales)
+    (found,) = cost_areas(_reader(left), _reader(right), [Area.of(whole, config)], config, statistics)
     cost = found.costs.left[:, :, :5].astype(int)
     states = found.costs.left_state, found.costs.right_state
     cost[~reference.possible(*states)] = IMPOSSIBLE_COST
@@ -186,15 +190,17 @@ def test_compare__penalties_follow_both_images(network_file):
 @pytest.mark.parametrize("gradients", ["normalized", "raw"])
 def test_compare__a_right_area_is_a_left_one_of_swapped_images(network_file, gradients):
     left, right = masked_images()
-    scales = Scales(Scale(490.0, 75.0), Scale(510.0, 85.0))
+    statistics = PairStatistics(ImageStatistics(490.0, 75.0), ImageStatistics(510.0, 85.0))
     config, swapped = (
         settings(*ends, network_file, sgm={"gradients": gradients, "span": 16}) for ends in ((-6, 3), (-3, 6))
     )
     window = Window(3, -4, 20, 30)
     both = [Area.of(Window(3, 1, 20, 25), config), Area.mirror(window, config)]
-    _, found = compare(_reader(left), _reader(right), both, config, scales)
+    _, found = cost_areas(_reader(left), _reader(right), both, config, statistics)
     images = _reader(right), _reader(left)
-    (expected,) = compare(*images, [Area.of(window, swapped)], swapped, Scales(scales.right, scales.left))
+    (expected,) = cost_areas(
+        *images, [Area.of(window, swapped)], swapped, PairStatistics(statistics.right, statistics.left)
+    )
     for one, other in zip(found.costs[2:], expected.costs[2:], strict=True):
         np.testing.assert_array_equal(one, other)
     volumes = (cost_volume(one.costs, kernel_settings(swapped), one.gradients) for one in (found, expected))
@@ -376,7 +382,7 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     file = write_network(tmp_path / "network.onnx", random_weights())
     job = prepare(*images, tmp_path / "out", settings(-4, 6, file))
     job.begin()
-    job.store.write_normalization(Scales(Scale(500.0, 80.0), Scale(500.0, 80.0)).report())
+    job.store.write_normalization(PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 80.0)).report())
     write_network(file, random_weights(seed=1))
     with pytest.raises(SatIntervalsError, match=r"network\.onnx on this worker differs in sha256 from .* of the run"):
         match_tile(job, next(iter(job.store.grid)))

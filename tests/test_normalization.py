@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.match.normalization import BLOCK, Scale, blocks, measure, moments, scale_of
+from sat_intervals.match.normalization import BLOCK, ImageStatistics, blocks, measure, moments, statistics_of
 from sat_intervals.tiling import Window
 
 
@@ -19,20 +19,20 @@ def test_scale_of__equals_numpy_on_usable_pixels(seed, share, offset):
     parts = [moments(pixels[r : r + 4], state[r : r + 4]) for r in range(0, 9, 4)]
     usable = pixels[state == 0]
     if usable.size > 1:
-        assert scale_of(parts) == pytest.approx(Scale(usable.mean(), usable.std()), rel=1e-9)
+        assert statistics_of(parts) == pytest.approx(ImageStatistics(usable.mean(), usable.std()), rel=1e-9)
 
 
 def test_scale_of__worked_example():
     # 1 and 3, then 5, 7 and 9: mean 25 / 5 = 5, squares 16 + 4 + 0 + 4 + 16 = 40, deviation sqrt(8).
     whole, holes = np.zeros(3, np.uint8), np.array([0, 0, 1], np.uint8)
     parts = [moments(np.array([1.0, 3.0, 1000.0]), holes), moments(np.array([5.0, 7.0, 9.0]), whole)]
-    assert scale_of(parts) == (5.0, 8.0**0.5)
+    assert statistics_of(parts) == (5.0, 8.0**0.5)
 
 
 @pytest.mark.parametrize(("value", "mean"), [(7.0, 7.0), (None, 0.0)])
 def test_scale_of__divides_by_1_where_there_is_no_deviation(value, mean):
     state = np.full(4, value is None, np.uint8)
-    assert scale_of([moments(np.full(4, value or 0.0), state)]) == (mean, 1.0)
+    assert statistics_of([moments(np.full(4, value or 0.0), state)]) == (mean, 1.0)
 
 
 def test_measure__reads_every_pixel_once():

@@ -24,9 +24,9 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.in_memory import _reader
-from sat_intervals.match.matching_cost import Area, compare
+from sat_intervals.match.matching_cost import Area, cost_areas
 from sat_intervals.match.mccnn import load_network, weights_file
-from sat_intervals.match.normalization import Scales, measure
+from sat_intervals.match.normalization import PairStatistics, measure
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
 from sat_intervals.tiling import Window
@@ -186,7 +186,7 @@ def test_cost_volume__equals_libsgm_where_possible(peer: Peer, our_volume: np.nd
 
 
 def test_cost_span__is_what_pandora_measures(peer: Peer, pair: Pair) -> None:
-    # Pandora scales possibility by the lowest and the highest cost of all possible candidates of the image,
+    # Pandora statistics possibility by the lowest and the highest cost of all possible candidates of the image,
     # those of truncated ranges included. Where an image does not attain the declared span, Pandora's cut is
     # narrower.
     assert np.nanmin(peer.volume) == 0
@@ -269,10 +269,10 @@ def test_features__have_the_cosines_of_pandora(pandora, shared_data, tmp_path, k
     weights = trained_network(shared_data, tmp_path / "mb.onnx") if kind == "fp32" else None
     theirs = -mccnn_peer(pandora, folder, (minimum, maximum), weights)[0]
     network = load_network(weights_file(weights and str(weights)))
-    scales = [measure(_reader(np.ma.asarray(image)), *image.shape) for image in images]
+    statistics = [measure(_reader(np.ma.asarray(image)), *image.shape) for image in images]
     left, right = (
-        network(((image - scale.mean) / scale.deviation).astype(np.float32))
-        for image, scale in zip(images, scales, strict=True)
+        network(((image - statistics.mean) / statistics.deviation).astype(np.float32))
+        for image, statistics in zip(images, statistics, strict=True)
     )
     for k, d in enumerate(range(minimum, maximum + 1)):
         ours = (left[:, :, -d:] * right[:, :, : right.shape[2] + d]).sum(axis=0)
@@ -289,9 +289,9 @@ def test_cost_volume__has_the_winners_of_pandora_with_its_penalties_for_mccnn(pa
     search = {"disparity": {"minimum": minimum, "maximum": maximum}}
     config = load_config(search | {"cost": {"method": "mccnn"}, "sgm": REFERENCE_PENALTIES})
     readers = [_reader(np.ma.asarray(image.astype(np.float32))) for image in images]
-    scales = Scales(*(measure(read, *images[0].shape) for read in readers))
+    statistics = PairStatistics(*(measure(read, *images[0].shape) for read in readers))
     whole = Window(0, 0, *images[0].shape)
-    (found,) = compare(*readers, [Area.of(whole, config)], config, scales)
+    (found,) = cost_areas(*readers, [Area.of(whole, config)], config, statistics)
     volume = cost_volume(found.costs, kernel_settings(config), found.gradients)
     interior = ((volume != IMPOSSIBLE_COST) & np.isfinite(costs)).all(axis=2)
     assert (volume.argmin(axis=2) + minimum == theirs)[interior].mean() >= 0.99

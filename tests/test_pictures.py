@@ -26,10 +26,11 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
-from sat_intervals.show import draw_curve, draw_errors, draw_overview, draw_profile, draw_surface
 from sat_intervals.show.cost_curve import read_curve
-from sat_intervals.show.dsm import _relief
-from sat_intervals.show.legend import KINDS, ORANGE, SKY, VERMILION, classify
+from sat_intervals.show.dsm import _relief, draw_surface
+from sat_intervals.show.legend import ORANGE, PIXEL_CLASSES, SKY, VERMILION, classify
+from sat_intervals.show.maps import draw_errors, draw_overview
+from sat_intervals.show.profile import draw_curve, draw_profile
 from sat_intervals.tiling import Window
 
 WHITE, GREY = (255, 255, 255), (222, 222, 222)
@@ -129,7 +130,7 @@ def test_pictures__of_any_size_and_of_no_valid_pixel(tmp_path, shape, bands):
         assert 0.1 < share_of(picture, WHITE) < 0.97
     if bands is no_bands:
         assert share_of(pixels_of(tmp_path / "overview.png"), GREY) > 0.1
-        assert share_of(pixels_of(tmp_path / "overview.png"), KINDS[6].colour) > 0.03
+        assert share_of(pixels_of(tmp_path / "overview.png"), PIXEL_CLASSES[6].colour) > 0.03
 
 
 def test_draw_overview__reads_no_more_than_it_draws(tmp_path, monkeypatch):
@@ -147,11 +148,11 @@ def test_draw_overview__reads_no_more_than_it_draws(tmp_path, monkeypatch):
 
 
 def test_draw_overview__shows_every_kind_in_its_colour(tmp_path):
-    validity = np.array([[kind.flag for kind in KINDS]], np.uint16).repeat(40, axis=0).repeat(5, axis=1)
+    validity = np.array([[kind.flag for kind in PIXEL_CLASSES]], np.uint16).repeat(40, axis=0).repeat(5, axis=1)
     bands = no_bands(*validity.shape)[0]
     draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
     picture = pixels_of(tmp_path / "overview.png")
-    shares = [share_of(picture, kind.colour) for kind in KINDS if kind.colour != "#000000"]
+    shares = [share_of(picture, kind.colour) for kind in PIXEL_CLASSES if kind.colour != "#000000"]
     assert min(shares) > 0.005
 
 
@@ -473,6 +474,6 @@ def test_open_results__refuses_other_pixels_than_those_of_the_run(tmp_path, name
 
 def test_classify__takes_the_first_reason():
     validity = np.array([0, NOT_REFINED, REGULARIZED, MISMATCH | REGULARIZED, LEFT_WINDOW | OCCLUSION], np.uint16)
-    meanings = [KINDS[place].meaning for place in classify(validity)]
+    meanings = [PIXEL_CLASSES[place].meaning for place in classify(validity)]
     assert meanings[:2] == ["valid", "valid"]
     assert meanings[2:] == ["valid, interval regularised", FLAGS[7].meaning, FLAGS[0].meaning]

@@ -24,7 +24,7 @@ from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import is_complete, prepare
 from sat_intervals.run.tile import match_tile
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.tiles import digest
+from sat_intervals.store.manifest import digest
 from sat_intervals.tiling import Window
 
 

@@ -10,18 +10,16 @@ import numpy as np
 from sat_intervals.config import Config, Interval, Mccnn, load_config
 from sat_intervals.config.pairs import Pair
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.disparity import Rows as Judgeable
-from sat_intervals.evaluate.disparity import evaluate, rules_of
+from sat_intervals.evaluate.disparity import EvaluatedRows, criteria_of, evaluate
 from sat_intervals.evaluate.paper import METHODS
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.machine import usable_memory
-from sat_intervals.match.matching_cost import Area, Reader, compare
-from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
-from sat_intervals.match.normalization import Scales, measure
+from sat_intervals.match.matching_cost import Area, Reader, cost_areas
+from sat_intervals.match.memory import PROCESS_BYTES, check_memory, volume_bytes
+from sat_intervals.match.normalization import PairStatistics, measure
 from sat_intervals.match.patch import kernel_settings, match_patch
-from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_strips
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY
 from sat_intervals.raster import Image, check_pair, open_image, read_window
 from sat_intervals.tiling import Window, facing
@@ -70,20 +68,22 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
     readers = partial(read_window, left), partial(read_window, right)
-    methods, scale = _all_methods(*readers, whole, config, _scales(*readers, left, right, config))
+    methods, scale = _all_methods(*readers, whole, config, _statistics(*readers, left, right, config))
     report: dict[str, Any] = {"cost": config.cost.method}
-    rules = rules_of(config, tolerance)
+    criteria = criteria_of(config, tolerance)
     for method in METHODS:
-        strips = partial(_judgeable, *_settled(methods[method], method, config), scale, truth)
-        report[method] = evaluate(strips, rules)["all"]
+        strips = partial(_evaluated, *_settled(methods[method], method, config), scale, truth)
+        report[method] = evaluate(strips, criteria)["all"]
     return report
 
 
-def _scales(left: Reader, right: Reader, left_image: Image, right_image: Image, config: Config) -> Scales | None:
+def _statistics(
+    left: Reader, right: Reader, left_image: Image, right_image: Image, config: Config
+) -> PairStatistics | None:
     if not isinstance(config.cost, Mccnn):
         return None
     views = (left, left_image), (right, right_image)
-    return Scales(*(measure(read, image.height, image.width) for read, image in views))
+    return PairStatistics(*(measure(read, image.height, image.width) for read, image in views))
 
 
 def _check_memory(whole: Window, config: Config) -> None:
@@ -91,20 +91,16 @@ def _check_memory(whole: Window, config: Config) -> None:
     pixels, count = whole.height * whole.width, config.disparity.count
     beyond = count - 1 if config.cross_check and config.cross_check.method == "accurate" else 0
     needed = PROCESS_BYTES + volume_bytes(whole.height, whole.width + beyond, config) + _PIXEL_BYTES * pixels
-    memory = usable_memory()
-    if needed > memory:
-        raise SatIntervalsError(
-            f"{whole.height} x {whole.width} pixels x {count} disparities need {needed / 1e9:.1f} GB, "
-            f"this process may use {memory / 1e9:.1f} GB: cut the pair"
-        )
+    what = f"{whole.height} x {whole.width} pixels x {count} disparities"
+    check_memory(needed, what, "cut the pair")
 
 
 def _all_methods(
-    left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None
-) -> tuple[dict[str, Rows], Scale]:
+    left: Reader, right: Reader, whole: Window, config: Config, statistics: PairStatistics | None
+) -> tuple[dict[str, RawRows], ConfidenceScale]:
     """Raw products of every one of METHODS, and what their confidence is relative to."""
     search = config.disparity
-    volume = _volume(left, right, whole, config, scales)
+    volume = _volume(left, right, whole, config, statistics)
     refine = config.refinement is not None
     weights = np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights
     winner, disparity, ambiguity = read_winners(volume, search.minimum, weights, refine)
@@ -115,18 +111,18 @@ def _all_methods(
     seen = np.asarray(read_right_winners(volume, search.minimum))
     del volume  # before the right view has one of its own
     if config.cross_check and config.cross_check.method == "accurate":
-        seen = _right_winners(left, right, whole, config, scales)
+        seen = _right_winners(left, right, whole, config, statistics)
     histogram = ambiguity_histogram(ambiguity, winner != NO_DISPARITY, config.largest_ambiguity)
     assert config.ambiguity is not None  # regularisation needs it
     validity = np.where(winner == NO_DISPARITY, NO_CANDIDATE, 0).astype(np.uint16)
     methods = {
-        method: Rows(winner, lower, upper, disparity, ambiguity, validity, seen)
+        method: RawRows(winner, lower, upper, disparity, ambiguity, validity, seen)
         for method, (lower, upper) in bounds.items()
     }
     return methods, confidence_scale(config.ambiguity, histogram)
 
 
-def _settled(rows: Rows, method: str, config: Config) -> tuple[Rows, Config]:
+def _settled(rows: RawRows, method: str, config: Config) -> tuple[RawRows, Config]:
     """What one method finishes: only the last has its intervals regularised, the baseline not even filtered."""
     if method != METHODS[-1]:
         config = config.model_copy(update={"regularization": None})
@@ -136,32 +132,36 @@ def _settled(rows: Rows, method: str, config: Config) -> tuple[Rows, Config]:
     return rows, config
 
 
-def _judgeable(rows: Rows, config: Config, scale: Scale, truth: Image) -> Iterator[Judgeable]:
+def _evaluated(rows: RawRows, config: Config, scale: ConfidenceScale, truth: Image) -> Iterator[EvaluatedRows]:
     """Final bands and truth, strip by strip: whole they would take as much as the volume."""
     height, width = rows.winner.shape
     step = max(1, _STRIP_PIXELS // width)
     row = 0
-    for final in finish_strips((rows.cut(first, first + step) for first in range(0, height, step)), scale, config):
+    for final in postprocess_strips((rows.cut(first, first + step) for first in range(0, height, step)), scale, config):
         pixels, state = read_window(truth, Window(row, 0, final.validity.shape[0], width))
         true = np.where(state == 0, pixels.astype(np.float64), np.nan)
         disparity, lower, upper, confidence = final.intervals
-        yield Judgeable(disparity, lower, upper, confidence, final.validity, true)
+        yield EvaluatedRows(disparity, lower, upper, confidence, final.validity, true)
         row += final.validity.shape[0]
 
 
-def _volume(left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None) -> np.ndarray:
+def _volume(
+    left: Reader, right: Reader, whole: Window, config: Config, statistics: PairStatistics | None
+) -> np.ndarray:
     """Aggregated costs of the whole pair, ``(rows, columns, count)`` uint16."""
-    (similarity,) = compare(left, right, [Area.of(whole, config)], config, scales)
-    return cost_volume(similarity.costs, kernel_settings(config), similarity.gradients)
+    (cost,) = cost_areas(left, right, [Area.of(whole, config)], config, statistics)
+    return cost_volume(cost.costs, kernel_settings(config), cost.gradients)
 
 
-def _right_winners(left: Reader, right: Reader, whole: Window, config: Config, scales: Scales | None) -> np.ndarray:
+def _right_winners(
+    left: Reader, right: Reader, whole: Window, config: Config, statistics: PairStatistics | None
+) -> np.ndarray:
     """The winners of the right view, matched on its own: left and right change places, and disparities their sign."""
     search = config.disparity
     mirrored = load_config(
         config, {"disparity": {"minimum": -search.maximum, "maximum": -search.minimum}, "cross_check": None}
     )
     reach = facing(whole, search.minimum, search.maximum)
-    swapped = None if scales is None else Scales(scales.right, scales.left)
+    swapped = None if statistics is None else PairStatistics(statistics.right, statistics.left)
     winner = match_patch(right, left, reach, reach, reach, mirrored, swapped).raw.winner
     return np.where(winner == NO_DISPARITY, NO_DISPARITY, -winner).astype(np.int16)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.metrics import Figures, Judged, Rules, bias_histogram
+from sat_intervals.evaluate.metrics import Criteria, Judged, Metrics, bias_histogram
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
@@ -18,7 +18,7 @@ from sat_intervals.results import Layer, Run, open_run
 _JUDGED_PIXELS = 1 << 20  # at a time, 150 bytes each; those read and waiting are 25
 
 
-class Rows(NamedTuple):
+class EvaluatedRows(NamedTuple):
     """Full-width rows of what is judged and of the truth, all ``(rows, columns)``.
 
     Attributes
@@ -96,46 +96,50 @@ def evaluate_run(
         raise SatIntervalsError(f"{out}: there is no truth.tif beside its left image {left}: give --truth")
     truth_layer = run.layer(truth or run.truth_beside)
     mask_layer = None if mask is None else run.layer(mask)
-    rules = rules_of(config, tolerance)
+    criteria = criteria_of(config, tolerance)
 
-    def strips() -> Iterator[Rows]:
+    def strips() -> Iterator[EvaluatedRows]:
         return _read_strips(run, truth_layer, mask_layer)
 
     return {
         "cost": config.cost.method,
-        **evaluate(strips, rules, remove_bias=remove_bias, with_rejected=config.products.keep_rejected),
+        **evaluate(strips, criteria, remove_bias=remove_bias, with_rejected=config.products.keep_rejected),
     }
 
 
-def rules_of(config: Config, tolerance: float = 0.0) -> Rules:
+def criteria_of(config: Config, tolerance: float = 0.0) -> Criteria:
     """How a run is judged; where it did not regularise, low confidence is that of the default settings."""
     low, search = config.regularization or Regularization(), config.disparity
-    return Rules(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance)
+    return Criteria(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance)
 
 
 def evaluate(
-    strips: Callable[[], Iterable[Rows]], rules: Rules, *, remove_bias: bool = False, with_rejected: bool = False
+    strips: Callable[[], Iterable[EvaluatedRows]],
+    criteria: Criteria,
+    *,
+    remove_bias: bool = False,
+    with_rejected: bool = False,
 ) -> dict[str, Any]:
     """Judge rows given strip by strip, from the top; ``strips`` is called once for every time they are gone through.
 
     Returns what `evaluate_run` does, but for ``cost``.
     """
     bias = _median_bias(strips()) if remove_bias else None
-    rules = replace(rules, bias=bias or 0.0)
-    kept, written = Figures(rules), Figures(rules)
-    for rows, first, last in _with_halo(strips(), rules.depth):
-        kept.add(_judged(rows, rows.known & rows.valid, first, last, rules))
+    criteria = replace(criteria, bias=bias or 0.0)
+    kept, written = Metrics(criteria), Metrics(criteria)
+    for rows, first, last in _with_halo(strips(), criteria.depth):
+        kept.add(_judged(rows, rows.known & rows.valid, first, last, criteria))
         if with_rejected:
-            written.add(_judged(rows, rows.known, first, last, rules))
+            written.add(_judged(rows, rows.known, first, last, criteria))
     return {
         **kept.report(),
-        "tolerance": rules.tolerance,
+        "tolerance": criteria.tolerance,
         "bias": bias,
         "with_rejected": written.report() if with_rejected else None,
     }
 
 
-def _median_bias(strips: Iterable[Rows]) -> float:
+def _median_bias(strips: Iterable[EvaluatedRows]) -> float:
     """Median of disparity - truth over valid pixels, in pixels; 0 where there are none."""
     histogram = bias_histogram()
     for rows in strips:
@@ -144,12 +148,12 @@ def _median_bias(strips: Iterable[Rows]) -> float:
     return histogram.median() or 0.0
 
 
-def _judged(rows: Rows, chosen: np.ndarray, first: int, last: int, rules: Rules) -> Judged:
+def _judged(rows: EvaluatedRows, chosen: np.ndarray, first: int, last: int, criteria: Criteria) -> Judged:
     """The chosen pixels of the rows ``[first, last)``; the rows around them make their low-confidence areas whole."""
-    truth = rows.truth.astype(np.float64) + rules.bias
-    low = low_confidence(rows.confidence, rules.threshold, rules.kernel)
+    truth = rows.truth.astype(np.float64) + criteria.bias
+    low = low_confidence(rows.confidence, criteria.threshold, criteria.kernel)
     error = np.where(chosen, np.abs(truth - rows.disparity), np.nan)
-    area_error = area_maximum(error, low, rules.depth)
+    area_error = area_maximum(error, low, criteria.depth)
     inner = slice(first, last)
     chosen = chosen[inner]
     bands = (truth, rows.disparity, rows.lower, rows.upper, rows.confidence)
@@ -157,22 +161,22 @@ def _judged(rows: Rows, chosen: np.ndarray, first: int, last: int, rules: Rules)
     return Judged(true, disparity, lower, upper, confidence, low[inner][chosen], area_error[inner][chosen])
 
 
-def _with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, int]]:
+def _with_halo(strips: Iterable[EvaluatedRows], margin: int) -> Iterator[tuple[EvaluatedRows, int, int]]:
     """Rows with ``first`` and ``last``: those between have ``margin`` rows around them, as far as the image goes."""
-    waiting: Rows | None = None
+    waiting: EvaluatedRows | None = None
     first = 0
     for strip in strips:
-        waiting = strip if waiting is None else Rows(*map(np.concatenate, zip(waiting, strip, strict=True)))
+        waiting = strip if waiting is None else EvaluatedRows(*map(np.concatenate, zip(waiting, strip, strict=True)))
         last = waiting.truth.shape[0] - margin
         if last > first:
             yield waiting, first, last
             start = max(0, last - margin)
-            waiting, first = Rows(*(band[start:] for band in waiting)), last - start
+            waiting, first = EvaluatedRows(*(band[start:] for band in waiting)), last - start
     if waiting is not None and waiting.truth.shape[0] > first:
         yield waiting, first, waiting.truth.shape[0]
 
 
-def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[Rows]:
+def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[EvaluatedRows]:
     """Strips of rows, from the top; files are read by rows of blocks, which are then cut."""
     step = max(1, _JUDGED_PIXELS // run.region.width)
     for window in run.windows():
@@ -180,6 +184,6 @@ def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[Rows]:
         if mask is not None:
             true[np.nan_to_num(mask.read(window)) == 0] = np.nan
         (disparity, lower, upper, confidence), validity = run.read_bands(window)
-        rows = Rows(disparity, lower, upper, confidence, validity, true)
+        rows = EvaluatedRows(disparity, lower, upper, confidence, validity, true)
         for first in range(0, window.height, step):
-            yield Rows(*(band[first : first + step] for band in rows))
+            yield EvaluatedRows(*(band[first : first + step] for band in rows))

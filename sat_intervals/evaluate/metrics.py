@@ -14,7 +14,7 @@ _LARGEST_RATIO, _LARGEST_BIAS = 100, 1000
 
 
 @dataclass(frozen=True)
-class Rules:
+class Criteria:
     """How intervals are judged.
 
     Attributes
@@ -149,12 +149,12 @@ class _Deciles:
         ]
 
 
-class Figures:
+class Metrics:
     """Figures of merit of one population of pixels."""
 
-    def __init__(self, rules: Rules) -> None:
-        self._rules = rules
-        self._areas = {name: _Intervals(rules.maximum - rules.minimum) for name in ("all", "high", "low")}
+    def __init__(self, criteria: Criteria) -> None:
+        self._criteria = criteria
+        self._areas = {name: _Intervals(criteria.maximum - criteria.minimum) for name in ("all", "high", "low")}
         self._ratios = Histogram(0, _LARGEST_RATIO, _RATIO)
         self._deciles = _Deciles()
         self._wrong = {"bad1": 0, "bad3": 0, "truth_outside_range": 0}
@@ -162,8 +162,8 @@ class Figures:
     def add(self, judged: Judged) -> None:
         """Take judged pixels into account."""
         truth, lower, upper, low = judged.truth, judged.lower, judged.upper, judged.low
-        rules = self._rules
-        inside = (lower - rules.tolerance <= truth) & (truth <= upper + rules.tolerance)
+        criteria = self._criteria
+        inside = (lower - criteria.tolerance <= truth) & (truth <= upper + criteria.tolerance)
         width = upper - lower
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
             self._areas[name].add(inside[chosen], width[chosen])
@@ -173,7 +173,7 @@ class Figures:
         error = np.abs(judged.disparity - truth)
         self._wrong["bad1"] += int((error > 1).sum())
         self._wrong["bad3"] += int((error > 3).sum())
-        self._wrong["truth_outside_range"] += int(((truth < rules.minimum) | (truth > rules.maximum)).sum())
+        self._wrong["truth_outside_range"] += int(((truth < criteria.minimum) | (truth > criteria.maximum)).sum())
 
     def report(self) -> dict[str, Any]:
         """All figures; None where there is no pixel to tell. Shares are of the judged pixels."""

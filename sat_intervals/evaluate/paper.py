@@ -58,7 +58,7 @@ _REFERENCE_2 = {
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneMetrics:
     """The figures of one scene, as `evaluate_run` or `ablate_pair` report them, and the group it belongs to."""
 
     name: str
@@ -76,12 +76,12 @@ class Row:
     at_objective: int | None = None
 
 
-def table_1(scenes: Iterable[Scene]) -> list[Row]:
+def table_1(scenes: Iterable[SceneMetrics]) -> list[Row]:
     """Accuracy, relative size and overestimation by group (paper, table 1)."""
     return _table(scenes, TABLE_1, ACCURACY, {"paper": _PAPER_1, "reference": _REFERENCE_1})
 
 
-def table_2(scenes: Iterable[Scene]) -> list[Row]:
+def table_2(scenes: Iterable[SceneMetrics]) -> list[Row]:
     """Accuracy of the methods of the ablation by group (paper, table 2)."""
     return _table(scenes, TABLE_2, TABLE_2[METHODS[-1]], {"paper": _PAPER_2, "reference": _REFERENCE_2})
 
@@ -95,7 +95,10 @@ def look_up(report: dict[str, Any], place: tuple[str, ...]) -> float | None:
 
 
 def _table(
-    scenes: Iterable[Scene], columns: Mapping[str, tuple[str, ...]], accuracy: tuple[str, ...], others: dict[str, Any]
+    scenes: Iterable[SceneMetrics],
+    columns: Mapping[str, tuple[str, ...]],
+    accuracy: tuple[str, ...],
+    others: dict[str, Any],
 ) -> list[Row]:
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for scene in scenes:

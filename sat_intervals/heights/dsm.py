@@ -7,7 +7,7 @@ never filled.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
@@ -16,8 +16,9 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.fusion import cells_of_run, fused
-from sat_intervals.heights.point_cloud import WINDOW, Cells, Cloud, Extent
+from sat_intervals.heights.point_cloud import WINDOW, Cells, Extent, PointCloud
 from sat_intervals.products import POINTS
+from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     Georeferencing,
     OutputWriter,
@@ -32,9 +33,6 @@ from sat_intervals.raster import (
 )
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Grid, Window
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage ("extent", "cells", "files"), how much of it is done, and how much there is."""
 
 # Cells of a tile: some tens of megabytes.
 _TILE_ROWS, _TILE_COLUMNS = 512, 2048
@@ -105,7 +103,7 @@ def make_surface(
     clouds = []
     for done, run in enumerate(runs):
         progress("extent", done, len(runs))
-        clouds.append(Cloud(run, projection))
+        clouds.append(PointCloud(run, projection))
     cells = _cells(clouds, resolution, radius)
     tags = {
         "RUNS": runs_tag(runs),
@@ -178,7 +176,7 @@ def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
     raise SatIntervalsError(f"no valid pixel in {', '.join(str(run.out) for run in runs)}: there is no surface to make")
 
 
-def _cells(clouds: Sequence[Cloud], resolution: float, radius: float) -> Cells:
+def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float) -> Cells:
     extents = [cloud.extent for cloud in clouds if cloud.extent is not None]
     left, bottom, right, top = zip(*extents, strict=True)
     cells = Cells.over(Extent(min(left), min(bottom), max(right), max(top)).grown(radius), resolution)
@@ -196,7 +194,7 @@ def _place(cells: Cells, crs: str) -> Georeferencing:
 
 
 def _strips(
-    threads: ThreadPoolExecutor, clouds: Sequence[Cloud], cells: Cells, radius: float, interval: str
+    threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, interval: str
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Bands of full-width strips, from the top, with the first row of each."""
 

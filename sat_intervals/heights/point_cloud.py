@@ -67,7 +67,7 @@ class Cells:
         )
 
 
-class Cloud:
+class PointCloud:
     """The points of one run, read by windows, with the extent of each on the map."""
 
     def __init__(self, run: Run, projection: Projection) -> None:

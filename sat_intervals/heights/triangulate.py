@@ -4,7 +4,7 @@ Points are interpolated from a lattice, which takes about a second a megapixel: 
 needed. Rows are read, computed and written strip by strip, whatever the size.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from sat_intervals.heights.sensors import Lattice, Points, Sensors
 from sat_intervals.products import INVALID
+from sat_intervals.progress import Progress
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -21,9 +22,6 @@ _PIXELS = 1 << 20
 # What is written is rounded to hundredths of a millimetre on the ground and tenths of one in height, below the error of
 # the lattice: the file is half as large.
 _DEGREES, _METRES = 2.0**-33, 2.0**-13
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage ("points", "files"), how much of it is done, and how much there is."""
 
 
 def triangulate(

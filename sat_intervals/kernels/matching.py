@@ -180,7 +180,7 @@ def _see_from_right(curve, index, cost, best, start):
         store(cost, start + k, smaller(candidate, known))
 
 
-class _Patch(NamedTuple):
+class _Inputs(NamedTuple):
     """What both sweeps read and write. They unpack it once: counting references would cost more than a pixel."""
 
     left: np.ndarray
@@ -195,14 +195,14 @@ class _Patch(NamedTuple):
     curve: np.ndarray
 
 
-def _prepare(costs: Costs) -> _Patch:
+def _prepare(costs: Costs) -> _Inputs:
     columns = costs.left_state.shape[1]
     count = costs.right_state.shape[1] - columns + 1
     size = padded_to_lanes(count)
     beyond = np.zeros(size, np.uint16)
     beyond[count:] = WALL
     slots = 1 + 3 * columns
-    return _Patch(
+    return _Inputs(
         *costs,
         barrier=np.zeros(columns + size, np.uint16),
         possible=np.zeros(columns, np.int64),

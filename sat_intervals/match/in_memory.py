@@ -9,12 +9,11 @@ import xarray as xr
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.machine import usable_memory
 from sat_intervals.match.matching_cost import Reader
-from sat_intervals.match.memory import volume_bytes
-from sat_intervals.match.normalization import Scales, measure
+from sat_intervals.match.memory import check_memory, volume_bytes
+from sat_intervals.match.normalization import PairStatistics, measure
 from sat_intervals.match.patch import match_patch
-from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_rows
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
 
@@ -49,17 +48,17 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     left_image, right_image = _image(left_pixels), _image(right_pixels)
     whole = Window(0, 0, *left_image.shape)
     readers = _reader(left_image), _reader(right_image)
-    scales = None
+    statistics = None
     if isinstance(config.cost, Mccnn):
-        scales = Scales(measure(readers[0], *left_image.shape), measure(readers[1], *right_image.shape))
-    patch = match_patch(*readers, whole, whole, whole, config, scales)
+        statistics = PairStatistics(measure(readers[0], *left_image.shape), measure(readers[1], *right_image.shape))
+    patch = match_patch(*readers, whole, whole, whole, config, statistics)
     raw = patch.raw
-    rows = Rows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
-    scale = Scale(np.nan, np.nan)
+    rows = RawRows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
+    scale = ConfidenceScale(np.nan, np.nan)
     if config.ambiguity:
         histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
         scale = confidence_scale(config.ambiguity, histogram)
-    final = finish_rows(rows, 0, whole.height, scale, config)
+    final = postprocess_rows(rows, 0, whole.height, scale, config)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(left_image, dims=("row", "column"))
     dataset = xr.Dataset(coords=labels.coords)
     for band, layer in zip(BANDS, final.intervals, strict=True):
@@ -110,13 +109,11 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
             f"columns, out of the right, {right.shape[1]}: check their sign, x_right = x_left + disparity"
         )
     rows, columns = left.shape
-    needed, there = volume_bytes(rows, columns, config), usable_memory()
-    if needed > there:
-        raise SatIntervalsError(
-            f"{rows} x {columns} pixels x {search.count} disparities "
-            f"need {needed / 1e9:.1f} GB, this process may use {there / 1e9:.1f} GB: "
-            "write the arrays to files and use match_pair, which works in tiles"
-        )
+    check_memory(
+        volume_bytes(rows, columns, config),
+        f"{rows} x {columns} pixels x {search.count} disparities",
+        "write the arrays to files and use match_pair, which works in tiles",
+    )
 
 
 def _reader(image: np.ma.MaskedArray) -> Reader:

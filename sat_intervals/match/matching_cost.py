@@ -10,7 +10,7 @@ from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.match.mccnn import Network, load_network, weights_file
-from sat_intervals.match.normalization import Scale, Scales
+from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import Window, facing
 
 Reader = Callable[[Window], tuple[np.ndarray, np.ndarray]]
@@ -61,7 +61,7 @@ class Area(NamedTuple):
         return self.base if self.mirrored else self.facing
 
 
-class Similarity(NamedTuple):
+class MatchingCost(NamedTuple):
     """What the kernels match an area by, and the states of its base's pixels."""
 
     costs: Costs
@@ -83,9 +83,9 @@ class _View(NamedTuple):
         return np.ascontiguousarray(array[row : row + window.height, column : column + window.width])
 
 
-def compare(
-    left: Reader, right: Reader, areas: Sequence[Area], config: Config, scales: Scales | None = None
-) -> list[Similarity]:
+def cost_areas(
+    left: Reader, right: Reader, areas: Sequence[Area], config: Config, statistics: PairStatistics | None = None
+) -> list[MatchingCost]:
     """Read two views once and make the costs and penalties of areas of theirs, which have the same rows.
 
     Parameters
@@ -96,17 +96,17 @@ def compare(
         What to match.
     config
         Settings.
-    scales
+    statistics
         Mean and standard deviation of the whole images, which MC-CNN needs.
     """
     views = _read(left, [area.left for area in areas], config), _read(right, [area.right for area in areas], config)
     if isinstance(config.cost, Mccnn):
-        assert scales is not None  # whoever matches by MC-CNN has measured the images
-        costs = _correlations(*views, areas, scales, load_network(weights_file(config.cost.weights)))
+        assert statistics is not None  # whoever matches by MC-CNN has measured the images
+        costs = _correlations(*views, areas, statistics, load_network(weights_file(config.cost.weights)))
     else:
         costs = _hamming(*views, areas, config.cost.window)
     return [
-        Similarity(found, _gradients(area, *views, config, scales), _of_base(area, *views))
+        MatchingCost(found, _gradients(area, *views, config, statistics), _of_base(area, *views))
         for area, found in zip(areas, costs, strict=True)
     ]
 
@@ -136,7 +136,9 @@ def _hamming(left: _View, right: _View, areas: Sequence[Area], window: int) -> l
 
 
 # ---- MC-CNN ------------------------------------------------------------------------------------------------
-def _correlations(left: _View, right: _View, areas: Sequence[Area], scales: Scales, network: Network) -> list[Costs]:
+def _correlations(
+    left: _View, right: _View, areas: Sequence[Area], statistics: PairStatistics, network: Network
+) -> list[Costs]:
     """Costs of all areas, strip by strip: features are never kept, and computed once however many areas there are."""
     views = left, right
     states = [window_state(view.state, view.radius) for view in views]
@@ -147,8 +149,8 @@ def _correlations(left: _View, right: _View, areas: Sequence[Area], scales: Scal
     for row in range(0, left.window.height, STRIP):
         rows = slice(row, min(row + STRIP, left.window.height))
         strips = [
-            _features(view, state, rows, scale, network)
-            for view, state, scale in zip(views, states, scales, strict=True)
+            _features(view, state, rows, of_image, network)
+            for view, state, of_image in zip(views, states, statistics, strict=True)
         ]
         for area, costs in zip(areas, made, strict=True):
             base, there = strips[area.mirrored], strips[not area.mirrored]
@@ -167,7 +169,7 @@ def _correlations(left: _View, right: _View, areas: Sequence[Area], scales: Scal
     ]
 
 
-def _features(view: _View, state: np.ndarray, rows: slice, scale: Scale, network: Network) -> np.ndarray:
+def _features(view: _View, state: np.ndarray, rows: slice, statistics: ImageStatistics, network: Network) -> np.ndarray:
     """Features of rows of a view, ``(features, rows, columns)``; zero beside the columns with a usable window."""
     height, width = rows.stop - rows.start, view.window.width
     usable = np.flatnonzero((state[rows] == 0).any(axis=0))
@@ -175,7 +177,7 @@ def _features(view: _View, state: np.ndarray, rows: slice, scale: Scale, network
         return np.zeros((network.count, height, width), np.float32)
     first, last = usable[0], usable[-1] + 1
     seen = np.s_[rows.start : rows.stop + 2 * view.radius, first : last + 2 * view.radius]
-    pixels = (view.pixels[seen].astype(np.float64) - scale.mean) / scale.deviation
+    pixels = (view.pixels[seen].astype(np.float64) - statistics.mean) / statistics.deviation
     pixels[view.state[seen] != 0] = 0
     inner = network(pixels.astype(np.float32))
     if inner.shape[2] == width:
@@ -186,13 +188,15 @@ def _features(view: _View, state: np.ndarray, rows: slice, scale: Scale, network
 
 
 # ---- Penalties ---------------------------------------------------------------------------------------------
-def _gradients(area: Area, left: _View, right: _View, config: Config, scales: Scales | None) -> Gradients | None:
+def _gradients(
+    area: Area, left: _View, right: _View, config: Config, statistics: PairStatistics | None
+) -> Gradients | None:
     """What the penalties of an area follow; None where they are constant."""
     if isinstance(config.sgm, MccnnSgm):
         edges = np.full(2, config.sgm.d)
         if config.sgm.gradients == "normalized":
-            assert scales is not None
-            edges *= [scales[area.mirrored].deviation, scales[not area.mirrored].deviation]
+            assert statistics is not None
+            edges *= [statistics[area.mirrored].deviation, statistics[not area.mirrored].deviation]
         rule = _edge_rule(config, config.sgm, edges, area)
     elif isinstance(config.sgm, NegativeSgm | InverseSgm):
         rule = _banz_rule(config.sgm)

@@ -1,6 +1,8 @@
 """Memory of a worker, from the sizes of what it holds; and the tile that fits in a given one."""
 
 from sat_intervals.config import Config, ConfigError, Mccnn
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.machine import usable_memory
 
 # A process before its first tile, its libraries and compiled kernels; measured 240 MB.
 PROCESS_BYTES = 300 * 10**6
@@ -55,3 +57,18 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
         f"{tiles_at_once} at once, need {needed / 1e6:.0f} MB, given are {memory / 1e6:.0f} MB: "
         "give more memory or fewer workers"
     )
+
+
+def check_memory(needed: int, what: str, way_out: str) -> None:
+    """Refuse what needs more bytes than this process may use.
+
+    Raises
+    ------
+    SatIntervalsError
+        With both figures.
+    """
+    usable = usable_memory()
+    if needed > usable:
+        raise SatIntervalsError(
+            f"{what} need {needed / 1e9:.1f} GB, this process may use {usable / 1e9:.1f} GB: {way_out}"
+        )

@@ -24,23 +24,23 @@ class Moments(NamedTuple):
     squares: float
 
 
-class Scale(NamedTuple):
+class ImageStatistics(NamedTuple):
     """Mean and standard deviation of an image's usable pixels; 0 and 1 where there are none."""
 
     mean: float
     deviation: float
 
 
-class Scales(NamedTuple):
+class PairStatistics(NamedTuple):
     """Those of both images."""
 
-    left: Scale
-    right: Scale
+    left: ImageStatistics
+    right: ImageStatistics
 
     @classmethod
-    def of_report(cls, report: dict[str, Any]) -> "Scales":
+    def of_report(cls, report: dict[str, Any]) -> "PairStatistics":
         """What `report` made."""
-        return cls(Scale(**report["left"]), Scale(**report["right"]))
+        return cls(ImageStatistics(**report["left"]), ImageStatistics(**report["right"]))
 
     def report(self) -> dict[str, Any]:
         """As manifests and run.json hold them."""
@@ -61,12 +61,12 @@ def blocks(height: int, width: int) -> list[Window]:
     return [tile.core for tile in Grid(Window(0, 0, height, width), BLOCK)]
 
 
-def measure(read: Callable[[Window], tuple[np.ndarray, np.ndarray]], height: int, width: int) -> Scale:
+def measure(read: Callable[[Window], tuple[np.ndarray, np.ndarray]], height: int, width: int) -> ImageStatistics:
     """Read a whole image block by block and measure it."""
-    return scale_of(moments(*read(block)) for block in blocks(height, width))
+    return statistics_of(moments(*read(block)) for block in blocks(height, width))
 
 
-def scale_of(blocks: Iterable[Moments]) -> Scale:
+def statistics_of(blocks: Iterable[Moments]) -> ImageStatistics:
     """Of an image, from its blocks in their order."""
     number, mean, squares = 0, 0.0, 0.0
     for block in blocks:
@@ -77,4 +77,4 @@ def scale_of(blocks: Iterable[Moments]) -> Scale:
             mean += difference * block.number / total
         number = total
     deviation = math.sqrt(squares / number) if number else 0.0
-    return Scale(mean, deviation or 1.0)
+    return ImageStatistics(mean, deviation or 1.0)

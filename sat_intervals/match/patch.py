@@ -6,8 +6,8 @@ import numpy as np
 
 from sat_intervals.config import Config, Sgm
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match
-from sat_intervals.match.matching_cost import Area, Reader, Similarity, compare
-from sat_intervals.match.normalization import Scales
+from sat_intervals.match.matching_cost import Area, MatchingCost, Reader, cost_areas
+from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
 from sat_intervals.tiling import Window, facing
 
@@ -53,7 +53,7 @@ def match_patch(
     region: Window,
     image: Window,
     config: Config,
-    scales: Scales | None = None,
+    statistics: PairStatistics | None = None,
 ) -> Patch:
     """Match a core with its overlap.
 
@@ -69,7 +69,7 @@ def match_patch(
         All left pixels: the overlap goes beyond the region, but not beyond the image.
     config
         Settings.
-    scales
+    statistics
         Mean and standard deviation of the whole images, which MC-CNN needs.
     """
     settings = kernel_settings(config)
@@ -79,22 +79,20 @@ def match_patch(
     areas = [Area.of(core.grown(overlap, overlap).clipped(image), config)]
     if method == "accurate":
         areas.append(_seen_area(core, image, config))
-    similarities = compare(left, right, areas, config, scales)
+    matching_costs = cost_areas(left, right, areas, config, statistics)
     seen = core if method == "fast" else Window(core.row, core.column, 0, 0)
-    raw, right_view = _matched(similarities[0], areas[0], settings, output, seen)
+    raw, right_view = _matched(matching_costs[0], areas[0], settings, output, seen)
     inside = output.relative_to(areas[0].base).slices
-    raw.validity[similarities[0].state[inside] & MASKED != 0] |= LEFT_MASKED
+    raw.validity[matching_costs[0].state[inside] & MASKED != 0] |= LEFT_MASKED
     if method == "accurate":
-        right_view = _match_from_right(similarities[1], areas[1], core, settings)
+        right_view = _match_from_right(matching_costs[1], areas[1], core, settings)
     return Patch(raw, output, right_view)
 
 
-def _matched(
-    similarity: Similarity, area: Area, settings: Settings, output: Window, core: Window
-) -> tuple[Raw, RightView]:
+def _matched(cost: MatchingCost, area: Area, settings: Settings, output: Window, core: Window) -> tuple[Raw, RightView]:
     """Match an area; returns the products of ``output`` and the right view of ``core``."""
     windows = output.relative_to(area.base), core.relative_to(area.base)
-    return match(similarity.costs, settings, *windows, similarity.gradients)
+    return match(cost.costs, settings, *windows, cost.gradients)
 
 
 def _seen_area(core: Window, image: Window, config: Config) -> Area:
@@ -105,10 +103,10 @@ def _seen_area(core: Window, image: Window, config: Config) -> Area:
     return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
 
 
-def _match_from_right(similarity: Similarity, area: Area, core: Window, settings: Settings) -> RightView:
+def _match_from_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:
     """The right view from a volume of its own: left and right change places, and disparities their sign."""
     maximum = settings.minimum + settings.count - 1
     mirrored = settings._replace(minimum=-maximum, cut_level=-1, weights=np.zeros(0, np.uint16), refine=False)
     reach = facing(core, settings.minimum, maximum)
-    raw, _ = _matched(similarity, area, mirrored, reach, reach)
+    raw, _ = _matched(cost, area, mirrored, reach, reach)
     return RightView(raw.cost, np.where(raw.winner == NO_DISPARITY, NO_DISPARITY, -raw.winner).astype(np.int16))

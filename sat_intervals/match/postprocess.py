@@ -17,7 +17,7 @@ from sat_intervals.kernels.intervals import regularize
 from sat_intervals.products import BANDS, INVALID, NO_DISPARITY, REGULARIZED
 
 
-class Rows(NamedTuple):
+class RawRows(NamedTuple):
     """Raw products of full-width rows, all ``(rows, columns)`` but the last.
 
     Attributes
@@ -42,9 +42,9 @@ class Rows(NamedTuple):
     validity: np.ndarray
     right_winner: np.ndarray
 
-    def cut(self, first: int, last: int) -> "Rows":
+    def cut(self, first: int, last: int) -> "RawRows":
         """The rows ``[first, last)``."""
-        return Rows(*(array[first:last] for array in self))
+        return RawRows(*(array[first:last] for array in self))
 
 
 class Final(NamedTuple):
@@ -54,23 +54,23 @@ class Final(NamedTuple):
     validity: np.ndarray
 
 
-class Scale(NamedTuple):
+class ConfidenceScale(NamedTuple):
     """The ambiguities that become confidence 1 and 0."""
 
     p1: float
     p99: float
 
 
-def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> Scale:
+def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceScale:
     """What confidence is relative to: given figures, the whole range, or percentiles of the whole image.
 
     ``histogram`` counts the ambiguities, ``0 .. etas * count``, of all pixels with a possible candidate.
     """
     if settings.p1 is not None and settings.p99 is not None:
-        return Scale(settings.p1, settings.p99)
+        return ConfidenceScale(settings.p1, settings.p99)
     if settings.normalization == "range":
-        return Scale(0.0, float(histogram.size - 1))
-    return Scale(*percentiles(histogram))
+        return ConfidenceScale(0.0, float(histogram.size - 1))
+    return ConfidenceScale(*percentiles(histogram))
 
 
 def halo(config: Config) -> int:
@@ -82,7 +82,7 @@ def _median_radius(config: Config) -> int:
     return config.median.size // 2 if config.median else 0
 
 
-def finish_rows(rows: Rows, first: int, last: int, scale: Scale, config: Config) -> Final:
+def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> Final:
     """Final bands of the rows ``[first, last)``.
 
     Parameters
@@ -123,7 +123,7 @@ def finish_rows(rows: Rows, first: int, last: int, scale: Scale, config: Config)
     return Final(bands, validity)
 
 
-def _bounds(rows: Rows, config: Config) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(rows: RawRows, config: Config) -> tuple[np.ndarray, np.ndarray]:
     """Both bounds as float; what stands where nothing was searched is never written."""
     if config.interval is None:
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
@@ -152,20 +152,20 @@ def _regularized(
     return lower, upper, low[first - top : last - top]
 
 
-def finish_strips(strips: Iterable[Rows], scale: Scale, config: Config) -> Iterator[Final]:
+def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[Final]:
     """Final bands of a region given strip by strip, from the top; each strip waits for the halo below it."""
     margin = halo(config)
-    waiting: Rows | None = None
+    waiting: RawRows | None = None
     first = 0  # of the waiting rows, those before are halo
     for strip in strips:
-        waiting = strip if waiting is None else Rows(*map(_stacked, waiting, strip))
+        waiting = strip if waiting is None else RawRows(*map(_stacked, waiting, strip))
         last = waiting.winner.shape[0] - margin
         if last > first:
-            yield finish_rows(waiting, first, last, scale, config)
+            yield postprocess_rows(waiting, first, last, scale, config)
             start = max(0, last - margin)
             waiting, first = waiting.cut(start, last + margin), last - start
     if waiting is not None and waiting.winner.shape[0] > first:
-        yield finish_rows(waiting, first, waiting.winner.shape[0], scale, config)
+        yield postprocess_rows(waiting, first, waiting.winner.shape[0], scale, config)
 
 
 def _stacked(above: np.ndarray, below: np.ndarray) -> np.ndarray:

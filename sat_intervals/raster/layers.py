@@ -8,7 +8,7 @@ import numpy as np
 from rasterio import Env
 from rasterio.crs import CRS
 from rasterio.transform import Affine
-from rasterio.windows import Window as Area
+from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
@@ -55,7 +55,7 @@ def write_once(
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> np.ndarray:
     """Read all bands of a file, or of a window inside it: ``(bands, rows, columns)`` in the file's type."""
-    area = window and Area(window.column, window.row, window.width, window.height)
+    area = window and RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
         return np.asarray(dataset.read(window=area))
 

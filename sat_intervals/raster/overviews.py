@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 from rasterio.enums import Resampling
-from rasterio.windows import Window as Area
+from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.raster.images import Image, opened
 from sat_intervals.raster.windows import read_inside
@@ -23,7 +23,7 @@ def read_small_image(image: Image, window: Window, shape: tuple[int, int]) -> np
     if shape == (window.height, window.width):
         means = picked
     else:
-        area = Area(window.column, window.row, window.width, window.height)
+        area = RasterioWindow(window.column, window.row, window.width, window.height)
         with opened(image.path, window) as dataset:
             means = dataset.read(image.band, window=area, out_shape=shape, resampling=Resampling.average)
     return np.where(state == 0, means, np.nan)

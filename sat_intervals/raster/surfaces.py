@@ -6,7 +6,7 @@ import numpy as np
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform
-from rasterio.windows import Window as Area
+from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
@@ -71,7 +71,7 @@ def read_heights(
     with opened(str(path), window) as dataset:
         try:
             with WarpedVRT(dataset, dtype="float64", nodata=np.nan, **grid) as warped:
-                values = warped.read(1, window=Area(window.column, window.row, window.width, window.height))
+                values = warped.read(1, window=RasterioWindow(window.column, window.row, window.width, window.height))
         except gdal.GDAL_ERRORS as error:
             raise SatIntervalsError(f"{path} cannot be laid on the surface: {gdal.reason(error)}") from error
         return np.asarray(values * dataset.scales[0] + dataset.offsets[0])

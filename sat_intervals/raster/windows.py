@@ -1,7 +1,7 @@
 """Pixels in: any window of an image, with the states of its pixels."""
 
 import numpy as np
-from rasterio.windows import Window as Area
+from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.products import MASKED, NO_DATA
 from sat_intervals.raster.images import Image, opened
@@ -41,7 +41,7 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Values in the file's type, and states, of a window that lies inside the image; with ``shape`` so many picked."""
-    area = Area(window.column, window.row, window.width, window.height)
+    area = RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(image.path, window) as dataset:
         values = dataset.read(image.band, window=area, out_shape=shape)
         usable = np.isfinite(values) & _differs(values, image.nodata)

@@ -15,7 +15,7 @@ from rasterio import Env
 from rasterio.enums import Resampling
 from rasterio.io import DatasetReader, DatasetWriter
 from rasterio.shutil import copy
-from rasterio.windows import Window as Area
+from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
@@ -134,7 +134,7 @@ class OutputWriter:
         """Write the strip that begins at ``row``: of each file ``(bands, rows, width)``, or ``(rows, width)``."""
         for file, raster in zip(self._files, rasters, strict=True):
             bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
-            area = Area(0, row, self._shape[1], bands.shape[1])
+            area = RasterioWindow(0, row, self._shape[1], bands.shape[1])
             with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
                 self._strips[file.name].write(bands, window=area)
             self._sums[file.name] += _sum(bands)
@@ -270,12 +270,12 @@ def _bytes(files: Sequence[File], height: int, width: int) -> int:
     return height * width * sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in files)
 
 
-def _areas(dataset: DatasetReader) -> Iterator[Area]:
+def _areas(dataset: DatasetReader) -> Iterator[RasterioWindow]:
     """Windows that cover a file."""
     height, width = _READ_BACK
     for row in range(0, dataset.height, height):
         for column in range(0, dataset.width, width):
-            yield Area(column, row, min(width, dataset.width - column), min(height, dataset.height - row))
+            yield RasterioWindow(column, row, min(width, dataset.width - column), min(height, dataset.height - row))
 
 
 def _sum(bands: np.ndarray) -> int:

@@ -2,7 +2,7 @@
 
 import json
 import platform
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -14,13 +14,13 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.match.postprocess import Rows, Scale, confidence_scale, finish_strips
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
 from sat_intervals.products import FLAGS
+from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
 from sat_intervals.run.job import Job
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
-from sat_intervals.run.tile import logged_stage
 from sat_intervals.store.tiles import mark_replaced
 
 Item = TypeVar("Item")
@@ -28,11 +28,8 @@ Item = TypeVar("Item")
 # Pixels of a strip, in whole rows: what is held of one takes about 100 bytes a pixel, several times.
 STRIP_PIXELS = 1 << 20
 
-Progress = Callable[[str, int, int], None]
-"""Called with a stage ("kernels", "images", "tiles", "bands", "files"), how much is done, how much in all."""
 
-
-def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
+def assemble(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
     """Write the files of a run whose tiles are done; returns the content of run.json.
 
     Parameters
@@ -55,14 +52,14 @@ def conclude(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
     histogram = store.histogram()
     records = store.records()
     _check_matched(job, records, int(histogram.sum()))
-    scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else Scale(np.nan, np.nan)
+    scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
     with _going_on(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
         with logged_stage(seconds, "bands"):
-            strips = (Rows(**strip) for strip in store.strips(STRIP_PIXELS // region.width))
+            strips = (RawRows(**strip) for strip in store.strips(STRIP_PIXELS // region.width))
             row = 0
-            for final in _ahead(finish_strips(_ahead(strips), scale, config)):
+            for final in _ahead(postprocess_strips(_ahead(strips), scale, config)):
                 writer.write(row, final.intervals, final.validity)
                 tally.add(final.intervals, final.validity)
                 row += final.validity.shape[0]
@@ -133,7 +130,7 @@ def _tags(config: Config) -> dict[str, str]:
     return tags
 
 
-def _report(job: Job, scale: Scale, tally: Tally, seconds: dict[str, float]) -> dict[str, Any]:
+def _report(job: Job, scale: ConfidenceScale, tally: Tally, seconds: dict[str, float]) -> dict[str, Any]:
     """The content of run.json."""
     grid, config = job.store.grid, job.config
     packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")

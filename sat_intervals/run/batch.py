@@ -19,16 +19,16 @@ import yaml
 
 from sat_intervals.config import Cluster, Config, load_config, load_yaml
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image
 from sat_intervals.results import open_run
-from sat_intervals.run.assemble import Progress, conclude
+from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, changes_since, compile_kernels, is_complete, prepare
 from sat_intervals.run.pair import check_failures, matched, measure_images
+from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import remove_tiles
-
-REPORT = "batch.json"
 
 _LOG = logging.getLogger(__name__)
 
@@ -191,19 +191,6 @@ def match_batch(
     return ended
 
 
-def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
-    """What `match_batch` said last of the pairs in a folder; None where there is no batch."""
-    text = LocalFolder(out).read(REPORT)
-    if text is None:
-        return None
-    try:
-        return {
-            str(name): {"error": "", **ended, "state": str(ended["state"])} for name, ended in json.loads(text).items()
-        }
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: run the batch again") from error
-
-
 def _images(pair: PairOfBatch) -> tuple[Image, Image]:
     return open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
 
@@ -259,12 +246,12 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
 def _matched(
     jobs: Mapping[str, Job], out: Path, cluster: Cluster, keep_tiles: bool, progress: Progress
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Match the tiles of all jobs and conclude each, in a thread of its own, while others are being matched."""
+    """Match the tiles of all jobs and assemble each, in a thread of its own, while others are being matched."""
     if not jobs:
         return
     for config in {_kernels(job.config): job.config for job in jobs.values()}.values():
         compile_kernels(config)
-    concluding: dict[Future[dict[str, Any]], str] = {}
+    assembling: dict[Future[dict[str, Any]], str] = {}
     with _thread() as (thread, check), connected(cluster, out) as client:
         measured = {}
         for name, job in jobs.items():
@@ -276,14 +263,14 @@ def _matched(
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
         for job, failures in matched(client, list(measured.values()), progress):
-            concluding[thread.submit(_concluded, job, failures, keep_tiles, check)] = names[id(job)]
-            for future in [future for future in concluding if future.done()]:
-                yield concluding.pop(future), future.result()
-        total = len(concluding)
-        while concluding:
-            progress("pairs.files", total - len(concluding), total)
-            for future in wait(concluding, timeout=0.5, return_when="FIRST_COMPLETED").done:
-                yield concluding.pop(future), future.result()
+            assembling[thread.submit(_assembled, job, failures, keep_tiles, check)] = names[id(job)]
+            for future in [future for future in assembling if future.done()]:
+                yield assembling.pop(future), future.result()
+        total = len(assembling)
+        while assembling:
+            progress("pairs.files", total - len(assembling), total)
+            for future in wait(assembling, timeout=0.5, return_when="FIRST_COMPLETED").done:
+                yield assembling.pop(future), future.result()
 
 
 @contextmanager
@@ -309,11 +296,11 @@ def _kernels(config: Config) -> str:
     return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
-def _concluded(job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress) -> dict[str, Any]:
+def _assembled(job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress) -> dict[str, Any]:
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = conclude(job, {}, progress)
+            report = assemble(job, {}, progress)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # whatever is wrong with one pair, the others go on

@@ -14,18 +14,18 @@ import numpy as np
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
-from sat_intervals.machine import usable_cores, usable_memory
+from sat_intervals.machine import usable_cores
 from sat_intervals.match.mccnn import load_network, weights_file
-from sat_intervals.match.memory import fitted, volume_bytes
-from sat_intervals.match.normalization import Scale as ImageScale
-from sat_intervals.match.normalization import Scales
+from sat_intervals.match.memory import check_memory, fitted, volume_bytes
+from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import match_patch
-from sat_intervals.match.postprocess import Rows, Scale, finish_strips
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files
 from sat_intervals.raster.identity import identity
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.store.folder import folder_at
-from sat_intervals.store.tiles import LAYOUT, Store, differences, digest, inputs_before, is_replacing
+from sat_intervals.store.manifest import differences, digest
+from sat_intervals.store.tiles import LAYOUT, Store, inputs_before, is_replacing
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Sections of the settings that no tile knows of.
@@ -94,7 +94,7 @@ def prepare(
     config, out = fitted_to_jobs(load_config(config)), Path(out)
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
-    check_memory(config, region)
+    check_tiles(config, region)
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
     home, elsewhere = out / "tiles", None
@@ -200,11 +200,11 @@ def compile_kernels(config: Config) -> None:
         return pixels, np.zeros(pixels.shape, np.uint8)
 
     spot = Window(0, 0, 4, 4)
-    scales = Scales(ImageScale(0.5, 0.3), ImageScale(0.5, 0.3))
-    patch = match_patch(read, read, spot, spot, spot, config, scales)
+    statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
+    patch = match_patch(read, read, spot, spot, spot, config, statistics)
     raw = patch.raw
-    rows = Rows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
-    list(finish_strips([rows], Scale(0.0, 1.0), config))
+    rows = RawRows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
+    list(postprocess_strips([rows], ConfidenceScale(0.0, 1.0), config))
 
 
 def checked_region(left: Image, window: Window | None) -> Window:
@@ -220,19 +220,17 @@ def checked_region(left: Image, window: Window | None) -> Window:
     return window
 
 
-def check_memory(config: Config, region: Window) -> None:
+def check_tiles(config: Config, region: Window) -> None:
     """Refuse tiles that this process cannot hold; what jobs and the workers of a scheduler have is theirs to know."""
     if config.cluster.kind not in ("threads", "processes"):
         return
     height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
     workers = min(config.cluster.workers or usable_cores(), len(Grid(region, config.tiles.size)))
-    needed, there = workers * volume_bytes(height, width, config), usable_memory()
-    if needed > there:
-        raise SatIntervalsError(
-            f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {workers} at once, need "
-            f"{needed / 1e9:.1f} GB, this process may use {there / 1e9:.1f} GB: "
-            "choose a smaller --tile-size or fewer --workers"
-        )
+    check_memory(
+        workers * volume_bytes(height, width, config),
+        f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {workers} at once,",
+        "choose a smaller --tile-size or fewer --workers",
+    )
 
 
 def _inputs(left: Image, right: Image, config: Config, before: Mapping[str, Any]) -> dict[str, Any]:

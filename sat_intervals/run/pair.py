@@ -10,13 +10,14 @@ from distributed import Client
 
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
-from sat_intervals.match.normalization import Moments, Scale, Scales, blocks, scale_of
+from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
+from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image
-from sat_intervals.run.assemble import Progress, conclude
+from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, compile_kernels, prepare
-from sat_intervals.run.submit import Flight, Task, reason
-from sat_intervals.run.tile import logged_stage, match_tile, measure_block
+from sat_intervals.run.submit import Submission, Task, reason
+from sat_intervals.run.tile import match_tile, measure_block
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
 
@@ -85,7 +86,7 @@ def match_pair(
                             measure_images(client, job, progress)
                         for _, failures in matched(client, [job], progress):
                             check_failures(job, failures)
-            report = conclude(job, seconds, progress)
+            report = assemble(job, seconds, progress)
         if not keep_tiles:
             job.store.remove()
     return report
@@ -102,21 +103,23 @@ def measure_images(client: Client, job: Job, progress: Progress) -> None:
     if not isinstance(job.config.cost, Mccnn) or job.store.normalization() is not None:
         return
     job.store.write_normalization(
-        Scales(*(_measured(client, image, job, progress) for image in (job.left, job.right))).report()
+        PairStatistics(*(_measured(client, image, job, progress) for image in (job.left, job.right))).report()
     )
 
 
-def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Scale:
+def _measured(client: Client, image: Image, job: Job, progress: Progress) -> ImageStatistics:
     windows = blocks(image.height, image.width)
     retries = job.config.cluster.retries
     found: dict[int, Moments] = {}
-    for landed in Flight(client, (Task(i, measure_block, (image, block), retries) for i, block in enumerate(windows))):
-        if landed is not None and landed.error is not None:
-            raise RunError(f"{image.path} could not be measured: {reason(landed.error)}") from landed.error
-        if landed is not None:
-            found[landed.label] = landed.result
+    for outcome in Submission(
+        client, (Task(i, measure_block, (image, block), retries) for i, block in enumerate(windows))
+    ):
+        if outcome is not None and outcome.error is not None:
+            raise RunError(f"{image.path} could not be measured: {reason(outcome.error)}") from outcome.error
+        if outcome is not None:
+            found[outcome.label] = outcome.result
         progress("images", len(found), len(windows))
-    return scale_of(found[i] for i in range(len(windows)))
+    return statistics_of(found[i] for i in range(len(windows)))
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
@@ -147,11 +150,11 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
         for tile in waiting[i]
     )
     progress("tiles", done, total)
-    for landed in Flight(client, tasks):
-        if landed is None:
+    for outcome in Submission(client, tasks):
+        if outcome is None:
             progress("tiles", done, total)
             continue
-        (i, tile), _, error = landed
+        (i, tile), _, error = outcome
         if isinstance(error, OSError) and error.errno in _FULL:  # no other tile would fare better
             raise RunError(
                 f"{error.filename or jobs[i].store.folder}: {error.strerror}: make room and run the same command "

@@ -10,7 +10,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
 from sat_intervals.raster import Image
 from sat_intervals.run.cluster import tiles_at_once
-from sat_intervals.run.job import check_memory, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.pair import match_pair
 from sat_intervals.tiling import Grid, Window
 
@@ -86,7 +86,7 @@ def plan(
     left, right = checked_pair(left, right, config)
     workers = workers or tiles_at_once(config.cluster)
     region = checked_region(left, window)
-    check_memory(config, region)
+    check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
     work = _work(grid, region, config)
     pixels = region.height * region.width

@@ -41,7 +41,7 @@ class Task:
     retries: int
 
 
-class Landing(NamedTuple):
+class Outcome(NamedTuple):
     """How a task ended: with a result, or with an error."""
 
     label: Any
@@ -49,7 +49,7 @@ class Landing(NamedTuple):
     error: BaseException | None
 
 
-class Flight:
+class Submission:
     """Tasks, two of them in flight for every core; iterates over their landings, and None where none lands for a while.
 
     dask blames a worker's death on every task that it held. Those blamed too often are tried again at the end, one at a
@@ -66,31 +66,31 @@ class Flight:
         self._name = uuid.uuid4().hex  # a scheduler may serve several runs, and takes equal keys for one task
         self._submitted = 0
         self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
-        self._flying: dict[str, tuple[Task, bool, Future[Any]]] = {}
+        self._in_flight: dict[str, tuple[Task, bool, Future[Any]]] = {}
         self._suspects: list[Task] = []
         self._width, self._looked = 2, float("-inf")
         self._workers: set[str] = set()
 
-    def __iter__(self) -> Iterator[Landing | None]:
+    def __iter__(self) -> Iterator[Outcome | None]:
         self._fill()
-        while self._flying:
+        while self._in_flight:
             future = self._next()
             if future is None:
                 self._fill()
                 yield None
                 continue
             result, error = _end_of(future)
-            task, is_alone, _ = self._flying.pop(str(future.key))
+            task, is_alone, _ = self._in_flight.pop(str(future.key))
             future.release()
             is_blamed = isinstance(error, KilledWorker) and not is_alone
             if is_blamed:
                 _LOG.info("%s of %s: its workers died; it is tried again, alone", task.function.__name__, task.label)
                 self._suspects.append(task)
             self._fill()
-            if not self._flying and self._suspects:
+            if not self._in_flight and self._suspects:
                 self._submit(self._suspects.pop(), is_alone=True)
             if not is_blamed:
-                yield Landing(task.label, result, error)
+                yield Outcome(task.label, result, error)
 
     def _next(self) -> Future[Any] | None:
         """The next future that ends; None where none does for a while, so that whoever waits can look around."""
@@ -107,7 +107,7 @@ class Flight:
             self._width = 2 * max(1, sum(cores.values()))
             self._note_workers(set(cores))
             self._looked = time.monotonic()
-        while len(self._flying) < self._width:
+        while len(self._in_flight) < self._width:
             following = next(self._tasks, None)
             if following is None:
                 return
@@ -123,7 +123,7 @@ class Flight:
         key = f"{task.function.__name__}-{self._name}-{self._submitted}"
         with _scheduler_needed():
             future = self._client.submit(task.function, *task.arguments, key=key, retries=task.retries, pure=False)
-        self._flying[key] = task, is_alone, future
+        self._in_flight[key] = task, is_alone, future
         future.add_done_callback(self._ended.put)
 
 

@@ -2,8 +2,6 @@
 
 import logging
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -11,33 +9,16 @@ import numpy as np
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.match.normalization import Moments, Scales, moments
+from sat_intervals.match.normalization import Moments, PairStatistics, moments
 from sat_intervals.match.patch import Patch, match_patch
 from sat_intervals.products import NO_DISPARITY
+from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job, weights_identity
 from sat_intervals.run.seams import seam_lines
 from sat_intervals.tiling import Tile, Window
 
 _LOG = logging.getLogger(__name__)
-
-
-@contextmanager
-def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Add the seconds that the block takes to a stage."""
-    started = time.perf_counter()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
-
-
-@contextmanager
-def logged_stage(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Like `timed`, and say in the log when the stage begins and ends."""
-    _LOG.info("stage %s begins", stage)
-    before = seconds.get(stage, 0.0)
-    with timed(seconds, stage):
-        yield
-    _LOG.info("stage %s ended after %.1f s", stage, seconds[stage] - before)
 
 
 def measure_block(image: Image, block: Window) -> Moments:
@@ -79,18 +60,18 @@ def _match_tile(job: Job, tile: Tile) -> None:
 
     grid, config = job.store.grid, job.config
     image = Window(0, 0, job.left.height, job.left.width)
-    scales = _checked_scales(job)
+    statistics = _checked_statistics(job)
     started = time.perf_counter()
     readers = reader(job.left, "left"), reader(job.right, "right")
-    patch = match_patch(*readers, tile.core, grid.region, image, config, scales)
+    patch = match_patch(*readers, tile.core, grid.region, image, config, statistics)
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with timed(seconds, "write"):
-        job.store.write_arrays(tile, _left_behind(patch, tile, job), job.manifest)
+        job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
 
-def _checked_scales(job: Job) -> Scales | None:
+def _checked_statistics(job: Job) -> PairStatistics | None:
     """Mean and standard deviation of the images, where MC-CNN needs them; its weights are those of the run."""
     cost, normalization = job.config.cost, job.store.normalization()
     if not isinstance(cost, Mccnn) or normalization is None:
@@ -99,10 +80,10 @@ def _checked_scales(job: Job) -> Scales | None:
     for key in ("sha256", "onnxruntime"):
         if here[key] != wanted[key]:
             raise SatIntervalsError(f"{here['path']} on this worker differs in {key} from {wanted['path']} of the run")
-    return Scales.of_report(normalization)
+    return PairStatistics.of_report(normalization)
 
 
-def _left_behind(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
+def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     """What the tile's core adds to the store."""
     raw = patch.raw
     inner = tile.core.relative_to(patch.output).slices

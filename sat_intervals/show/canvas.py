@@ -1,4 +1,7 @@
-"""What all pictures share: the page, its style and colours, the range of a map, the words on an empty one."""
+"""What all pictures share: the page, its style and colours, the range of a map, the words on an empty one.
+
+Every picture imports it, so it is here that matplotlib, the extra ``plot``, is found missing.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,11 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sat_intervals.errors import SatIntervalsError
+
+try:
+    from matplotlib import rc_context
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+except ImportError as error:
+    raise SatIntervalsError("pictures need matplotlib: pip install 'sat-intervals[plot]'") from error
 
 DPI = 110  # dots an inch
 NOTHING = "#dedede"  # where there is no value

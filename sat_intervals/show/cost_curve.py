@@ -8,8 +8,8 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import Area, compare
-from sat_intervals.match.normalization import Scales
+from sat_intervals.match.matching_cost import Area, cost_areas
+from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import FLAGS, IMPOSSIBLE_COST
 from sat_intervals.raster import read_window
@@ -66,9 +66,9 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     settings = kernel_settings(config)
     readers = partial(read_window, results.left), partial(read_window, results.right)
     normalization = results.report.get("normalization")
-    scales = Scales.of_report(normalization) if normalization else None
-    (similarity,) = compare(*readers, [Area.of(area, config)], config, scales)
-    volume = cost_volume(similarity.costs, settings, similarity.gradients)
+    statistics = PairStatistics.of_report(normalization) if normalization else None
+    (cost,) = cost_areas(*readers, [Area.of(area, config)], config, statistics)
+    volume = cost_volume(cost.costs, settings, cost.gradients)
     curve = np.ascontiguousarray(volume[pixel.relative_to(area).slices])
     possible = curve[0, 0] != IMPOSSIBLE_COST
     if not possible.any():

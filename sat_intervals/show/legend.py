@@ -19,7 +19,7 @@ _INVALID = {
 }
 
 
-class Kind(NamedTuple):
+class PixelClass(NamedTuple):
     """A kind of pixel: its colour as ``#rrggbb``, what it means, and the validity flag that makes it (0 = none)."""
 
     colour: str
@@ -27,17 +27,17 @@ class Kind(NamedTuple):
     flag: int
 
 
-KINDS = (
-    Kind("#f2f2f2", "valid", 0),
-    Kind(SKY, "valid, interval regularised", REGULARIZED),
-    *(Kind(_INVALID[flag.name], flag.meaning, flag.value) for flag in FLAGS if flag.invalid),
+PIXEL_CLASSES = (
+    PixelClass("#f2f2f2", "valid", 0),
+    PixelClass(SKY, "valid, interval regularised", REGULARIZED),
+    *(PixelClass(_INVALID[flag.name], flag.meaning, flag.value) for flag in FLAGS if flag.invalid),
 )
 FIRST_INVALID = 2
 
 
 def classify(validity: np.ndarray) -> np.ndarray:
-    """The place in KINDS of every pixel of a validity band, uint8; of several reasons to be invalid the first."""
+    """The index in PIXEL_CLASSES of every pixel of a validity band, uint8; the first of several reasons wins."""
     places = np.zeros(validity.shape, np.uint8)
-    for place in (1, *range(len(KINDS) - 1, FIRST_INVALID - 1, -1)):
-        places[validity & KINDS[place].flag != 0] = place
+    for place in (1, *range(len(PIXEL_CLASSES) - 1, FIRST_INVALID - 1, -1)):
+        places[validity & PIXEL_CLASSES[place].flag != 0] = place
     return places

@@ -5,17 +5,17 @@ from textwrap import fill
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.image import AxesImage
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import INVALID
 from sat_intervals.results import Results
 from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
-from sat_intervals.show.legend import KINDS, SKY, VERMILION, classify
+from sat_intervals.show.legend import PIXEL_CLASSES, SKY, VERMILION, classify
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map: more pixels than its dots are thinned out
 _TEXT = 8.5  # inches that the words over a map take
@@ -78,7 +78,7 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
         _show(panel, results, kind, cmap=ListedColormap([VERMILION, SKY]), vmin=0, vmax=1)
         panel.set_title(_share_text(int(missed.sum()), judged))
         texts = (f"truth above the interval: {missed[0]:,} px", f"truth below it: {missed[1]:,} px")
-        key = [Patch(facecolor=color, label=text) for color, text in zip((VERMILION, SKY), texts, strict=True)]
+        key = [patches.Patch(facecolor=color, label=text) for color, text in zip((VERMILION, SKY), texts, strict=True)]
         figure.legend(handles=key, loc="outside lower left", ncols=2, frameon=False)
 
 
@@ -150,17 +150,17 @@ def _draw_map(
 def _draw_validity(panel: Axes, key: Axes, results: Results, validity: np.ndarray) -> None:
     """Why pixels are invalid, a colour for the first reason of each, with the shares of the pixels shown."""
     places = classify(validity)
-    colours = ListedColormap([kind.colour for kind in KINDS])
-    _show(panel, results, places, cmap=colours, vmin=-0.5, vmax=len(KINDS) - 0.5)
+    colours = ListedColormap([kind.colour for kind in PIXEL_CLASSES])
+    _show(panel, results, places, cmap=colours, vmin=-0.5, vmax=len(PIXEL_CLASSES) - 0.5)
     panel.set_title("Validity")
-    shares = np.bincount(places.ravel(), minlength=len(KINDS)) / places.size
+    shares = np.bincount(places.ravel(), minlength=len(PIXEL_CLASSES)) / places.size
     entries = [
         (kind.colour, f"{kind.meaning} ({100 * share:.1f}\u00a0%)")
-        for kind, share in zip(KINDS, shares, strict=True)
+        for kind, share in zip(PIXEL_CLASSES, shares, strict=True)
         if share or kind.flag == 0
     ]
     entries.append((NOTHING, "in the other maps: no value"))
-    handles = [Patch(facecolor=colour, edgecolor=_EDGE, label=fill(text, 46)) for colour, text in entries]
+    handles = [patches.Patch(facecolor=colour, edgecolor=_EDGE, label=fill(text, 46)) for colour, text in entries]
     key.axis("off")
     key.legend(handles=handles, loc="upper left", frameon=False, title="Validity", alignment="left", borderaxespad=0)
 

@@ -7,7 +7,6 @@ lies elsewhere than in the folder of one of them: they write the same bytes.
 """
 
 import errno
-import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -18,24 +17,21 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.store.folder import Folder, LocalFolder, folder_at
+from sat_intervals.errors import RunError
+from sat_intervals.store.folder import Folder, folder_at
+from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, parsed
 from sat_intervals.store.zarr_arrays import DamagedTilesError, TileArrays
 from sat_intervals.tiling import Grid, Tile, Window
 
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
 LAYOUT = 4
 
-_MANIFEST, _ARRAYS, _RECORDS, _FAILURES = "manifest.json", "arrays.zarr", "records", "failures"
+_ARRAYS, _RECORDS, _FAILURES = "arrays.zarr", "records", "failures"
 _NORMALIZATION = "normalization.json"
 # In the folder of the run where its tiles lie elsewhere: it says where.
 _PLACE = "store.json"
 # In the folder of the run from the beginning of one that replaces another to its end.
 _REPLACING = "replacing"
-
-
-class StoreError(SatIntervalsError):
-    """A store that belongs to another run, or cannot be written."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +85,9 @@ class Store:
         """
         home, folder, before = folder_at(self.home), self.folder, _place(self.home)
         try:
-            text = None if overwrite else before.read(_MANIFEST)
+            text = None if overwrite else before.read(MANIFEST)
             if text is not None:
-                _check_same(text, before, manifest)
+                check_same(text, before, manifest)
                 if before != folder:
                     raise StoreError(
                         f"the tiles of the run in {self.home.parent} lie in {before}, not in {folder}: give the same "
@@ -113,7 +109,7 @@ class Store:
             else:
                 home.delete(_PLACE)
             self._arrays.create()
-            if not folder.create(_MANIFEST, json.dumps(manifest, indent=1)):
+            if not folder.create(MANIFEST, json.dumps(manifest, indent=1)):
                 self.check(manifest)
         except OSError as error:
             raise StoreError(
@@ -131,13 +127,13 @@ class Store:
         StoreError
             When it is another's.
         """
-        there = self.folder.read(_MANIFEST)
+        there = self.folder.read(MANIFEST)
         if there is None:
             raise RunError(
                 f"the tiles in {self.folder} are gone, as where another run of the same images and settings ended: "
                 "run the same command again, it matches them anew"
             )
-        _check_same(there, self.folder, manifest)
+        check_same(there, self.folder, manifest)
 
     @contextmanager
     def needed(self, manifest: Mapping[str, Any]) -> Iterator[None]:
@@ -162,7 +158,7 @@ class Store:
             self._arrays.write(tile, arrays)
             self.check(manifest)
         except Exception:
-            if self.folder.read(_MANIFEST) is None:  # it was removed meanwhile, and what came later would stay for ever
+            if self.folder.read(MANIFEST) is None:  # it was removed meanwhile, and what came later would stay for ever
                 _drop(self.folder)
             raise
 
@@ -182,7 +178,7 @@ class Store:
     def write_failure(self, tile: str, reason: str) -> None:
         """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
         with suppress(OSError):  # a full disk is reason enough for a tile to fail, but not for the run to end at once
-            if self.folder.read(_MANIFEST) is not None:  # else a bucket would keep it for ever
+            if self.folder.read(MANIFEST) is not None:  # else a bucket would keep it for ever
                 self.folder.write(f"{_FAILURES}/{tile}.json", json.dumps(reason))
 
     def failures(self) -> dict[str, str]:
@@ -260,7 +256,7 @@ def is_replacing(home: Path) -> bool:
 def inputs_before(home: Path) -> dict[str, Any]:
     """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
     try:
-        return dict(json.loads(_place(home).read(_MANIFEST) or "{}").get("inputs", {}))
+        return dict(json.loads(_place(home).read(MANIFEST) or "{}").get("inputs", {}))
     except (OSError, AttributeError, TypeError, ValueError):
         return {}
 
@@ -271,93 +267,29 @@ def _place(home: Path) -> Folder:
     return folder_at(json.loads(noted) if noted else home)
 
 
-@dataclass(frozen=True)
-class Status:
-    """How far the tiles of a run are.
-
-    Attributes
-    ----------
-    total, done
-        Numbers of tiles.
-    failed
-        Why tiles failed that are not done since, by name.
-    running
-        Whether a run is at work on them.
-    """
-
-    total: int
-    done: int
-    failed: dict[str, str]
-    running: bool
-
-
-def read_status(home: Path) -> Status:
-    """How far a run is, from its store alone.
-
-    Parameters
-    ----------
-    home
-        Folder of the tiles in that of the run, wherever they lie.
+def store_of(home: Path) -> Store:
+    """The store of the run to whose folder ``home`` belongs, to be looked at: how far it is.
 
     Raises
     ------
     StoreError
-        Where there is no store.
+        Where there is none.
     """
     folder = _place(home)
-    text = folder.read(_MANIFEST)
+    text = folder.read(MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")
-    manifest = _parsed(text, folder)
+    manifest = parsed(text, folder)
     try:
         grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
     except (LookupError, TypeError) as error:
-        raise StoreError(f"{folder}/{_MANIFEST} is no manifest of a run: --overwrite starts afresh") from error
-    store = Store(home, grid, 1, 0, str(folder))
-    return Status(len(grid), len(store.done()), store.failures(), LocalFolder(home).is_locked())
-
-
-def _parsed(manifest: str, folder: Folder) -> dict[str, Any]:
-    try:
-        return dict(json.loads(manifest))
-    except (ValueError, TypeError) as error:
-        raise StoreError(f"{folder}/{_MANIFEST} cannot be read, {error}: --overwrite starts afresh") from error
-
-
-def _check_same(there: str, folder: Folder, manifest: Mapping[str, Any]) -> None:
-    """Hold that the manifest in a folder is that of the run."""
-    if changed := list(differences(_parsed(there, folder), json.loads(json.dumps(manifest)))):
-        raise StoreError(
-            f"{folder} holds the tiles of another run: {'; '.join(changed)} "
-            "(use the same settings and inputs to go on, --overwrite to start afresh)"
-        )
+        raise StoreError(f"{folder}/{MANIFEST} is no manifest of a run: --overwrite starts afresh") from error
+    return Store(home, grid, 1, 0, str(folder))
 
 
 def _drop(folder: Folder) -> None:
     """Delete the tiles in a folder, and the folder where nothing else is in it."""
     # The manifest first: without it nothing of the rest counts.
-    for name in (_MANIFEST, _ARRAYS, _RECORDS, _FAILURES, _NORMALIZATION):
+    for name in (MANIFEST, _ARRAYS, _RECORDS, _FAILURES, _NORMALIZATION):
         folder.delete(name)
     folder.delete_if_empty()
-
-
-def digest(manifest: Mapping[str, Any]) -> str:
-    """A name of 32 digits that only manifests share in which `differences` finds none."""
-
-    def without_times(there: dict[str, Any]) -> dict[str, Any]:
-        return {key: value for key, value in there.items() if key != "modified"}
-
-    same = json.dumps(json.loads(json.dumps(manifest), object_hook=without_times), sort_keys=True)
-    return hashlib.sha256(same.encode()).hexdigest()[:32]
-
-
-def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
-    """The values in which two manifests differ, each with its path; when a file was changed does not count."""
-    if isinstance(there, dict) and isinstance(wanted, dict):
-        for key in sorted(there.keys() | wanted.keys()):
-            yield from differences(there.get(key), wanted.get(key), f"{path}.{key}".lstrip("."))
-    elif isinstance(there, list) and isinstance(wanted, list) and len(there) == len(wanted):
-        for place, pair in enumerate(zip(there, wanted, strict=True)):
-            yield from differences(*pair, f"{path}.{place}")
-    elif there != wanted and not path.endswith(".modified"):  # when does not matter where SHA-256 agrees
-        yield f"{path} was {json.dumps(there)}, now {json.dumps(wanted)}"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.results import Bands, Results
-from sat_intervals.show.legend import FIRST_INVALID, KINDS, classify
+from sat_intervals.show.legend import FIRST_INVALID, PIXEL_CLASSES, classify
 
 _PIXELS = 500_000  # on the page, at 5 to 8 bytes each once compressed and written as text
 _WIDTH_BARS, _CONFIDENCE_BARS = 60, 25
@@ -91,7 +91,7 @@ class Pixels:
                 "low": _coded(low, 0, 1, "u1"),
                 "missed": _coded(np.where(valid, missed, 0), 0, 1, "u1"),
             },
-            "kinds": [{"colour": each.colour, "meaning": each.meaning} for each in KINDS],
+            "kinds": [{"colour": each.colour, "meaning": each.meaning} for each in PIXEL_CLASSES],
         }
 
 

@@ -1,0 +1,94 @@
+"""The package as it is installed and imported: public names, packages, and nothing changed for others."""
+
+import subprocess
+import sys
+
+import pytest
+from test_architecture import FOLDERS, HOMES, PYPROJECT, modules
+
+import sat_intervals
+
+MODULES = list(modules())
+
+
+def test_package__is_imported_without_its_libraries() -> None:
+    libraries = {*HOMES, "pydantic", "xarray", "yaml"}
+    code = f"import sys, sat_intervals; print(*{libraries!r} & sys.modules.keys())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
+def test_package__public_names_exist() -> None:
+    assert set(sat_intervals._HOMES) == set(sat_intervals.__all__) - {"__version__"}
+    assert set(sat_intervals.__all__) <= set(dir(sat_intervals))
+    assert sat_intervals.__version__ == PYPROJECT["project"]["version"]
+    for name in sat_intervals._HOMES:
+        assert getattr(sat_intervals, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'match_pairs'"):
+        _ = sat_intervals.match_pairs
+
+
+def test_packages__equal_the_folders() -> None:
+    shipped = {
+        ".".join([package, *file.parent.relative_to(folder).parts])
+        for package, folder in FOLDERS.items()
+        for file in folder.rglob("*")
+        if file.suffix in {".py", ".yaml"}
+    }
+    assert shipped == set(PYPROJECT["tool"]["setuptools"]["packages"])
+
+
+def test_entry_point__is_not_hidden_by_a_module() -> None:
+    package, command = PYPROJECT["project"]["scripts"]["sat-intervals"].split(":")
+    assert f"{package}.{command}" not in MODULES
+
+
+# What the interpreter and the libraries are set to.
+STATE = """
+import gc, importlib, logging, signal, sys, warnings
+from numba import config
+
+def state():
+    loggers = [logging.root, *(x for x in logging.root.manager.loggerDict.values() if isinstance(x, logging.Logger))]
+    return {
+        **{f"numba's {name}": repr(getattr(config, name)) for name in dir(config) if not name.startswith("_")},
+        **{f"signal {number}": signal.getsignal(number) for number in signal.valid_signals()},
+        **{
+            f"logger {one.name}": (one.level, one.propagate, one.disabled, one.handlers[:], one.filters[:])
+            for one in loggers
+            if one.name.partition(".")[0] != "sat_intervals"
+        },
+        "warnings": warnings.filters[:],
+        "garbage": (gc.isenabled(), gc.get_threshold()),
+        "hooks": (sys.excepthook, sys.unraisablehook),
+    }
+"""
+IMPORT_ALL = f"""
+import importlib
+for name in {[name.removesuffix(".__init__") for name in MODULES]!r}:
+    importlib.import_module(name)
+"""
+
+
+def test_modules__importing_them_changes_nothing_of_others() -> None:
+    """Other libraries may set at import what they like: theirs are imported before."""
+    others = run_python(f"{IMPORT_ALL}import sys; print(*[name for name in sys.modules if name[:4] != 'sat_'])").split()
+    script = f"""{STATE}
+for name in {others!r}:
+    try:
+        importlib.import_module(name)
+    except ImportError:
+        pass
+before = state()
+{IMPORT_ALL}
+after = state()
+for name, value in before.items():
+    if after[name] != value:
+        print(name, "was", value, "and is", after[name])
+"""
+    assert run_python(script) == ""
+
+
+def run_python(script: str) -> str:
+    """What a script prints, in a process of its own."""
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
