@@ -31,7 +31,7 @@ def write_run(folder, bands, validity, truth=None, image=None):
     out = folder / "out"
     with OutputWriter(out, RUN_FILES, height, width, PLACE, {}) as writer:
         writer.write(0, bands, validity)
-        writer.publish({"run.json": json.dumps(_report(inputs, bands, validity))})
+        writer.publish(("run.json", json.dumps(_report(inputs, bands, validity))))
     return out
 
 

@@ -308,7 +308,7 @@ def test_match__names_the_tiles_that_a_truncated_file_fails(folder, tmp_path, cl
     result = command(*matching(folder, out, *options, left="cut.tif"))
     assert (result.returncode, result.stdout) == (1, "")
     first, *lines = result.stderr.splitlines()
-    assert re.fullmatch(r"sat-intervals: (\d+) of 20 tiles failed, .*run the same command again:", first)
+    assert re.fullmatch(r"sat-intervals: (\d+) of 20 tiles failed, .*run the same command again, with --ov.*:", first)
     assert int(first.split()[1]) == len(lines)
     failed = {re.fullmatch(r"  tile (\d_\d): (.*)", line)[1] for line in lines}
     kept = {path.stem for path in (out / "tiles" / "records").glob("[0-9]*.json")}
