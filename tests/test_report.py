@@ -130,7 +130,7 @@ def test_write_report__takes_names_as_text(tmp_path):
 def test_package_data__holds_the_parts_of_the_page():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     patterns = project["tool"]["setuptools"]["package-data"]["sat_intervals.show.report"]
-    folder = ROOT / "sat_intervals" / "report"
+    folder = ROOT / "sat_intervals" / "show" / "report"
     shipped = {file for pattern in patterns for file in folder.glob(pattern)}
     assert shipped == {file for file in folder.iterdir() if file.is_file() and file.suffix != ".py"}
 

@@ -89,7 +89,8 @@ def submitted(
         "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
         "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
     } | (own or {})
-    code = f"from sat_intervals import cluster, cli; vars(cluster).update({constants or {}}); cli.main()"
+    code = "from sat_intervals import cli; from sat_intervals.run import cluster; "
+    code += f"vars(cluster).update({constants or {}}); cli.main()"
     command = [sys.executable, "-c", code, "match", images / "left.tif", images / "right.tif", folder / "out"]
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
     with (folder / "log").open("w") as log:
