@@ -220,7 +220,7 @@ def sbatch(folder: Path, script: str) -> str:
 
 def test_match__waits_for_the_first_worker_and_says_so(slurm, pair, tmp_path):
     programs = sbatch(tmp_path, 'exec $SBATCH --begin=now+15 "$@"')
-    with submitted(pair, tmp_path, programs=programs, constants={"_TOLD_EVERY": 4, "WORKERS_GONE": 1}, is_quiet=False):
+    with submitted(pair, tmp_path, programs=programs, constants={"_TOLD_EVERY": 4, "WORKERS_GONE": 5}, is_quiet=False):
         pass
     lines = (tmp_path / "log").read_text().splitlines()
     assert 1 <= len(lines) <= 8
