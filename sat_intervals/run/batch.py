@@ -300,7 +300,7 @@ def _assembled(job: Job, failures: dict[str, BaseException], keep_tiles: bool, p
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assemble(job, {}, progress)
+            report = assemble(job, {}, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # whatever is wrong with one pair, the others go on
