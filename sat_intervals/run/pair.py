@@ -2,7 +2,7 @@
 
 import errno
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +77,16 @@ def match_pair(
     seconds: dict[str, float] = {}
     with logged_stage(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
+
+    def match() -> None:
+        with logged_stage(seconds, "tiles"):
+            if job.waiting() or not _is_measured(job):
+                with connected(job.config.cluster, job.out) as client:
+                    with logged_stage(seconds, "tiles.images"):
+                        measure_images(client, job, progress)
+                    for _, failures in matched(client, [job], progress):
+                        check_failures(job, failures)
+
     with LocalFolder(job.store.home).locked():
         if not overwrite and job.is_finished():
             job.store.remove()
@@ -88,31 +98,25 @@ def match_pair(
             compile_kernels(job.config)
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
-            report = _matched_and_assembled(job, keep_tiles, seconds, progress)
+            match()
+            report = assembled(job, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     return report
 
 
-def _matched_and_assembled(job: Job, keep_tiles: bool, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
-    """Match what is to be matched and write the files; tiles that turn out to be damaged are matched again."""
-    tries = 0
-    while True:
-        with logged_stage(seconds, "tiles"):
-            if job.waiting() or not _is_measured(job):
-                with connected(job.config.cluster, job.out) as client:
-                    with logged_stage(seconds, "tiles.images"):
-                        measure_images(client, job, progress)
-                    for _, failures in matched(client, [job], progress):
-                        check_failures(job, failures)
+def assembled(
+    job: Job, match: Callable[[], None], seconds: dict[str, float], progress: Progress, *, keep_tiles: bool
+) -> dict[str, Any]:
+    """Write the files of a run, see `assemble`; ``match`` is called for tiles that turn out to be damaged."""
+    for _ in range(_TRIES):
         try:
             return assemble(job, seconds, progress, keep_tiles=keep_tiles)
         except DamagedTilesError as error:
-            tries += 1
-            if tries > _TRIES:
-                raise
             job.store.check(job.manifest)
-            _LOG.warning("%s; it does so now", error)
+            _LOG.warning("%s; this is done now", error)
+            match()
+    return assemble(job, seconds, progress, keep_tiles=keep_tiles)
 
 
 def _is_measured(job: Job) -> bool:

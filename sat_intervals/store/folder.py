@@ -37,8 +37,8 @@ class Folder(Protocol):
     def delete(self, name: str) -> None:
         """Delete a file, if it is there."""
 
-    def delete_all(self, names: Collection[str]) -> None:
-        """Delete many files, and the folders of theirs that hold no file then."""
+    def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
+        """Delete many files, and folders where no file is in them then."""
 
     def delete_if_empty(self) -> None:
         """Delete this folder, where nothing is in it."""

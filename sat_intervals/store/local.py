@@ -89,12 +89,12 @@ class LocalFolder:
         """See `Folder`."""
         (self.path / name).unlink(missing_ok=True)
 
-    def delete_all(self, names: Collection[str]) -> None:
+    def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
         """See `Folder`."""
         for name in names:
             self.delete(name)
-        for top in {name.partition("/")[0] for name in names if "/" in name}:
-            for place, _, _ in os.walk(self.path / top, topdown=False):
+        for folder in folders:
+            for place, _, _ in os.walk(self.path / folder, topdown=False):
                 LocalFolder(Path(place)).delete_if_empty()
 
     def delete_if_empty(self) -> None:

@@ -86,15 +86,14 @@ class RemoteFolder:
             system.invalidate_cache(path)
             system.rm(path)
 
-    def delete_all(self, names: Collection[str]) -> None:
+    def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
         """See `Folder`."""
-        if not names:
-            return
         with suppress(FileNotFoundError), self._reached("") as (system, path):
             system.invalidate_cache(path.rstrip("/"))
-            system.rm([path + name for name in names])
-        for top in {name.partition("/")[0] for name in names if "/" in name}:
-            with suppress(FileNotFoundError), self._reached(top) as (system, path):
+            if names:
+                system.rm([path + name for name in names])
+        for folder in folders:
+            with suppress(FileNotFoundError), self._reached(folder) as (system, path):
                 if not system.find(path):  # a bucket has no folders, other services do
                     system.rm(path, recursive=True)
 

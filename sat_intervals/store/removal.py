@@ -29,8 +29,8 @@ def drop(folder: Folder) -> None:
     if _is_of_run(folder):
         # The manifest first: without it nothing of the rest counts. The group last: it tells of a removal cut short.
         folder.delete(MANIFEST)
-        folder.delete_all(names.keys() - {MANIFEST, _GROUP})
-        folder.delete_all([_GROUP])
+        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES))
+        folder.delete_all([_GROUP], [ARRAYS])
     else:
         folder.delete_all([name for name, size in names.items() if size == 0])  # nobody's: left by a power loss
     folder.delete_if_empty()

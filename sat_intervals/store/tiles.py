@@ -180,8 +180,7 @@ class Store:
             self.check(manifest)
         except Exception:
             if self.folder.read(MANIFEST) is None:  # it was removed meanwhile, and what came later would stay for ever
-                self._arrays.drop(tile)
-                self._arrays.folder.delete_if_empty()
+                self.folder.delete_all([f"{ARRAYS}/{name}" for name in self._arrays.files_of(tile)], [ARRAYS])
                 self.folder.delete_if_empty()
             raise
         return checksums
