@@ -11,7 +11,7 @@ from networks import random_weights, write_network
 from sat_intervals import match_pair
 from sat_intervals.cli import main
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.run import pair as run
 from sat_intervals.run.tile import match_tile
@@ -19,7 +19,7 @@ from sat_intervals.store.tiles import Store
 
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
 SHARDS = ["arrays.zarr/int16/c/0/1/0", "arrays.zarr/uint32/c/0/1/0", "arrays.zarr/right/c/1/0"]
-CHUNKS = ["arrays.zarr/seams/c/1/0/0/0/0", "arrays.zarr/histogram/c/1/0/0"]
+CHUNKS = ["arrays.zarr/seams/c/1/0/0/0/0/0", "arrays.zarr/histogram/c/1/0/0"]
 DESCRIPTIONS = [
     f"arrays.zarr/{array}zarr.json" for array in ("", "int16/", "uint32/", "right/", "seams/", "histogram/")
 ]
@@ -111,18 +111,20 @@ def test_match__matches_tiles_again_that_were_exchanged(scene, tmp_path):
 
 @pytest.mark.parametrize("name", [*SHARDS, *CHUNKS])
 def test_match__heals_what_is_damaged_before_it_is_assembled(scene, tmp_path, monkeypatch, name):
-    matched = []
+    log = tmp_path / "log"
+    log.touch()
 
     def and_damage(job, tile):
         match_tile(job, tile)
-        if tile.name == "1_0" and tile.name not in matched:
+        if tile.name == "1_0" and tile.name not in log.read_text():
             damage(job.store.home / name, "bit")
-        matched.append(tile.name)
+        with log.open("a") as file:
+            print(tile.name, file=file)
 
     monkeypatch.setattr(run, "match_tile", and_damage)
     said = match(scene, tmp_path / "out")
     assert f"tiles 1_0 in {tmp_path}/out/tiles are damaged" in said
-    assert sorted(matched) == ["0_0", "0_1", "0_2", "1_0", "1_0", "1_1", "1_2"]
+    assert sorted(log.read_text().split()) == ["0_0", "0_1", "0_2", "1_0", "1_0", "1_1", "1_2"]
     assert_same(scene, tmp_path / "out")
 
 
@@ -208,8 +210,8 @@ def test_status__of_a_damaged_store_says_what_it_can(scene, tmp_path, name, cont
     assert_same(scene, tmp_path / "out")
 
 
-def dies(*arguments):
-    raise KeyboardInterrupt
+def dies(*arguments, **named):
+    raise RunError("killed")
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
@@ -218,13 +220,15 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
     out, store = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
     with monkeypatch.context() as patch:
         patch.setattr(Store, "remove", dies)
-        match(scene, out, *store, status=130)
+        match(scene, out, *store, status=1)
     report = (out / "run.json").read_bytes()
     if is_begun:
         for file in tmp_path.rglob("manifest.json"):
             file.unlink()
-    said = match(scene, out, *store, "--p1", "7", status=2)
-    assert f"{out} already holds a run" in said
+    assert f"{out} already holds a run" in match(scene, out, *store, "--tile-size", "80", status=2)
+    settings = yaml.safe_load((scene / "settings.yaml").read_text()) | {"median": None}  # of which no tile knows
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(scene / "left.tif", scene / "right.tif", out, settings)
     assert list(tmp_path.rglob("records/*.json"))
     assert match(scene, out, *store) == (
         f"sat-intervals: the run in {out} was complete; the tiles that it left are removed now\n"
@@ -252,8 +256,8 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     out, options = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
     match(scene, out, *options, "--keep-tiles")
     (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
-    shutil.rmtree(out)
     shutil.rmtree(tiles)
+    shutil.rmtree(out)
     names = ["notes.txt", "records/notes.json", "failures/all.json", "arrays.zarr/int16/table", "arrays.zarr/.zattrs"]
     mine = with_files(tiles, names)
     top = [
@@ -268,7 +272,7 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     mine |= with_files(tiles, ["records/77_0.json"])
     with monkeypatch.context() as patch:
         patch.setattr(run, "assembled", dies)
-        match(scene, out, *options, "--overwrite", status=130)
+        match(scene, out, *options, "--overwrite", status=1)
     assert_kept(mine)
     match(scene, out, *options, "--overwrite")
     assert_kept(mine)
