@@ -225,7 +225,7 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
     if is_begun:
         for file in tmp_path.rglob("manifest.json"):
             file.unlink()
-    assert f"{out} already holds a run" in match(scene, out, *store, "--tile-size", "80", status=2)
+    assert f"{out} already holds a run" in match(scene, out, *store, "--tile-size", "128", status=2)
     settings = yaml.safe_load((scene / "settings.yaml").read_text()) | {"median": None}  # of which no tile knows
     with pytest.raises(SatIntervalsError, match="already holds a run"):
         match_pair(scene / "left.tif", scene / "right.tif", out, settings)
