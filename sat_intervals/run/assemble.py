@@ -21,7 +21,7 @@ from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
 from sat_intervals.run.job import Job
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
-from sat_intervals.store.tiles import mark_replaced
+from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced
 
 Item = TypeVar("Item")
 
@@ -29,7 +29,7 @@ Item = TypeVar("Item")
 STRIP_PIXELS = 1 << 20
 
 
-def assemble(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:
+def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_tiles: bool = False) -> dict[str, Any]:
     """Write the files of a run whose tiles are done; returns the content of run.json.
 
     Parameters
@@ -40,24 +40,29 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
         What earlier stages took; those of this one are added.
     progress
         Called strip by strip.
+    keep_tiles
+        Whether the tiles stay afterwards.
 
     Raises
     ------
+    DamagedTilesError
+        Tiles are to be matched again.
     RunError
         Tiles are missing, or a file cannot be written.
     SatIntervalsError
         No pixel could be matched.
     """
     config, store, region = job.config, job.store, job.store.grid.region
-    histogram = store.histogram()
     records = store.records()
+    _check_done(job, records)
+    histogram, seams = store.histogram(records), store.seams(records)
     _check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
     with _going_on(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
         with logged_stage(seconds, "bands"):
-            strips = (RawRows(**strip) for strip in store.strips(STRIP_PIXELS // region.width))
+            strips = (RawRows(**strip) for strip in store.strips(STRIP_PIXELS // region.width, records))
             row = 0
             for final in _ahead(postprocess_strips(_ahead(strips), scale, config)):
                 writer.write(row, final.intervals, final.validity)
@@ -71,7 +76,9 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress) -> dict[st
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
-        report = _report(job, scale, tally, seconds)
+        report = _report(job, scale, tally, seconds, seams)
+        if not keep_tiles:
+            mark_finished(store.home, job.name)
         writer.publish(report=("run.json", json.dumps(report, indent=1) + "\n"))
         mark_replaced(store.home)
         progress("files", 1, 1)
@@ -97,12 +104,17 @@ def _ahead(items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _check_matched(job: Job, records: dict[str, dict[str, Any]], searched: int) -> None:
-    """An image without data is the user's mistake, and is told so."""
-    done = job.store.done()
-    missing = [tile.name for tile in job.store.grid if tile.name not in done or tile.name not in records]
+def _check_done(job: Job, records: Records) -> None:
+    """What went missing since the tiles were matched is matched again by the next try."""
+    missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
-        raise RunError(f"tiles {', '.join(missing)} are missing in {job.store.folder}: run the same command again")
+        raise DamagedTilesError(
+            f"tiles {', '.join(missing)} are missing in {job.store.folder}: run the same command again"
+        )
+
+
+def _check_matched(job: Job, records: Records, searched: int) -> None:
+    """An image without data is the user's mistake, and is told so."""
     if searched:
         return
     usable = {side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")}
@@ -130,7 +142,9 @@ def _tags(config: Config) -> dict[str, str]:
     return tags
 
 
-def _report(job: Job, scale: ConfidenceScale, tally: Tally, seconds: dict[str, float]) -> dict[str, Any]:
+def _report(
+    job: Job, scale: ConfidenceScale, tally: Tally, seconds: dict[str, float], seams: np.ndarray
+) -> dict[str, Any]:
     """The content of run.json."""
     grid, config = job.store.grid, job.config
     packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
@@ -152,7 +166,7 @@ def _report(job: Job, scale: ConfidenceScale, tally: Tally, seconds: dict[str, f
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },
-        "overlap_left": seam_report(job.store.seams(), grid),
+        "overlap_left": seam_report(seams, grid),
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
     }

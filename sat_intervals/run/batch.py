@@ -16,16 +16,16 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from distributed import Client
 
 from sat_intervals.config import Cluster, Config, load_config, load_yaml
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image
 from sat_intervals.results import open_run
-from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, changes_since, compile_kernels, is_complete, prepare
-from sat_intervals.run.pair import check_failures, matched, measure_images
+from sat_intervals.run.pair import assembled, check_failures, matched, measure_images
 from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import remove_tiles
@@ -263,7 +263,7 @@ def _matched(
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
         for job, failures in matched(client, list(measured.values()), progress):
-            assembling[thread.submit(_assembled, job, failures, keep_tiles, check)] = names[id(job)]
+            assembling[thread.submit(_assembled, client, job, failures, keep_tiles, check)] = names[id(job)]
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()
         total = len(assembling)
@@ -296,11 +296,17 @@ def _kernels(config: Config) -> str:
     return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
-def _assembled(job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress) -> dict[str, Any]:
+def _assembled(
+    client: Client, job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress
+) -> dict[str, Any]:
+    def match() -> None:
+        for _, failures in matched(client, [job], progress):
+            check_failures(job, failures)
+
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assemble(job, {}, progress)
+            report = assembled(job, match, {}, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # whatever is wrong with one pair, the others go on

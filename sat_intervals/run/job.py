@@ -3,7 +3,7 @@
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +25,7 @@ from sat_intervals.raster.identity import identity
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import differences, digest
-from sat_intervals.store.tiles import LAYOUT, Store, inputs_before, is_replacing
+from sat_intervals.store.tiles import LAYOUT, Store, finished_run, inputs_before, is_replacing
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Sections of the settings that no tile knows of.
@@ -63,12 +63,23 @@ class Job:
         """All that decides the bytes of a tile."""
         return _manifest(self.config, self.inputs, self.store.grid.region)
 
+    @property
+    def name(self) -> str:
+        """A name that this run shares with no other: all that decides the bytes of its files."""
+        return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster"})})
+
+    def is_finished(self) -> bool:
+        """Whether the folder holds the files of this very run, which died before it removed its tiles."""
+        return is_complete(self.out) and finished_run(self.store.home) == self.name
+
     def begin(self, *, overwrite: bool = False) -> None:
         """Open the store for what decides the bytes of a tile; to be called while its folder is locked.
 
         With ``overwrite`` the files of the run before stay until this one replaces them; it can be resumed without.
         """
-        check_output(self.out, overwrite)  # again: another run may have ended here before the lock was free
+        if not overwrite and is_complete(self.out):  # of this run or of one that ended before the lock was free
+            raise _holds_run(self.out, OUTPUTS)
+        check_output(self.out, overwrite)
         self.store.open(self.manifest, overwrite=overwrite)
 
     def waiting(self) -> list[Tile]:
@@ -173,17 +184,21 @@ def check_output(out: Path, overwrite: bool) -> None:
     try:
         there = [name for name in OUTPUTS if (out / name).exists()]
         # run.json is the last: without it, but with tiles, a run was killed between the names of its files
-        is_under_way = is_replacing(out / "tiles") if "run.json" in there else (out / "tiles").exists()
+        home = out / "tiles"
+        is_unfinished = is_replacing(home) or finished_run(home) is not None
+        is_under_way = is_unfinished if "run.json" in there else home.exists()
         if there and not overwrite and not is_under_way:
-            raise SatIntervalsError(
-                f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite"
-            )
+            raise _holds_run(out, there)
         if os.path.lexists(out) and not out.is_dir():
             raise SatIntervalsError(f"{out} is no folder: choose another")
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise SatIntervalsError(f"{out} cannot be written: {error.strerror}: choose another folder") from error
+
+
+def _holds_run(out: Path, there: Sequence[str]) -> SatIntervalsError:
+    return SatIntervalsError(f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite")
 
 
 def is_complete(out: Path) -> bool:

@@ -2,7 +2,7 @@
 
 import errno
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,21 @@ from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image
+from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, compile_kernels, prepare
 from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_tile, measure_block
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Window
 
 # Errors of a disk, or of a user's share of it.
 _FULL = errno.ENOSPC, errno.EDQUOT
+
+# How often damaged tiles are matched again before the run gives up: a disk that damages more is broken.
+_TRIES = 2
 
 _LOG = logging.getLogger(__name__)
 
@@ -72,24 +77,51 @@ def match_pair(
     seconds: dict[str, float] = {}
     with logged_stage(seconds, "start"):
         job = prepare(left, right, out, config, window=window, overwrite=overwrite)
+
+    def match() -> None:
+        with logged_stage(seconds, "tiles"):
+            if job.waiting() or not _is_measured(job):
+                with connected(job.config.cluster, job.out) as client:
+                    with logged_stage(seconds, "tiles.images"):
+                        measure_images(client, job, progress)
+                    for _, failures in matched(client, [job], progress):
+                        check_failures(job, failures)
+
     with LocalFolder(job.store.home).locked():
+        if not overwrite and job.is_finished():
+            job.store.remove()
+            _LOG.warning("the run in %s was complete; the tiles that it left are removed now", job.out)
+            return open_run(job.out).report
         job.begin(overwrite=overwrite)
         with logged_stage(seconds, "kernels"):
             progress("kernels", 0, 1)
             compile_kernels(job.config)
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
-            with logged_stage(seconds, "tiles"):
-                if job.waiting():
-                    with connected(job.config.cluster, job.out) as client:
-                        with logged_stage(seconds, "tiles.images"):
-                            measure_images(client, job, progress)
-                        for _, failures in matched(client, [job], progress):
-                            check_failures(job, failures)
-            report = assemble(job, seconds, progress)
+            match()
+            report = assembled(job, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     return report
+
+
+def assembled(
+    job: Job, match: Callable[[], None], seconds: dict[str, float], progress: Progress, *, keep_tiles: bool
+) -> dict[str, Any]:
+    """Write the files of a run, see `assemble`; ``match`` is called for tiles that turn out to be damaged."""
+    for _ in range(_TRIES):
+        try:
+            return assemble(job, seconds, progress, keep_tiles=keep_tiles)
+        except DamagedTilesError as error:
+            job.store.check(job.manifest)
+            _LOG.warning("%s; this is done now", error)
+            match()
+    return assemble(job, seconds, progress, keep_tiles=keep_tiles)
+
+
+def _is_measured(job: Job) -> bool:
+    """Whether the store holds mean and standard deviation of both images, or the run does without."""
+    return not isinstance(job.config.cost, Mccnn) or job.store.normalization() is not None
 
 
 def measure_images(client: Client, job: Job, progress: Progress) -> None:
@@ -100,7 +132,7 @@ def measure_images(client: Client, job: Job, progress: Progress) -> None:
     RunError
         An image that cannot be read.
     """
-    if not isinstance(job.config.cost, Mccnn) or job.store.normalization() is not None:
+    if _is_measured(job):
         return
     job.store.write_normalization(
         PairStatistics(*(_measured(client, image, job, progress) for image in (job.left, job.right))).report()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.config import Mccnn
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
 from sat_intervals.match.patch import Patch, match_patch
@@ -66,16 +66,18 @@ def _match_tile(job: Job, tile: Tile) -> None:
     patch = match_patch(*readers, tile.core, grid.region, image, config, statistics)
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with timed(seconds, "write"):
-        job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds})
+        files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
+    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
 
 def _checked_statistics(job: Job) -> PairStatistics | None:
     """Mean and standard deviation of the images, where MC-CNN needs them; its weights are those of the run."""
     cost, normalization = job.config.cost, job.store.normalization()
-    if not isinstance(cost, Mccnn) or normalization is None:
+    if not isinstance(cost, Mccnn):
         return None
+    if normalization is None:
+        raise RunError(f"what was measured of the images is lost in {job.store.folder}: run the same command again")
     here, wanted = weights_identity(cost), job.inputs["weights"]
     for key in ("sha256", "onnxruntime"):
         if here[key] != wanted[key]:

@@ -1,5 +1,6 @@
 """Places where a run leaves small texts and arrays: folders of this machine, prefixes of any fsspec file system."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Protocol
 
@@ -10,19 +11,22 @@ __all__ = ["Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
 
 
 class Folder(Protocol):
-    """What a store needs of the place where it lies; names are relative to it, with ``/`` between their parts."""
+    """What a store needs of the place where it lies; names are relative to it, with ``/`` between their parts.
+
+    Bytes that are no UTF-8 are read as U+FFFD, so that a damaged text fails its checksum and nothing else.
+    """
 
     def read(self, name: str) -> str | None:
         """Text of a file, None where there is none."""
 
+    def read_bytes(self, name: str) -> bytes | None:
+        """Content of a file, None where there is none."""
+
     def read_all(self, folder: str) -> dict[str, str]:
         """Texts of the JSON files in a folder, by name without ending."""
 
-    def names(self, folder: str) -> set[str]:
-        """Names, without ending, of the JSON files in a folder."""
-
-    def files(self, folder: str) -> set[str]:
-        """Names of all files in a folder and in those below it, relative to it."""
+    def sizes(self) -> dict[str, int]:
+        """Bytes of all files in it and in the folders below it, by name."""
 
     def write(self, name: str, text: str) -> None:
         """Write a file that is either there as a whole or not at all."""
@@ -31,7 +35,10 @@ class Folder(Protocol):
         """Write a file as a whole unless it is there; whether it was written."""
 
     def delete(self, name: str) -> None:
-        """Delete a file, or a folder with all that is in it, if it is there."""
+        """Delete a file, if it is there."""
+
+    def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
+        """Delete many files, and folders where no file is in them then."""
 
     def delete_if_empty(self) -> None:
         """Delete this folder, where nothing is in it."""

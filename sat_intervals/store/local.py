@@ -5,7 +5,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,26 +30,29 @@ class LocalFolder:
 
     def read(self, name: str) -> str | None:
         """See `Folder`."""
+        content = self.read_bytes(name)
+        return None if content is None else content.decode(errors="replace")
+
+    def read_bytes(self, name: str) -> bytes | None:
+        """See `Folder`."""
         try:
-            return (self.path / name).read_text()
+            return (self.path / name).read_bytes()
         except FileNotFoundError:
             return None
 
     def read_all(self, folder: str) -> dict[str, str]:
         """See `Folder`."""
-        return {file.stem: file.read_text() for file in self._files(folder)}
+        files = (self.path / folder).glob("[!.]*.json")
+        return {file.stem: file.read_text(errors="replace") for file in files if file.is_file()}
 
-    def names(self, folder: str) -> set[str]:
+    def sizes(self) -> dict[str, int]:
         """See `Folder`."""
-        return {file.stem for file in self._files(folder)}
-
-    def _files(self, folder: str) -> Iterator[Path]:
-        return (self.path / folder).glob("[!.]*.json")
-
-    def files(self, folder: str) -> set[str]:
-        """See `Folder`."""
-        root = self.path / folder
-        return {os.path.relpath(Path(place, name), root) for place, _, names in os.walk(root) for name in names}
+        found = {}
+        for place, _, names in os.walk(self.path):
+            for name in names:
+                with suppress(FileNotFoundError):  # others may be at work here
+                    found[os.path.relpath(f"{place}/{name}", self.path)] = os.lstat(f"{place}/{name}").st_size
+        return found
 
     def write(self, name: str, text: str) -> None:
         """See `Folder`."""
@@ -84,10 +87,15 @@ class LocalFolder:
 
     def delete(self, name: str) -> None:
         """See `Folder`."""
-        if (self.path / name).is_dir():
-            shutil.rmtree(self.path / name, ignore_errors=True)
-        else:
-            (self.path / name).unlink(missing_ok=True)
+        (self.path / name).unlink(missing_ok=True)
+
+    def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
+        """See `Folder`."""
+        for name in names:
+            self.delete(name)
+        for folder in folders:
+            for place, _, _ in os.walk(self.path / folder, topdown=False):
+                LocalFolder(Path(place)).delete_if_empty()
 
     def delete_if_empty(self) -> None:
         """See `Folder`."""

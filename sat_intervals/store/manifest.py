@@ -2,21 +2,64 @@
 
 import hashlib
 import json
+import zlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.folder import Folder
+from sat_intervals.tiling import Grid, Window
 
 MANIFEST = "manifest.json"
+# The key of the checksum of all others.
+_SEAL = "crc32"
 
 
 class StoreError(SatIntervalsError):
     """A store that belongs to another run, or cannot be written."""
 
 
+def sealed(content: Mapping[str, Any]) -> str:
+    """JSON of an object with its own checksum, so that no damage passes for content, see `unsealed`."""
+    return json.dumps({**content, _SEAL: _checksum(content)}, indent=1)
+
+
+def unsealed(text: str | None) -> dict[str, Any] | None:
+    """What `sealed` made a text of; None for any other text, and for none."""
+    try:
+        content = json.loads(text or "")
+    except (ValueError, RecursionError):
+        return None
+    is_whole = isinstance(content, dict) and content.pop(_SEAL, None) == _checksum(content)
+    return content if is_whole else None
+
+
+def _checksum(content: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(content).encode())
+
+
 def parsed(manifest: str, folder: Folder) -> dict[str, Any]:
-    """The manifest in a folder.
+    """The manifest in a folder; one without a checksum is that of another version.
+
+    Raises
+    ------
+    StoreError
+        For what is none, or damaged.
+    """
+    try:
+        there = json.loads(manifest)
+        if not isinstance(there, dict):
+            raise ValueError("it is no object")
+        if _SEAL in there and unsealed(manifest) is None:
+            raise ValueError("it is damaged")
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{folder}/{MANIFEST} cannot be read, {error}: --overwrite starts afresh") from error
+    there.pop(_SEAL, None)
+    return there
+
+
+def grid_of(manifest: Mapping[str, Any], folder: Folder) -> Grid:
+    """The tiles of a manifest.
 
     Raises
     ------
@@ -24,9 +67,9 @@ def parsed(manifest: str, folder: Folder) -> dict[str, Any]:
         For what is none.
     """
     try:
-        return dict(json.loads(manifest))
-    except (ValueError, TypeError) as error:
-        raise StoreError(f"{folder}/{MANIFEST} cannot be read, {error}: --overwrite starts afresh") from error
+        return Grid(Window(**manifest["region"]), int(manifest["settings"]["tiles"]["size"]))
+    except (LookupError, TypeError, ValueError) as error:
+        raise StoreError(f"{folder}/{MANIFEST} is no manifest of a run: --overwrite starts afresh") from error
 
 
 def check_same(there: str, folder: Folder, manifest: Mapping[str, Any]) -> None:

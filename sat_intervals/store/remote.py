@@ -5,7 +5,7 @@ from its own environment variables and files (``AWS_ENDPOINT_URL``, ``~/.aws``) 
 """
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -37,35 +37,34 @@ class RemoteFolder:
 
     def read(self, name: str) -> str | None:
         """See `Folder`."""
+        content = self.read_bytes(name)
+        return None if content is None else content.decode(errors="replace")
+
+    def read_bytes(self, name: str) -> bytes | None:
+        """See `Folder`."""
         try:
             with self._reached(name) as (system, path):
-                return str(system.cat_file(path).decode())
+                return bytes(system.cat_file(path))
         except FileNotFoundError:
             return None
 
     def read_all(self, folder: str) -> dict[str, str]:
         """See `Folder`."""
-        paths = self._files(folder)
-        with self._reached(folder) as (system, _):
-            texts = system.cat(paths) if paths else {}
-        return {PurePosixPath(path).stem: text.decode() for path, text in texts.items()}
-
-    def names(self, folder: str) -> set[str]:
-        """See `Folder`."""
-        return {PurePosixPath(path).stem for path in self._files(folder)}
-
-    def _files(self, folder: str) -> list[str]:
         with suppress(FileNotFoundError), self._reached(folder) as (system, path):
             system.invalidate_cache(path)
-            return [file for file in system.ls(path, detail=False) if file.endswith(".json")]
-        return []
+            paths = [file for file in system.ls(path, detail=False) if file.endswith(".json")]
+            texts = system.cat(paths, on_error="omit") if paths else {}
+            return {PurePosixPath(path).stem: text.decode(errors="replace") for path, text in texts.items()}
+        return {}
 
-    def files(self, folder: str) -> set[str]:
+    def sizes(self) -> dict[str, int]:
         """See `Folder`."""
-        with suppress(FileNotFoundError), self._reached(folder) as (system, path):
-            system.invalidate_cache(path)
-            return {str(PurePosixPath(file).relative_to(path)) for file in system.find(path)}
-        return set()
+        with suppress(FileNotFoundError), self._reached("") as (system, path):
+            root = path.rstrip("/")
+            system.invalidate_cache(root)
+            found = system.find(root, detail=True)
+            return {str(PurePosixPath(file).relative_to(root)): about["size"] for file, about in found.items()}
+        return {}
 
     def write(self, name: str, text: str) -> None:
         """See `Folder`."""
@@ -85,7 +84,18 @@ class RemoteFolder:
         """See `Folder`."""
         with suppress(FileNotFoundError), self._reached(name) as (system, path):
             system.invalidate_cache(path)
-            system.rm(path, recursive=True)
+            system.rm(path)
+
+    def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
+        """See `Folder`."""
+        with suppress(FileNotFoundError), self._reached("") as (system, path):
+            system.invalidate_cache(path.rstrip("/"))
+            if names:
+                system.rm([path + name for name in names])
+        for folder in folders:
+            with suppress(FileNotFoundError), self._reached(folder) as (system, path):
+                if not system.find(path):  # a bucket has no folders, other services do
+                    system.rm(path, recursive=True)
 
     def delete_if_empty(self) -> None:
         """See `Folder`; a bucket stays."""

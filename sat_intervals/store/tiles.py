@@ -1,9 +1,10 @@
 """What tiles leave behind until the run is finished: arrays, records, a manifest.
 
-A tile's arrays lie in files of its own, written by whoever computed the tile, and its record comes last: a tile is done
-when its record and its files are there. Writing a tile again writes the same bytes. The manifest holds everything that
-decides the bytes; a store with another manifest is never mixed in. Runs with the same manifest may share a store that
-lies elsewhere than in the folder of one of them: they write the same bytes.
+A tile's arrays lie in files of its own, written by whoever computed the tile. Its record comes last and holds sizes and
+checksums of these files: a tile is done when its record is whole and its files have their sizes. Checksums are compared
+where files are read, and a tile with a damaged file is no longer done. Writing a tile again writes the same bytes. The
+manifest holds everything that decides the bytes; a store with another manifest is never mixed in. Runs with the same
+manifest may share a store that lies elsewhere than in the folder of one of them: they write the same bytes.
 """
 
 import errno
@@ -19,19 +20,27 @@ import numpy as np
 
 from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
-from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, parsed
-from sat_intervals.store.zarr_arrays import DamagedTilesError, TileArrays
-from sat_intervals.tiling import Grid, Tile, Window
+from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
+from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_free, drop
+from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
+from sat_intervals.tiling import Grid, Tile
+
+Records = Mapping[str, Mapping[str, Any]]
+"""Records of tiles, by name."""
 
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
-LAYOUT = 4
+LAYOUT = 5
 
-_ARRAYS, _RECORDS, _FAILURES = "arrays.zarr", "records", "failures"
-_NORMALIZATION = "normalization.json"
 # In the folder of the run where its tiles lie elsewhere: it says where.
 _PLACE = "store.json"
 # In the folder of the run from the beginning of one that replaces another to its end.
 _REPLACING = "replacing"
+# In the folder of the run from when its files get their names until its tiles are removed: which run that is.
+_FINISHED = "finished"
+
+
+class DamagedTilesError(RunError):
+    """Tiles that are not what was written; they are no longer done."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,7 @@ class Store:
 
     @property
     def _arrays(self) -> TileArrays:
-        return TileArrays(self.folder.inside(_ARRAYS), self.grid, self.count, self.ambiguities)
+        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities)
 
     def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
         """Create the store, or go on with the one that is there; to be called while ``home`` is locked.
@@ -83,9 +92,11 @@ class Store:
             When the store that is there was begun with other settings, inputs or versions, or lies in another place, or
             cannot be used.
         """
-        home, folder, before = folder_at(self.home), self.folder, _place(self.home)
+        home, folder = folder_at(self.home), self.folder
         try:
-            text = None if overwrite else before.read(MANIFEST)
+            before = self._before(overwrite)
+            check_free(folder)
+            text = None if overwrite else before.read(MANIFEST) or None
             if text is not None:
                 check_same(text, before, manifest)
                 if before != folder:
@@ -96,12 +107,15 @@ class Store:
             folder.make("")  # so that what cannot be used is told before anything is dropped
             if overwrite:
                 with suppress(OSError):  # what cannot be reached stays
-                    _drop(before)
+                    drop(before)
             if overwrite or (text is None and not self.elsewhere):
-                _drop(folder)
-            for name in ("", _RECORDS, _FAILURES):
+                drop(folder)
+            if folder.read(MANIFEST) == "":  # as a power loss leaves it
+                folder.delete(MANIFEST)
+            for name in ("", RECORDS, FAILURES):
                 folder.make(name)
             home.make("")
+            home.delete(_FINISHED)
             if overwrite:
                 home.write(_REPLACING, "")
             if self.elsewhere:
@@ -109,13 +123,22 @@ class Store:
             else:
                 home.delete(_PLACE)
             self._arrays.create()
-            if not folder.create(MANIFEST, json.dumps(manifest, indent=1)):
+            if not folder.create(MANIFEST, sealed(manifest)):
                 self.check(manifest)
         except OSError as error:
             raise StoreError(
                 f"{folder} cannot be used: {error.strerror or error}: check the path or URL, the credentials, and that "
                 "the package of its file system is installed (sat-intervals[remote] for s3://)"
             ) from error
+
+    def _before(self, overwrite: bool) -> Folder:
+        """Where the tiles lie that are there; where that cannot be read, this run says it anew."""
+        try:
+            return _place(self.home)
+        except StoreError:
+            if overwrite or self.elsewhere:
+                return self.folder
+            raise
 
     def check(self, manifest: Mapping[str, Any]) -> None:
         """Hold that the store is that of a run still: others may have removed it, or begun another in its place.
@@ -146,45 +169,44 @@ class Store:
             raise
 
     def done(self) -> set[str]:
-        """Names of the tiles that are complete: their record is there, and all that was written before it still is."""
-        records, arrays = self.folder.names(_RECORDS), self._arrays
-        there = arrays.files()
-        return {tile.name for tile in self.grid if tile.name in records and arrays.files_of(tile) <= there}
+        """Names of the tiles that are complete, see `records`."""
+        return set(self.records())
 
-    def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> None:
+    def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> Checksums:
         """Write what a tile leaves behind, see `TileArrays.write`, into the store of a manifest and no other."""
         self.check(manifest)
         try:
-            self._arrays.write(tile, arrays)
+            checksums = self._arrays.write(tile, arrays)
             self.check(manifest)
         except Exception:
             if self.folder.read(MANIFEST) is None:  # it was removed meanwhile, and what came later would stay for ever
-                _drop(self.folder)
+                self.folder.delete_all([f"{ARRAYS}/{name}" for name in self._arrays.files_of(tile)], [ARRAYS])
+                self.folder.delete_if_empty()
             raise
+        return checksums
 
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
-        """Write what the run wants to know of a tile, as JSON; from now on the tile is done."""
-        self.folder.write(f"{_RECORDS}/{tile.name}.json", json.dumps(record))
+        """Write what the run wants to know of a tile, and ``files``, its checksums; from now on the tile is done."""
+        self.folder.write(f"{RECORDS}/{tile.name}.json", sealed(record))
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Keep what was measured of the whole images, so that all tiles of the run agree on it, whenever matched."""
-        self.folder.write(_NORMALIZATION, json.dumps(normalization))
+        self.folder.write(NORMALIZATION, sealed(normalization))
 
     def normalization(self) -> dict[str, Any] | None:
-        """What `write_normalization` kept; None where nothing was measured."""
-        kept = self.folder.read(_NORMALIZATION)
-        return None if kept is None else dict(json.loads(kept))
+        """What `write_normalization` kept; None where nothing was measured, or that is damaged."""
+        return unsealed(self.folder.read(NORMALIZATION))
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
         with suppress(OSError):  # a full disk is reason enough for a tile to fail, but not for the run to end at once
             if self.folder.read(MANIFEST) is not None:  # else a bucket would keep it for ever
-                self.folder.write(f"{_FAILURES}/{tile}.json", json.dumps(reason))
+                self.folder.write(f"{FAILURES}/{tile}.json", json.dumps(reason))
 
     def failures(self) -> dict[str, str]:
         """Why tiles failed that are not done since, by name."""
-        reasons, done = self.folder.read_all(_FAILURES), self.done()
-        return {name: json.loads(reasons[name]) for name in sorted(reasons) if name not in done}
+        reasons, done = self.folder.read_all(FAILURES), self.done()
+        return {name: _reason(reasons[name]) for name in sorted(reasons) if name not in done}
 
     def check_space(self, tile: Tile) -> None:
         """Raise an OSError where the disk has no room for what a tile leaves behind, before work is put in."""
@@ -194,41 +216,53 @@ class Store:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
 
     def records(self) -> dict[str, dict[str, Any]]:
-        """The records of the tiles that are done, by name; those that a power loss left unreadable are deleted."""
-        texts, found = self.folder.read_all(_RECORDS), {}
+        """The records of the tiles that are done, by name: whole ones, whose files are there in their sizes."""
+        texts, sizes = self.folder.read_all(RECORDS), self._arrays.folder.sizes()
+        found = {}
         for tile in self.grid:
-            try:
-                if tile.name in texts:
-                    found[tile.name] = dict(json.loads(texts[tile.name]))
-            except (ValueError, TypeError):
-                self.folder.delete(f"{_RECORDS}/{tile.name}.json")
+            record = unsealed(texts.get(tile.name))
+            files = record.get("files", {}) if record else {}
+            is_whole = files.keys() == self._arrays.files_of(tile)
+            if record and is_whole and all(sizes.get(name) == size for name, (size, _) in files.items()):
+                found[tile.name] = record
         return found
 
-    def histogram(self) -> np.ndarray:
-        """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``."""
-        return self._arrays.histogram()
+    def histogram(self, records: Records) -> np.ndarray:
+        """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``; errors as of `strips`."""
+        with self._sound():
+            return self._arrays.histogram(_checksums(records))
 
-    def seams(self) -> np.ndarray:
-        """The lines along the tiles' borders, see `TileArrays.seams`."""
-        return self._arrays.seams()
+    def seams(self, records: Records) -> np.ndarray:
+        """The lines along the tiles' borders, see `TileArrays.seams`; errors as of `strips`."""
+        with self._sound():
+            return self._arrays.seams(_checksums(records))
 
-    def strips(self, rows: int) -> Iterator[dict[str, np.ndarray]]:
+    def strips(self, rows: int, records: Records) -> Iterator[dict[str, np.ndarray]]:
         """Raw products of the region in full-width strips of about ``rows`` rows, from the top.
 
         Raises
         ------
-        RunError
-            Of tiles whose files cannot be read; they are no longer done.
+        DamagedTilesError
+            Of tiles whose files are not what was written.
         """
+        with self._sound():
+            yield from self._arrays.strips(rows, _checksums(records))
+
+    @contextmanager
+    def _sound(self) -> Iterator[None]:
+        """Where a block meets a damaged file, look for all damaged tiles, so that they are matched again in one go."""
         try:
-            yield from self._arrays.strips(rows)
-        except DamagedTilesError as error:
-            for tile in error.tiles:
-                self.folder.delete(f"{_RECORDS}/{tile.name}.json")
-                self._arrays.drop(tile)
-            names = ", ".join(tile.name for tile in error.tiles)
-            raise RunError(
-                f"tiles {names} in {self.folder} cannot be read, {error}: the same command matches them again"
+            yield
+        except DamagedFileError as error:
+            records, damaged = self.records(), []
+            for tile in self.grid:
+                if tile.name not in records or not self._arrays.are_sound(records[tile.name]["files"]):
+                    self.folder.delete(f"{RECORDS}/{tile.name}.json")
+                    self._arrays.drop(tile)
+                    damaged.append(tile.name)
+            names = ", ".join(damaged) or f"of {error}"
+            raise DamagedTilesError(
+                f"tiles {names} in {self.folder} are damaged: the same command matches them again"
             ) from error
 
     def remove(self) -> None:
@@ -238,9 +272,19 @@ class Store:
 
 def remove_tiles(home: Path) -> None:
     """Delete the tiles of the run to whose folder ``home`` belongs, wherever they lie."""
-    _drop(_place(home))
-    for name in (_PLACE, _REPLACING):
+    drop(_place(home))
+    for name in (_PLACE, _REPLACING, _FINISHED):
         folder_at(home).delete(name)
+
+
+def mark_finished(home: Path, run: str) -> None:
+    """Note which run is about to give its files their names, after which its tiles are to be removed."""
+    folder_at(home).write(_FINISHED, run)
+
+
+def finished_run(home: Path) -> str | None:
+    """What `mark_finished` noted, where the tiles have not been removed since."""
+    return folder_at(home).read(_FINISHED)
 
 
 def mark_replaced(home: Path) -> None:
@@ -256,15 +300,41 @@ def is_replacing(home: Path) -> bool:
 def inputs_before(home: Path) -> dict[str, Any]:
     """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
     try:
-        return dict(json.loads(_place(home).read(MANIFEST) or "{}").get("inputs", {}))
-    except (OSError, AttributeError, TypeError, ValueError):
+        return dict((unsealed(_place(home).read(MANIFEST)) or {}).get("inputs", {}))
+    except (OSError, TypeError, ValueError):
         return {}
 
 
 def _place(home: Path) -> Folder:
-    """Where the tiles lie of the run to whose folder ``home`` belongs."""
+    """Where the tiles lie of the run to whose folder ``home`` belongs.
+
+    Raises
+    ------
+    StoreError
+        When that cannot be read.
+    """
     noted = folder_at(home).read(_PLACE)
-    return folder_at(json.loads(noted) if noted else home)
+    if noted is None:
+        return folder_at(home)
+    try:
+        place = json.loads(noted)
+        if isinstance(place, str):
+            return folder_at(place)
+    except (ValueError, RecursionError):
+        pass
+    raise StoreError(f"{home / _PLACE} cannot be read: give the --store of before to go on, or --overwrite")
+
+
+def _checksums(records: Records) -> Checksums:
+    """Those of the files of all tiles."""
+    return {name: file for record in records.values() for name, file in record["files"].items()}
+
+
+def _reason(text: str) -> str:
+    try:
+        return str(json.loads(text))
+    except (ValueError, RecursionError):
+        return "its reason cannot be read"
 
 
 def store_of(home: Path) -> Store:
@@ -279,17 +349,4 @@ def store_of(home: Path) -> Store:
     text = folder.read(MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")
-    manifest = parsed(text, folder)
-    try:
-        grid = Grid(Window(**manifest["region"]), manifest["settings"]["tiles"]["size"])
-    except (LookupError, TypeError) as error:
-        raise StoreError(f"{folder}/{MANIFEST} is no manifest of a run: --overwrite starts afresh") from error
-    return Store(home, grid, 1, 0, str(folder))
-
-
-def _drop(folder: Folder) -> None:
-    """Delete the tiles in a folder, and the folder where nothing else is in it."""
-    # The manifest first: without it nothing of the rest counts.
-    for name in (MANIFEST, _ARRAYS, _RECORDS, _FAILURES, _NORMALIZATION):
-        folder.delete(name)
-    folder.delete_if_empty()
+    return Store(home, grid_of(parsed(text, folder), folder), 1, 0, str(folder))

@@ -1,16 +1,21 @@
 """The arrays of the tiles of a run, in files that each tile writes for itself. The only home of zarr."""
 
+import asyncio
 import math
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import zarr
+from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store
 from zarr.codecs import BloscCodec
-from zarr.errors import ContainsArrayError
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import FsspecStore, LocalStore, MemoryStore, StorePath, WrapperStore
 
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.store.folder import Folder
@@ -31,17 +36,16 @@ SEAM_PRODUCTS = ("winner", "lower", "upper")
 
 # Rows of a shard that are compressed together, so that strips read no more than they need.
 _ROWS_TOGETHER = 128
-# What zarr and its codecs raise of files that were cut short or changed.
-_DAMAGED = ValueError, RuntimeError
+# An attribute of the group, so that a folder is known for a run's where its manifest is lost.
+MADE_BY = {"made_by": "sat-intervals"}
 _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 
+Checksums = Mapping[str, Sequence[int]]
+"""Bytes and CRC-32 of files, by name."""
 
-class DamagedTilesError(Exception):
-    """Tiles whose files cannot be read."""
 
-    def __init__(self, tiles: Sequence[Tile], reason: str) -> None:
-        super().__init__(reason)
-        self.tiles = tuple(tiles)
+class DamagedFileError(Exception):
+    """A file that is gone, or not what was written."""
 
 
 @dataclass(frozen=True)
@@ -67,33 +71,26 @@ class TileArrays:
 
     @property
     def _reach(self) -> int:
-        """Columns of the right view that a core sees."""
-        return self.grid.size + self.count - 1
+        return _reach(self.grid, self.count)
 
     def create(self) -> None:
-        """Make those that are not there, empty; of several that do so at once, each makes the same."""
-        size, height = self.grid.size, self.grid.rows * self.grid.size
-        width = self.grid.columns * size
-        together = math.gcd(size, _ROWS_TOGETHER)
-        group = zarr.open_group(self.folder.place(""), mode="a", zarr_format=3)
-        for dtype, planes in _PLANES.items():
-            count = len(planes)
-            _create(group, dtype, (count, height, width), (count, size, size), (count, together, size), dtype)
-        right = height, self.grid.columns * self._reach
-        _create(group, _RIGHT, right, (size, self._reach), (together, self._reach), np.uint32, _UNSEEN)
-        lines = len(SIDES), 2, len(SEAM_PRODUCTS), size
-        tiles, counts = (self.grid.rows, self.grid.columns), self.ambiguities + 1
-        _create(group, "seams", (*tiles, *lines), None, (1, 1, *lines), np.int16, NO_DISPARITY)
-        _create(group, "histogram", (*tiles, counts), None, (1, 1, counts), np.uint32)
+        """Write what describes the arrays, where that is not there or damaged; every run writes the same."""
+        texts, _ = _descriptions(self.grid, self.count, self.ambiguities)
+        for name, text in texts.items():
+            if self.folder.read(name) != text:
+                self.folder.make(name.rpartition("/")[0])
+                self.folder.write(name, text)
 
-    def _array(self, name: str, mode: Literal["r", "r+"] = "r") -> zarr.Array[Any]:
+    def _array(self, name: str, store: Store) -> zarr.Array[Any]:
+        """An array in a store; that it is described there too is for other tools."""
+        _, metadata = _descriptions(self.grid, self.count, self.ambiguities)
+        array = zarr.Array(zarr.AsyncArray(metadata[name], StorePath(store, name)))
         # Blocks that hold nothing but fill values are written too: files that are missing tell of tiles that are.
-        array = zarr.open_array(self.folder.place(name), mode=mode, zarr_format=3)
         return array.with_config({"write_empty_chunks": True})
 
-    def files(self) -> set[str]:
-        """Names of all files."""
-        return self.folder.files("")
+    def _store(self) -> Store:
+        place = self.folder.place("")
+        return LocalStore(place) if isinstance(place, Path) else FsspecStore.from_url(place)
 
     def files_of(self, tile: Tile) -> set[str]:
         """The files that hold what a tile leaves behind."""
@@ -108,8 +105,8 @@ class TileArrays:
         pixel = sum(np.dtype(dtype).itemsize for planes in _PLANES.values() for dtype in planes.values())
         return tile.core.height * (tile.core.width * pixel + self._reach * np.dtype(np.uint32).itemsize)
 
-    def write(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write what a tile leaves behind.
+    def write(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> Checksums:
+        """Write what a tile leaves behind; returns the checksums of its files.
 
         Parameters
         ----------
@@ -120,79 +117,69 @@ class TileArrays:
             ``right_cost`` and ``right_winner``, which may be missing; ``seams`` (SIDES, own line or ring,
             SEAM_PRODUCTS, size); ``histogram``.
         """
-        try:
-            self._write(tile, arrays)
-        except _DAMAGED:  # zarr reads what is there before it writes over it
-            self.drop(tile)
-            self._write(tile, arrays)
-
-    def _write(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> None:
         size, row, column = self.grid.size, tile.grid_row, tile.grid_column
         height, width = arrays["winner"].shape
         rows = slice(row * size, row * size + height)
+        store = _WrittenStore(self._store())
         for dtype, planes in _PLANES.items():
             made = np.stack([arrays[name].view(dtype) for name in planes])
-            self._array(dtype, "r+")[:, rows, column * size : column * size + width] = made
+            self._array(dtype, store)[:, rows, column * size : column * size + width] = made
         rank = np.full((height, self._reach), _UNSEEN)
         if "right_cost" in arrays:
             rank[:, : arrays["right_cost"].shape[1]] = _rank(arrays["right_cost"], arrays["right_winner"])
-        self._array(_RIGHT, "r+")[rows, column * self._reach : (column + 1) * self._reach] = rank
+        self._array(_RIGHT, store)[rows, column * self._reach : (column + 1) * self._reach] = rank
         for name in ("seams", "histogram"):
-            self._array(name, "r+")[row, column] = arrays[name]
+            self._array(name, store)[row, column] = arrays[name]
+        return store.checksums
 
     def drop(self, tile: Tile) -> None:
         """Delete what a tile left behind."""
-        for name in self.files_of(tile):
-            self.folder.delete(name)
+        self.folder.delete_all(self.files_of(tile))
 
-    def histogram(self) -> np.ndarray:
-        """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``."""
-        stored = self._array("histogram")
+    def are_sound(self, checksums: Checksums) -> bool:
+        """Whether files are what was written."""
+        return all(checksum(self.folder.read_bytes(name) or b"") == list(file) for name, file in checksums.items())
+
+    def histogram(self, checksums: Checksums) -> np.ndarray:
+        """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``; files and errors as of `strips`."""
+        stored = self._array("histogram", _CheckedStore(self._store(), checksums))
         rows = (np.asarray(stored[row]).sum(axis=0, dtype=np.int64) for row in range(self.grid.rows))
         return sum(rows, np.zeros(self.ambiguities + 1, np.int64))
 
-    def seams(self) -> np.ndarray:
-        """The lines along the tiles' borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size)."""
-        return np.asarray(self._array("seams")[:])
+    def seams(self, checksums: Checksums) -> np.ndarray:
+        """The lines along the tiles' borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size).
 
-    def strips(self, rows: int) -> Iterator[dict[str, np.ndarray]]:
+        Files and errors as of `strips`.
+        """
+        return np.asarray(self._array("seams", _CheckedStore(self._store(), checksums))[:])
+
+    def strips(self, rows: int, checksums: Checksums) -> Iterator[dict[str, np.ndarray]]:
         """Raw products of the region in full-width strips of about ``rows`` rows, from the top.
 
         The shares of the right view are merged: smallest cost, the largest disparity at ties.
 
+        Parameters
+        ----------
+        rows
+            Wanted height; a multiple of what is compressed together is taken.
+        checksums
+            Of the files of all tiles. A file is checked as a whole where it is first read.
+
         Raises
         ------
-        DamagedTilesError
-            Those that cannot be read.
+        DamagedFileError
+            Of the first file that is not what was written.
         """
         step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
+        store = _CheckedStore(self._store(), checksums)
+        stored = {name: self._array(name, store) for name in (*_PLANES, _RIGHT)}
         for first in range(0, self.grid.region.height, step):
-            last = min(first + step, self.grid.region.height)
-            try:
-                strip, right = self._read(slice(first, last), slice(None, self.grid.region.width), slice(None))
-            except _DAMAGED as error:
-                raise DamagedTilesError(list(self._damaged(first, last)), " ".join(str(error).split())) from error
-            yield strip | {"right_winner": self._merged(right)}
-
-    def _read(self, rows: slice, columns: slice, right_columns: slice) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Raw products of some pixels by name, and ranks of right ones."""
-        strip: dict[str, np.ndarray] = {}
-        for dtype, planes in _PLANES.items():
-            read = np.asarray(self._array(dtype)[:, rows, columns])
-            strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
-        return strip, np.asarray(self._array(_RIGHT)[rows, right_columns])
-
-    def _damaged(self, first: int, last: int) -> Iterator[Tile]:
-        """The tiles of some rows that cannot be read."""
-        size = self.grid.size
-        for tile in self.grid:
-            row, column = tile.grid_row * size, tile.grid_column * size
-            share = slice(tile.grid_column * self._reach, (tile.grid_column + 1) * self._reach)
-            if row < last and first < row + size:
-                try:
-                    self._read(slice(row, row + tile.core.height), slice(column, column + tile.core.width), share)
-                except _DAMAGED:
-                    yield tile
+            here = slice(first, min(first + step, self.grid.region.height))
+            strip: dict[str, np.ndarray] = {}
+            for dtype, planes in _PLANES.items():
+                read = np.asarray(stored[dtype][:, here, : self.grid.region.width])
+                strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
+            yield strip | {"right_winner": self._merged(np.asarray(stored[_RIGHT][here]))}
 
     def _merged(self, ranks: np.ndarray) -> np.ndarray:
         """One right view ``(rows, width + count - 1)`` from the shares of all cores of the rows."""
@@ -204,19 +191,92 @@ class TileArrays:
         return _winner(best)
 
 
-def _create(
-    group: zarr.Group,
-    name: str,
-    shape: tuple[int, ...],
-    shard: tuple[int, ...] | None,
-    chunk: tuple[int, ...],
-    dtype: npt.DTypeLike,
-    fill: Any = 0,
-) -> None:
-    with suppress(ContainsArrayError):
-        group.create_array(
+@lru_cache(maxsize=16)
+def _descriptions(grid: Grid, count: int, ambiguities: int) -> tuple[dict[str, str], dict[str, Any]]:
+    """What describes the arrays: texts by name of their file, the group's first, and metadata by name of the array."""
+    texts: dict[str, Any] = {}
+    group = zarr.create_group(MemoryStore(texts), zarr_format=3, attributes=MADE_BY)
+    metadata: dict[str, Any] = {}
+
+    def describe(
+        name: str,
+        shape: tuple[int, ...],
+        shard: tuple[int, ...] | None,
+        chunk: tuple[int, ...],
+        dtype: npt.DTypeLike,
+        fill: Any = 0,
+    ) -> None:
+        metadata[name] = group.create_array(
             name, shape=shape, shards=shard, chunks=chunk, dtype=dtype, compressors=_COMPRESSOR, fill_value=fill
-        )  # fmt: skip
+        ).metadata
+
+    size, height, width = grid.size, grid.rows * grid.size, grid.columns * grid.size
+    together, reach = math.gcd(size, _ROWS_TOGETHER), _reach(grid, count)
+    for dtype, planes in _PLANES.items():
+        planes_together = len(planes)
+        describe(
+            dtype,
+            (planes_together, height, width),
+            (planes_together, size, size),
+            (planes_together, together, size),
+            dtype,
+        )
+    describe(_RIGHT, (height, grid.columns * reach), (size, reach), (together, reach), np.uint32, _UNSEEN)
+    lines, counts = (len(SIDES), 2, len(SEAM_PRODUCTS), size), ambiguities + 1
+    describe("seams", (grid.rows, grid.columns, *lines), None, (1, 1, *lines), np.int16, NO_DISPARITY)
+    describe("histogram", (grid.rows, grid.columns, counts), None, (1, 1, counts), np.uint32)
+    return {name: text.to_bytes().decode() for name, text in texts.items()}, metadata
+
+
+def _reach(grid: Grid, count: int) -> int:
+    """Columns of the right view that a core sees."""
+    return grid.size + count - 1
+
+
+def checksum(content: bytes | memoryview) -> list[int]:
+    """Bytes and CRC-32 of a file."""
+    return [len(content), zlib.crc32(content)]
+
+
+class _WrittenStore(WrapperStore[Store]):
+    """A store that keeps the checksums of what is written, and shows nothing of what was there before.
+
+    zarr would merge what it finds of a file, and a damaged one, into what it writes.
+    """
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store)
+        self.checksums: dict[str, list[int]] = {}
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        return None
+
+    async def set(self, key: str, value: Buffer) -> None:
+        self.checksums[key] = await asyncio.to_thread(checksum, value.to_bytes())
+        await self._store.set(key, value)
+
+
+class _CheckedStore(WrapperStore[Store]):
+    """A store that reads a file as a whole at first and compares its checksum."""
+
+    def __init__(self, store: Store, checksums: Checksums) -> None:
+        super().__init__(store)
+        self._checksums = checksums
+        self._sound: set[str] = set()
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        if key in self._sound:
+            return await self._store.get(key, prototype, byte_range)
+        whole = await self._store.get(key, prototype)
+        content = b"" if whole is None else whole.to_bytes()
+        if whole is None or await asyncio.to_thread(checksum, content) != list(self._checksums.get(key, ())):
+            raise DamagedFileError(key)
+        self._sound.add(key)
+        if isinstance(byte_range, RangeByteRequest):
+            return whole[byte_range.start : byte_range.end]
+        if isinstance(byte_range, OffsetByteRequest):
+            return whole[byte_range.offset :]
+        return whole if byte_range is None else whole[-byte_range.suffix :]
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
