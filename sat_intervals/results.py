@@ -284,7 +284,7 @@ def _opened(told: dict[str, Any]) -> Image:
             f"{told['height']} x {told['width']}: put that image back or match again"
         )
     for file in (told, *told.get("files", ()), *([mask] if mask else [])):
-        if is_changed(file):
+        if is_changed(file["path"], file):
             raise SatIntervalsError(
                 f"{file['path']} is not the file that was matched: put that image back or match again"
             )

@@ -8,6 +8,7 @@ lies elsewhere than in the folder of one of them: they write the same bytes.
 
 import errno
 import json
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -20,6 +21,7 @@ import numpy as np
 from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, parsed
+from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.zarr_arrays import DamagedTilesError, TileArrays
 from sat_intervals.tiling import Grid, Tile, Window
 
@@ -28,10 +30,10 @@ LAYOUT = 4
 
 _ARRAYS, _RECORDS, _FAILURES = "arrays.zarr", "records", "failures"
 _NORMALIZATION = "normalization.json"
-# In the folder of the run where its tiles lie elsewhere: it says where.
-_PLACE = "store.json"
 # In the folder of the run from the beginning of one that replaces another to its end.
 _REPLACING = "replacing"
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Store:
     ambiguities
         Largest ambiguity a pixel can have.
     elsewhere
-        Folder or fsspec URL where the tiles lie; by default ``home``.
+        Folder, in the store that the user names, where the tiles lie; by default ``home``.
     """
 
     home: Path
@@ -75,7 +77,8 @@ class Store:
         manifest
             All that decides the bytes of a tile; ``region`` and ``settings`` tell the tiles.
         overwrite
-            Whether what is there is dropped, wherever it lies, and the files of a run before are to be replaced.
+            Whether what is there is dropped, and the files of a run before are to be replaced. Tiles in a store that
+            the user does not name stay.
 
         Raises
         ------
@@ -83,10 +86,11 @@ class Store:
             When the store that is there was begun with other settings, inputs or versions, or lies in another place, or
             cannot be used.
         """
-        home, folder, before = folder_at(self.home), self.folder, _place(self.home)
+        home, folder = folder_at(self.home), self.folder
         try:
-            text = None if overwrite else before.read(MANIFEST)
-            if text is not None:
+            before = self._place_before(overwrite)
+            text = None if overwrite or before is None else before.read(MANIFEST)
+            if before is not None and text is not None:
                 check_same(text, before, manifest)
                 if before != folder:
                     raise StoreError(
@@ -94,9 +98,10 @@ class Store:
                         "--store to go on, or none where there was none, --overwrite to start afresh"
                     )
             folder.make("")  # so that what cannot be used is told before anything is dropped
-            if overwrite:
+            if overwrite and before is not None:
                 with suppress(OSError):  # what cannot be reached stays
-                    _drop(before)
+                    if before == home or is_own(before):
+                        _drop(before)
             if overwrite or (text is None and not self.elsewhere):
                 _drop(folder)
             for name in ("", _RECORDS, _FAILURES):
@@ -105,9 +110,9 @@ class Store:
             if overwrite:
                 home.write(_REPLACING, "")
             if self.elsewhere:
-                home.write(_PLACE, json.dumps(str(folder)))
+                home.write(PLACE, json.dumps(str(folder)))
             else:
-                home.delete(_PLACE)
+                home.delete(PLACE)
             self._arrays.create()
             if not folder.create(MANIFEST, json.dumps(manifest, indent=1)):
                 self.check(manifest)
@@ -116,6 +121,17 @@ class Store:
                 f"{folder} cannot be used: {error.strerror or error}: check the path or URL, the credentials, and that "
                 "the package of its file system is installed (sat-intervals[remote] for s3://)"
             ) from error
+
+    def _place_before(self, overwrite: bool) -> Folder | None:
+        """Where the tiles of the run before are; with ``overwrite`` None where that is not to be touched."""
+        try:
+            return place_of(self.home, self.elsewhere and self.elsewhere.rpartition("/")[0])
+        except StoreError as error:
+            if not overwrite:
+                raise
+            if isinstance(error, ElsewhereError):
+                _LOG.warning("%s: they stay there", error.said)
+            return None
 
     def check(self, manifest: Mapping[str, Any]) -> None:
         """Hold that the store is that of a run still: others may have removed it, or begun another in its place.
@@ -233,13 +249,13 @@ class Store:
 
     def remove(self) -> None:
         """Delete the tiles, and nothing else that may be in their folder."""
-        remove_tiles(self.home)
+        remove_tiles(self.home, self.folder)
 
 
-def remove_tiles(home: Path) -> None:
-    """Delete the tiles of the run to whose folder ``home`` belongs, wherever they lie."""
-    _drop(_place(home))
-    for name in (_PLACE, _REPLACING):
+def remove_tiles(home: Path, place: Folder) -> None:
+    """Delete the tiles in ``place`` of the run to whose folder ``home`` belongs."""
+    _drop(place)
+    for name in (PLACE, _REPLACING):
         folder_at(home).delete(name)
 
 
@@ -253,29 +269,25 @@ def is_replacing(home: Path) -> bool:
     return folder_at(home).read(_REPLACING) is not None
 
 
-def inputs_before(home: Path) -> dict[str, Any]:
+def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
     """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
     try:
-        return dict(json.loads(_place(home).read(MANIFEST) or "{}").get("inputs", {}))
+        return dict(json.loads(place_of(home, store).read(MANIFEST) or "{}").get("inputs", {}))
     except (OSError, AttributeError, TypeError, ValueError):
         return {}
 
 
-def _place(home: Path) -> Folder:
-    """Where the tiles lie of the run to whose folder ``home`` belongs."""
-    noted = folder_at(home).read(_PLACE)
-    return folder_at(json.loads(noted) if noted else home)
-
-
-def store_of(home: Path) -> Store:
+def store_of(home: Path, store: str | None = None) -> Store:
     """The store of the run to whose folder ``home`` belongs, to be looked at: how far it is.
+
+    ``store`` is the one that the user names, see `place_of`.
 
     Raises
     ------
     StoreError
         Where there is none.
     """
-    folder = _place(home)
+    folder = place_of(home, store)
     text = folder.read(MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")
