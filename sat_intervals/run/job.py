@@ -124,8 +124,9 @@ def prepare(
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
         name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
-    folders = [home] if elsewhere is None or "://" in elsewhere else [home, Path(elsewhere)]
-    check_not_replaced(read, [out / name for name in OUTPUTS], folders)
+    # of the runs in a local store each has a folder whose name ends with a digest
+    stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
+    check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
     store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
     return Job(left, right, config, store, out, inputs, files)

@@ -8,9 +8,9 @@ from typing import Any
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.place import ElsewhereError
-from sat_intervals.store.tiles import store_of
+from sat_intervals.store.tiles import is_replacing, store_of
 
-__all__ = ["REPORT", "ElsewhereError", "Status", "read_report", "read_status"]
+__all__ = ["REPORT", "ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
 
 # In the folder of a batch: how its pairs ended.
 REPORT = "batch.json"

@@ -81,9 +81,9 @@ def _match_tile(job: Job, tile: Tile) -> None:
 
 def _checked_statistics(job: Job) -> PairStatistics | None:
     """Mean and standard deviation of the images, where MC-CNN needs them."""
-    normalization = job.store.normalization()
-    is_needed = isinstance(job.config.cost, Mccnn) and normalization is not None
-    return PairStatistics.of_report(normalization) if is_needed else None
+    if not isinstance(job.config.cost, Mccnn) or (normalization := job.store.normalization()) is None:
+        return None
+    return PairStatistics.of_report(normalization)
 
 
 def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
