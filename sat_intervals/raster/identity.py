@@ -3,6 +3,7 @@
 import hashlib
 import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import lru_cache
 from http.client import HTTPException
@@ -17,6 +18,8 @@ from sat_intervals.store.folder import object_tag
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
 # Seconds for a server to answer.
 _PATIENCE = 30
+# How often a file is hashed that is touched meanwhile.
+_TRIES = 3
 
 
 class ChangedInputError(RunError):
@@ -60,7 +63,7 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
 def _of_file(file: Path, known: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     path, status, stamp = str(file.resolve()), file.stat(), _stamp(file)
     before = known.get(path, {})
-    sha256 = before["sha256"] if before.get("stamp") == stamp else _sha256(file, stamp)
+    stamp, sha256 = (stamp, before["sha256"]) if before.get("stamp") == stamp else _hashed(file)
     modified = datetime.fromtimestamp(status.st_mtime, UTC).isoformat()
     return {"path": path, "bytes": status.st_size, "modified": modified, "sha256": sha256, "stamp": stamp}
 
@@ -69,6 +72,16 @@ def _stamp(file: str | Path) -> str:
     """What any change of a file changes, found without reading it."""
     status = os.stat(file)
     return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}"
+
+
+def _hashed(file: str | Path) -> tuple[str, str]:
+    """Stamp and SHA-256 of a file; one that is touched meanwhile is looked at again."""
+    for _ in range(_TRIES - 1):
+        with suppress(ChangedInputError):
+            stamp = _stamp(file)
+            return stamp, _sha256(file, stamp)
+    stamp = _stamp(file)
+    return stamp, _sha256(file, stamp)
 
 
 @lru_cache(maxsize=1024)
@@ -97,8 +110,7 @@ def is_changed(path: str, told: Mapping[str, Any]) -> bool:
     """Whether a file is no longer what `identity` told of it; where a server does not answer, it is not."""
     if "sha256" in told:
         try:
-            stamp = _stamp(path)
-            return bool(stamp != told.get("stamp") and _sha256(path, stamp) != told["sha256"])
+            return bool(_stamp(path) != told.get("stamp") and _hashed(path)[1] != told["sha256"])
         except FileNotFoundError:
             return True
     now = identity(path)
