@@ -5,6 +5,7 @@ The library is imported by the command that needs it: help and usage errors do n
 
 import atexit
 import gc
+import os
 from typing import Any
 
 import click
@@ -34,6 +35,10 @@ class _Commands(click.Group):
     def invoke(self, context: click.Context) -> Any:
         # The libraries make two hundred thousand objects that live as long as the process. To look for garbage among
         # them takes a fifth of a second while they are imported, and half a second at the end.
+        try:
+            os.getcwd()
+        except OSError:
+            _end(USER_ERROR, "the working directory is gone: change to a folder that is there")
         gc.set_threshold(5000)
         atexit.register(gc.freeze)
         try:

@@ -34,23 +34,25 @@ def demo(
     from sat_intervals.config import load_config
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.raster import north_up, write_once
+    from sat_intervals.raster import north_up, put_back, write_once
+    from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.job import check_output
     from sat_intervals.run.pair import match_pair
+    from sat_intervals.run.status import is_replacing
 
     check_output(out, run["overwrite"])
+    layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
+    overwrite = run["overwrite"] or is_replacing(out / "tiles")
     somewhere = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
-    with Console(quiet) as console:
+    with Console(quiet) as console, put_back(layers, out / "run.json"):
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed)
-        for name, layer, nodata in (
-            ("left", scene.left, 0),
-            ("right", scene.right, 0),
-            ("truth", scene.truth, float("nan")),
-        ):
-            write_once(out / f"{name}.tif", layer, nodata, somewhere, overwrite=run["overwrite"])
-        console.progress("scene", 1, 1)
         config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum)))
+        check_not_replaced([config_file], layers)
+        nodata = 0, 0, float("nan")
+        for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
+            write_once(path, pixels, value, somewhere, overwrite=overwrite)
+        console.progress("scene", 1, 1)
         report = match_pair(out / "left.tif", out / "right.tif", out, config, progress=console.progress, **run)
     console.summary(report, out)
     figures = evaluate_run(out, out / "truth.tif")["all"]

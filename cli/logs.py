@@ -91,6 +91,11 @@ def _added(handler: logging.Handler, logger: logging.Logger) -> Iterator[None]:
 
 @contextmanager
 def _opened(log_file: Path) -> Iterator[IO[str]]:
+    from sat_intervals.raster.identity import check_not_replaced
+
+    given = {**click.get_current_context().params, "log_file": None}.values()
+    names = [name for value in given for name in (value if isinstance(value, tuple) else (value,))]
+    check_not_replaced([name for name in names if isinstance(name, (str, Path))], [log_file])
     try:
         file = log_file.open("a", encoding="utf-8", errors="backslashreplace", buffering=1)
     except OSError as error:

@@ -36,6 +36,9 @@ def path(context: click.Context, parameter: click.Parameter, value: str | None) 
 
 quiet_option = click.option("--quiet", is_flag=True, help="Print errors only.")
 cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
+store_option = click.option(
+    "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles until the run is finished."
+)
 disparity_option = click.option(
     "--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched."
 )
@@ -140,9 +143,7 @@ def settings_options(command: Command) -> Command:
             metavar="SPEC",
             help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
         ),
-        click.option(
-            "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles until the run is finished."
-        ),
+        store_option,
     )
 
 

@@ -51,6 +51,8 @@ def plot(
         results.check_part(row, columns)
     if pixel is not None:
         results.check_pixel(*pixel)
+    pictures = [out / f"{name}.png" for name in ("overview", "errors", "profile", "curve", "dsm")]
+    results.check_kept(pictures, [truth, out / "dsm.tif"])
     draw_overview(results, out / "overview.png", dpi)
     click.echo(out / "overview.png")
     if results.truth is not None and results.config.interval is not None:

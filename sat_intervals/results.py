@@ -1,7 +1,7 @@
 """A finished run as its folder holds it: what it says of itself, its bands, its images, and a truth beside them."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
@@ -22,7 +22,7 @@ from sat_intervals.raster import (
     read_small_layers,
     read_window,
 )
-from sat_intervals.raster.identity import is_changed
+from sat_intervals.raster.identity import check_not_replaced, is_changed
 from sat_intervals.tiling import Window, strips
 
 # Pixels of a strip, and bands of the files.
@@ -113,6 +113,11 @@ class Run:
     def windows(self) -> Iterator[Window]:
         """Full-width windows of the results, from the top."""
         return strips(*self.shape, _STRIP)
+
+    def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
+        """Hold that none of the files to be written is one of the run, of its inputs, the truth, or ``inputs``."""
+        own = [self.out / name for name in (*_BANDS, "run.json")]
+        check_not_replaced([*own, *_files_told(self.report["inputs"]), self.truth_beside, *inputs], outputs)
 
     def layer(self, path: str | Path) -> Layer:
         """Another raster of the same pixels, such as the truth."""
@@ -224,6 +229,14 @@ def open_run(out: str | Path) -> Run:
     return Run(out, report, config, region)
 
 
+def _files_told(told: Any) -> Iterator[str]:
+    """The paths of all files that a report tells of its inputs."""
+    for value in told.values() if isinstance(told, dict) else told if isinstance(told, list) else ():
+        yield from _files_told(value)
+    if isinstance(told, dict) and isinstance(told.get("path"), str):
+        yield told["path"]
+
+
 def _check_input(told: dict[str, Any]) -> None:
     """Hold that a report tells of an image what is needed to open it again."""
     Path(told["path"])
@@ -284,7 +297,7 @@ def _opened(told: dict[str, Any]) -> Image:
             f"{told['height']} x {told['width']}: put that image back or match again"
         )
     for file in (told, *told.get("files", ()), *([mask] if mask else [])):
-        if is_changed(file):
+        if is_changed(file["path"], file):
             raise SatIntervalsError(
                 f"{file['path']} is not the file that was matched: put that image back or match again"
             )

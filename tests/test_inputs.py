@@ -16,7 +16,7 @@ import rasterio
 
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
-from sat_intervals.raster.identity import identity
+from sat_intervals.raster.identity import identity, is_changed
 from sat_intervals.tiling import Window
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
@@ -135,21 +135,40 @@ def test_match__never_goes_on_with_an_image_of_another_etag(server, images, tmp_
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
 
-def test_identity__hashes_again_only_when_size_or_time_changed(tmp_path):
+def test_identity__sees_a_change_at_equal_size_and_time_and_hashes_only_then(tmp_path, monkeypatch):
     file = tmp_path / "image.tif"
     file.write_bytes(b"one")
     before = identity(str(file))
     assert before["sha256"] == hashlib.sha256(b"one").hexdigest()
     times = file.stat().st_atime_ns, file.stat().st_mtime_ns
+    with monkeypatch.context() as patch:
+        patch.setattr(hashlib, "file_digest", None)
+        assert identity(str(file), {str(file): before}) == before
+    time.sleep(0.02)  # more than a tick of the clock of files
     file.write_bytes(b"two")
     os.utime(file, ns=times)
-    assert identity(str(file), {str(file): before}) == before
-    assert identity(str(file))["sha256"] == hashlib.sha256(b"two").hexdigest()
-    os.utime(file, ns=(times[0], times[1] + 10**6))
-    assert identity(str(file), {str(file): before})["sha256"] == hashlib.sha256(b"two").hexdigest()
-    file.write_bytes(b"four")
-    os.utime(file, ns=times)
-    assert identity(str(file), {str(file): before})["sha256"] == hashlib.sha256(b"four").hexdigest()
+    after = identity(str(file), {str(file): before})
+    assert {name for name in before if after[name] != before[name]} == {"sha256", "stamp"}
+    assert after["sha256"] == hashlib.sha256(b"two").hexdigest()
+    assert is_changed(str(file), before)
+    time.sleep(0.02)
+    file.write_bytes(b"one")
+    assert not is_changed(str(file), before)
+
+
+def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(server, images, tmp_path):
+    put(images, server.folder)
+    out = tmp_path / "out"
+    run = match(server, out, "--tile-size", "128", "--workers", "1")
+    while run.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
+        time.sleep(0.02)
+    changed = bytearray(images["right.tif"])
+    changed[-1] ^= 1
+    put({"right.tif": bytes(changed)}, server.folder)
+    status, output = ended(run)
+    assert (status, output.count("\n")) == (1, 1)
+    assert "right.tif was replaced or changed while the run worked on it" in output
+    assert [path.name for path in out.iterdir()] == ["tiles"]
 
 
 @pytest.mark.parametrize("path", ["http://127.0.0.1:1/image.tif", "/vsimem/image.tif", "nowhere://image.tif"])

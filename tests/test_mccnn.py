@@ -384,7 +384,7 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     job.begin()
     job.store.write_normalization(PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 80.0)).report())
     write_network(file, random_weights(seed=1))
-    with pytest.raises(SatIntervalsError, match=r"network\.onnx on this worker differs in sha256 from .* of the run"):
+    with pytest.raises(SatIntervalsError, match=r"network\.onnx differs in sha256 from .* of the run"):
         match_tile(job, next(iter(job.store.grid)))
 
 

@@ -590,8 +590,9 @@ def test_output_writer__keeps_what_was_there_until_publish(tmp_path, products):
 
 
 def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products):
-    (tmp_path / ".unpublished-intervals.tif" / "files" / "deep").mkdir(parents=True)
-    (tmp_path / ".unpublished-intervals.tif" / "files" / "deep" / "strips.tif").write_text("half")
+    (tmp_path / ".unpublished-intervals.tif" / "files" / "replaced").mkdir(parents=True)
+    for name in ("strips-intervals.tif", "validity.tif", "run.json", "replaced/intervals.tif"):
+        (tmp_path / ".unpublished-intervals.tif" / "files" / name).write_text("half")
     produce(tmp_path, products)
     assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
 
@@ -618,7 +619,8 @@ def test_output_writer__publishes_all_or_nothing(tmp_path, products, before):
 def test_output_writer__publishes_no_report_of_files_that_failed(tmp_path, products):
     (tmp_path / "run.json").write_text("of the run before")
     publish_where_the_last_fails(tmp_path, products, ("run.json", "{}"))
-    assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
+    assert left_behind(tmp_path) == ["run.json", "validity.tif"]
+    assert (tmp_path / "run.json").read_text() == "of the run before"
     (tmp_path / "validity.tif").rmdir()
     produce(tmp_path, products, report=("run.json", "{}"))
     assert (tmp_path / "run.json").read_text() == "{}"

@@ -143,8 +143,9 @@ def assert_complete(pair: Path, out: Path, *others: str) -> None:
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, *others])
 
 
-def status_of(out: Path) -> str:
-    return subprocess.run([COMMAND, "status", out], capture_output=True, text=True, check=True).stdout
+def status_of(out: Path, store: str) -> str:
+    command = [COMMAND, "status", out, "--store", store]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
@@ -152,9 +153,9 @@ def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
     with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
         wait_for_tiles(first, store, 3)
         with halted(first):
-            assert "a run is at work" in status_of(out)
+            assert "a run is at work" in status_of(out, store)
     done = records(store)
-    assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out)
+    assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out, store)
     with started(pair, out, store, "--keep-tiles") as again:
         assert ended(again) == (0, "")
     after = records(store)
@@ -181,7 +182,7 @@ def test_match__shares_a_bucket_with_the_same_run_and_ends_when_that_removes_the
     assert objects(store) == {}
 
 
-def test_match__never_forgets_where_tiles_lie_and_leaves_none_behind(bucket, pair, tmp_path):
+def test_match__never_forgets_where_tiles_lie(bucket, pair, tmp_path):
     first, second, out = f"{bucket}/first", tmp_path / "second", tmp_path / "out"
     with started(pair, out, first) as run:
         wait_for_tiles(run, first, 2)
@@ -190,19 +191,21 @@ def test_match__never_forgets_where_tiles_lie_and_leaves_none_behind(bucket, pai
     with started(pair, out, second) as run:
         status, output = ended(run)
     assert status == 2
-    assert re.search(rf"lie in {first}/(\w+), not in {second}/\1: give the same --store", output)
+    assert re.search(
+        rf"said to lie in {first}/(\w+), not in {second}: if that is your store, give --store {first}", output
+    )
     with started(pair, out, second, "--overwrite") as run:
         wait_until(lambda: list(second.glob("*/records/[0-9]*")) or run.poll() is not None, "tiles")
         run.terminate()
         assert ended(run)[0] == 143
-    assert objects(first) == {}
+    assert objects(first), "a store that is not named stays as it is"
     with started(pair, out, second) as run:
         assert ended(run) == (0, "")
     assert not list(second.iterdir())
     assert_complete(pair, out)
     with started(pair, out, first, "--overwrite") as run:
         assert ended(run) == (0, "")
-    assert objects(first) == {}
+    assert objects(first) == {}, "the same run in the same store"
     assert_complete(pair, out)
 
 

@@ -97,6 +97,8 @@ def make_surface(
         raise SatIntervalsError(f"interval is {interval!r}, allowed: envelope or mean")
     _check_target(path)
     runs = _triangulated([Path(out) for out in outs])
+    for run in runs:
+        run.check_kept([path], [run.out / "points.tif", geoid])
     middle = _point_near_the_middle(runs)
     projection = Projection(utm_of(*middle) if crs is None else crs, None if geoid is None else Path(geoid))
     projection.check(*middle)

@@ -59,6 +59,7 @@ def triangulate(
         No run, models or grids that cannot be read or do not fit, a file that cannot be written.
     """
     run = open_run(out)
+    run.check_kept([run.out / POINT_FILES[0].name], [left_model, right_model, left_grid, right_grid])
     search = run.config.disparity
     sensors = Sensors.load(*map(Path, (left_model, right_model, left_grid, right_grid)))
     right_width = run.report["inputs"]["right"]["width"]

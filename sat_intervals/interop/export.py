@@ -112,7 +112,7 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     Raises
     ------
     SatIntervalsError
-        No run, or a file that cannot be written.
+        No run, a file that cannot be written, or one that is an input or a file of the run.
     """
     run, target = open_run(out), Path(target)
     left = run.report["inputs"]["left"]
@@ -122,6 +122,7 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
         raise SatIntervalsError(f"{target} is a folder: give a prefix for ASP's file, such as {target / 'run'}")
     rasters = FORMATS[form](prefix, run.config)
     files = [file for file, _ in rasters]
+    run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
     with OutputWriter(folder, files, *shape, Georeferencing(), {}) as writer:
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)

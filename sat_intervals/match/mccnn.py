@@ -111,9 +111,9 @@ def _wrong(file: Path, what: str) -> SatIntervalsError:
 def load_network(file: Path) -> Network:
     """The network of a file, loaded once a process and again when the file is another."""
     status = file.stat()
-    return _loaded(file, status.st_mtime_ns, status.st_size)
+    return _loaded(file, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
 
 
 @lru_cache(maxsize=4)
-def _loaded(file: Path, modified: int, size: int) -> Network:
+def _loaded(file: Path, stamp: tuple[int, ...]) -> Network:
     return Network(file)

@@ -3,7 +3,16 @@
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
-from sat_intervals.raster.layers import north_up, read_layers, read_shape, read_tags, write_layer, write_once
+from sat_intervals.raster.layers import (
+    north_up,
+    put_back,
+    read_layers,
+    read_shape,
+    read_tags,
+    whole_file,
+    write_layer,
+    write_once,
+)
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
 from sat_intervals.raster.surfaces import is_surface, read_heights, read_place, resolution_of
@@ -27,6 +36,7 @@ __all__ = [
     "north_up",
     "open_image",
     "other_files",
+    "put_back",
     "read_heights",
     "read_layers",
     "read_place",
@@ -38,6 +48,7 @@ __all__ = [
     "resolution_of",
     "surface_file",
     "utm_of",
+    "whole_file",
     "write_layer",
     "write_once",
 ]

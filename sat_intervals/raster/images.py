@@ -203,10 +203,10 @@ def _check_range(left: Image, right: Image, minimum: int, maximum: int) -> None:
         )
 
 
-def other_files(image: Image) -> list[str]:
-    """The other files that an image is read from: a mask beside it, the sources of a virtual raster."""
+def other_files(name: str) -> list[str]:
+    """The other files that a raster is read from: a mask beside it, the sources of a virtual raster."""
     seen: list[str] = []
-    waiting = [image.path]
+    waiting = [name]
     while waiting:
         path = waiting.pop()
         try:
@@ -214,7 +214,7 @@ def other_files(image: Image) -> list[str]:
                 files = dataset.files
         except gdal.GDAL_ERRORS:  # a file beside it that is no raster
             continue
-        new = [file for file in files if file not in seen and Path(file).resolve() != Path(image.path).resolve()]
+        new = [file for file in files if file not in seen and Path(file).resolve() != Path(name).resolve()]
         seen += new
         waiting += [file for file in new if file.endswith((".vrt", ".VRT"))]
     return sorted(seen)

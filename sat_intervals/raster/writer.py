@@ -23,9 +23,11 @@ from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.store.folder import LocalFolder
 
-# Folder, beside the files, where they grow until they are whole; named after the first of them, and locked. What a
-# killed process left there is replaced.
+# Folder, beside the files, where they grow until they are whole; named after the first of them, and locked. Files of
+# these names that a killed process left there are replaced, others stay.
 _SCRATCH = ".unpublished-{}"
+# The report of a run, which is published with its files.
+_REPORT = "run.json"
 # Strips are kept as they come, in blocks low enough that a strip fills most of those it touches, and band by band, from
 # which the final files are made in four fifths of the time.
 _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "band", "bigtiff": "IF_SAFER"}
@@ -112,11 +114,14 @@ class OutputWriter:
                 raise OutputError(f"{place} cannot be written: it is no file: choose another name or folder")
         with self._failing(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
+        for place in (self._hidden, self._scratch, self._replaced):
+            if place.is_symlink():
+                raise OutputError(f"{place} is a symbolic link, and files grow there: remove it")
         self._locked.enter_context(LocalFolder(self._hidden).locked())
         try:
             with self._failing(self._folder):
-                shutil.rmtree(self._scratch, ignore_errors=True)
-                self._replaced.mkdir(parents=True)
+                self._remove_scratch()
+                self._replaced.mkdir(parents=True, exist_ok=True)
             check_space(self._folder, self._files, *self._shape)
             for file in self._files:
                 self._strips[file.name] = self._create(file)
@@ -161,7 +166,7 @@ class OutputWriter:
         """Give the files their names, all of them or none.
 
         With a ``report``, name and text of a file that tells that the others are whole, that of before goes first and
-        this one comes last: without it the others do not count, and nothing is put back where one fails.
+        this one comes last: without it the others do not count. Where one fails the files of before are put back.
         """
         self.build()
         names = [file.name for file in self._files]
@@ -171,24 +176,32 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 (self._scratch / name).write_text(text, encoding="utf-8")
                 _flush(self._scratch / name)
-                (self._folder / name).unlink(missing_ok=True)
         try:
+            if report:
+                self._put_aside(names[-1])
             for name in names:
+                if name != names[-1]:  # after the last there is nothing to put back
+                    self._put_aside(name)
                 with self._failing(self._folder / name):
-                    if not report and name != names[-1]:  # after the last there is nothing to put back
-                        with suppress(FileNotFoundError):
-                            os.replace(self._folder / name, self._replaced / name)
                     os.replace(self._scratch / name, self._folder / name)
         except BaseException:
-            if not report and (self._scratch / names[-1]).exists():
+            if (self._scratch / names[-1]).exists():
                 self._take_back(names)
             raise
+
+    def _put_aside(self, name: str) -> None:
+        """Keep the file that has the name until the new ones have theirs."""
+        place = self._folder / name
+        with self._failing(place), suppress(FileNotFoundError):
+            if place.is_dir() and not place.is_symlink():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            os.replace(place, self._replaced / name)
 
     def _take_back(self, names: Sequence[str]) -> None:
         """Put back the files that had the names before."""
         for name in names:
             with suppress(OSError):
-                if (self._replaced / name).exists():
+                if os.path.lexists(self._replaced / name):
                     os.replace(self._replaced / name, self._folder / name)
                 elif not (self._scratch / name).exists():
                     os.unlink(self._folder / name)
@@ -248,8 +261,19 @@ class OutputWriter:
             with suppress(*gdal.GDAL_ERRORS):
                 strips.close()
         self._strips.clear()
-        shutil.rmtree(self._scratch, ignore_errors=True)
+        self._remove_scratch()
         self._locked.close()
+
+    def _remove_scratch(self) -> None:
+        """Delete what was made here, now or by a process that was killed, and nothing else that may be there."""
+        names = [file.name for file in self._files]
+        ours = (*names, *(f"strips-{name}" for name in names), _REPORT)
+        for folder in (self._replaced, self._scratch):
+            with suppress(OSError):
+                for file in folder.iterdir():
+                    if file.name.startswith(ours) and not file.is_dir():
+                        file.unlink()
+                folder.rmdir()
 
 
 def check_space(folder: Path, files: Sequence[File], height: int, width: int) -> None:

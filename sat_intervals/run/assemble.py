@@ -72,6 +72,7 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         with logged_stage(seconds, "files"):
             progress("files", 0, 1)
             writer.build()
+            job.check_inputs()
             progress("files", 0, 1)  # so that a run that is to end does so before it publishes
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())

@@ -21,13 +21,16 @@ from distributed import Client
 from sat_intervals.config import Cluster, Config, load_config, load_yaml
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, open_image
+from sat_intervals.raster import Image, open_image, other_files
+from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.results import open_run
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.job import Job, changes_since, compile_kernels, is_complete, prepare
+from sat_intervals.run.job import OUTPUTS, Job, changes_since, compile_kernels, is_complete, prepare
 from sat_intervals.run.pair import assembled, check_failures, matched, measure_images
 from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.manifest import StoreError
+from sat_intervals.store.place import is_own, place_of
 from sat_intervals.store.tiles import remove_tiles
 
 _LOG = logging.getLogger(__name__)
@@ -160,6 +163,7 @@ def match_batch(
     RunError
         What stops all pairs, such as a full disk.
     """
+    _check_not_replaced(pairs, out, overwrite)
     ended: dict[str, dict[str, Any]] = {}
     cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
     _allow_files()
@@ -182,13 +186,25 @@ def match_batch(
                 if before is None:
                     jobs[pair.name] = _begun(pair, out, settings, overwrite, stack)
                 else:
-                    _tidy(out / pair.name, keep_tiles)
+                    _tidy(out / pair.name, keep_tiles, cluster.store)
                     note({pair.name: {"state": "done before", **before}})
             except Exception as error:  # whatever is wrong with one pair, the others go on
                 note({pair.name: _failed(error)})
         for name, how in _matched(jobs, out, cluster, keep_tiles, progress):
             note({name: how})
     return ended
+
+
+def _check_not_replaced(pairs: Sequence[PairOfBatch], out: Path, overwrite: bool) -> None:
+    """Hold that no pair's input is among what another pair writes."""
+    written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
+    names = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
+    files = [name for name in names if name and os.path.isfile(name)]
+    check_not_replaced(
+        [file for name in files for file in (name, *other_files(name))],
+        [out / REPORT, *(folder / name for folder in written for name in OUTPUTS)],
+        [folder / "tiles" for folder in written],
+    )
 
 
 def _images(pair: PairOfBatch) -> tuple[Image, Image]:
@@ -216,11 +232,19 @@ def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stac
     return job
 
 
-def _tidy(folder: Path, keep_tiles: bool) -> None:
+def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
     """Remove tiles that a death between the files and the end of their run left."""
-    if not keep_tiles and (folder / "tiles").exists():
-        with LocalFolder(folder / "tiles").locked():
-            remove_tiles(folder / "tiles")
+    home = folder / "tiles"
+    if keep_tiles or not home.exists() or home.is_symlink():
+        return
+    try:
+        place = place_of(home, store)
+    except StoreError as error:
+        _LOG.warning("%s", error)
+        return
+    if place == LocalFolder(home.absolute()) or is_own(place):
+        with LocalFolder(home).locked():
+            remove_tiles(home, place)
 
 
 def _failed(error: Exception) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import json
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +21,7 @@ from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import match_patch
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, other_files
-from sat_intervals.raster.identity import identity
+from sat_intervals.raster.identity import ChangedInputError, check_not_replaced, check_unchanged, identity
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import differences, digest
@@ -49,6 +49,8 @@ class Job:
         Folder of the run.
     inputs
         What run.json says of the images, and of the weights of MC-CNN.
+    files
+        What `identity` says of each file that the images are read from, by the name it is opened by.
     """
 
     left: Image
@@ -57,6 +59,7 @@ class Job:
     store: Store
     out: Path
     inputs: dict[str, Any]
+    files: dict[str, dict[str, Any]]
 
     @property
     def manifest(self) -> dict[str, Any]:
@@ -81,6 +84,24 @@ class Job:
             raise _holds_run(self.out, OUTPUTS)
         check_output(self.out, overwrite)
         self.store.open(self.manifest, overwrite=overwrite)
+
+    def check_inputs(self) -> None:
+        """Hold that all inputs are those of the run still, the weights those that this process finds.
+
+        Raises
+        ------
+        ChangedInputError
+            With the first that is not.
+        """
+        check_unchanged(self.files)
+        if isinstance(self.config.cost, Mccnn):
+            here, wanted = weights_identity(self.config.cost), self.inputs["weights"]
+            for key in ("sha256", "onnxruntime"):
+                if here[key] != wanted[key]:
+                    raise ChangedInputError(
+                        f"{here['path']} differs in {key} from {wanted['path']} of the run: it was replaced, or this "
+                        "worker has another"
+                    )
 
     def waiting(self) -> list[Tile]:
         """The tiles that are not done."""
@@ -109,13 +130,17 @@ def prepare(
     check_output(out, overwrite)
     check_space(out, RUN_FILES, region.height, region.width)
     home, elsewhere = out / "tiles", None
-    inputs = _inputs(left, right, config, inputs_before(home))
+    inputs, files = _inputs(left, right, config, inputs_before(home, config.cluster.store))
+    read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
         name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
+    # of the runs in a local store each has a folder whose name ends with a digest
+    stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
+    check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
     store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
-    return Job(left, right, config, store, out, inputs)
+    return Job(left, right, config, store, out, inputs, files)
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
@@ -143,7 +168,7 @@ def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: 
     }
     now = {
         "settings": config.model_dump(mode="json", exclude={"cluster"}),
-        "inputs": _inputs(left, right, config, report["inputs"]),
+        "inputs": _inputs(left, right, config, report["inputs"])[0],
         "region": asdict(checked_region(left, None)),
     }
     for one in (before, now):
@@ -191,6 +216,8 @@ def check_output(out: Path, overwrite: bool) -> None:
             raise _holds_run(out, there)
         if os.path.lexists(out) and not out.is_dir():
             raise SatIntervalsError(f"{out} is no folder: choose another")
+        if (out / "tiles").is_symlink():
+            raise SatIntervalsError(f"{out / 'tiles'} is a symbolic link: name the place of the tiles with --store")
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
@@ -248,27 +275,38 @@ def check_tiles(config: Config, region: Window) -> None:
     )
 
 
-def _inputs(left: Image, right: Image, config: Config, before: Mapping[str, Any]) -> dict[str, Any]:
-    """What run.json and the manifest say of the inputs; what they said before saves hashing files again."""
-    known = _known(before)
-    inputs = {"left": _described(left, known), "right": _described(right, known)}
+def _inputs(
+    left: Image, right: Image, config: Config, before: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """What run.json and the manifest say of the inputs, and of each file of the images by its name.
+
+    What they said before saves hashing files again.
+    """
+    known, files = _known(before), {}
+
+    def told(name: str) -> dict[str, Any]:
+        if name not in files:
+            files[name] = identity(name, known)
+        return files[name]
+
+    inputs = {"left": _described(left, told), "right": _described(right, told)}
     if isinstance(config.cost, Mccnn):
         inputs["weights"] = weights_identity(config.cost)
-    return inputs
+    return inputs, files
 
 
 def _known(inputs: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """What a manifest says of the files of its inputs, by path."""
-    described = [file for one in inputs.values() for file in (one, *one.get("files", ()), one.get("mask"))]
-    return {file["path"]: file for file in described if file and "sha256" in file}
+    ways = [one for both in inputs.values() for one in (both, both.get("mask")) if one]
+    described = [file for one in ways for file in (one, *one.get("files", ()))]
+    return {file["path"]: file for file in described if "sha256" in file}
 
 
-def _described(image: Image, known: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _described(image: Image, told: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
     """What run.json and the manifest say of an input."""
     crs = image.georeferencing.crs
     return {
-        **identity(image.path, known),
-        "files": [identity(file, known) for file in other_files(image)],
+        **_with_others(image.path, told),
         "height": image.height,
         "width": image.width,
         "band": image.band,
@@ -277,5 +315,10 @@ def _described(image: Image, known: dict[str, dict[str, Any]]) -> dict[str, Any]
         "crs": crs.to_string() if crs else None,
         "use_mask": image.use_mask,
         "alpha": image.alpha,
-        "mask": identity(image.mask, known) if image.mask else None,
+        "mask": _with_others(image.mask, told) if image.mask else None,
     }
+
+
+def _with_others(name: str, told: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
+    """What is told of a raster, and of the other files it is read from."""
+    return {**told(name), "files": [told(file) for file in other_files(name)]}

@@ -13,6 +13,7 @@ from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import Image
+from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
@@ -144,9 +145,11 @@ def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Ima
     retries = job.config.cluster.retries
     found: dict[int, Moments] = {}
     for outcome in Submission(
-        client, (Task(i, measure_block, (image, block), retries) for i, block in enumerate(windows))
+        client, (Task(i, measure_block, (image, block, job.files), retries) for i, block in enumerate(windows))
     ):
         if outcome is not None and outcome.error is not None:
+            if isinstance(outcome.error, ChangedInputError):
+                raise outcome.error
             raise RunError(f"{image.path} could not be measured: {reason(outcome.error)}") from outcome.error
         if outcome is not None:
             found[outcome.label] = outcome.result
@@ -155,7 +158,10 @@ def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Ima
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
-    """Raise a RunError that names every tile that failed, if there are any."""
+    """Raise a RunError that names every tile that failed, if there are any, or the input that changed."""
+    for error in failures.values():
+        if isinstance(error, ChangedInputError):
+            raise error
     if failures:
         lines = "\n".join(f"  tile {name}: {reason(error)}" for name, error in sorted(failures.items()))
         raise RunError(

@@ -7,7 +7,10 @@ from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.tiles import store_of
+from sat_intervals.store.place import ElsewhereError
+from sat_intervals.store.tiles import is_replacing, store_of
+
+__all__ = ["REPORT", "ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
 
 # In the folder of a batch: how its pairs ended.
 REPORT = "batch.json"
@@ -33,21 +36,23 @@ class Status:
     running: bool
 
 
-def read_status(home: Path) -> Status:
+def read_status(home: Path, store: str | None = None) -> Status:
     """How far a run is, from its store alone.
 
     Parameters
     ----------
     home
         Folder of the tiles in that of the run, wherever they lie.
+    store
+        The store that the user names; without it none but ``home`` is looked at.
 
     Raises
     ------
     StoreError
-        Where there is no store.
+        Where there is no store, or it is said to be in another than the user names.
     """
-    store = store_of(home)
-    return Status(len(store.grid), len(store.done()), store.failures(), LocalFolder(home).is_locked())
+    there = store_of(home, store)
+    return Status(len(there.grid), len(there.done()), there.failures(), LocalFolder(home).is_locked())
 
 
 def read_report(out: Path) -> dict[str, dict[str, Any]] | None:

@@ -14,17 +14,21 @@ from sat_intervals.match.patch import Patch, match_patch
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
-from sat_intervals.run.job import Job, weights_identity
+from sat_intervals.raster.identity import check_unchanged
+from sat_intervals.run.job import Job
 from sat_intervals.run.seams import seam_lines
 from sat_intervals.tiling import Tile, Window
 
 _LOG = logging.getLogger(__name__)
 
 
-def measure_block(image: Image, block: Window) -> Moments:
-    """Look at a block of an image for its mean and standard deviation; runs on a worker."""
+def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]]) -> Moments:
+    """Look at a block of an image, one of ``files``, for its mean and standard deviation; runs on a worker."""
     try:
-        return moments(*read_window(image, block))
+        try:
+            return moments(*read_window(image, block))
+        finally:
+            check_unchanged(files)
     except SatIntervalsError as error:
         error.__cause__ = error.__context__ = None
         raise
@@ -45,6 +49,7 @@ def match_tile(job: Job, tile: Tile) -> None:
 
 def _match_tile(job: Job, tile: Tile) -> None:
     job.store.check(job.manifest)
+    job.check_inputs()  # so that nothing is matched in vain
     job.store.check_space(tile)
     seconds: dict[str, float] = {}
     usable = {"left": 0, "right": 0}
@@ -63,7 +68,10 @@ def _match_tile(job: Job, tile: Tile) -> None:
     statistics = _checked_statistics(job)
     started = time.perf_counter()
     readers = reader(job.left, "left"), reader(job.right, "right")
-    patch = match_patch(*readers, tile.core, grid.region, image, config, statistics)
+    try:
+        patch = match_patch(*readers, tile.core, grid.region, image, config, statistics)
+    finally:  # a file that was replaced by a shorter one cannot be read
+        job.check_inputs()
     seconds["match"] = time.perf_counter() - started - seconds["read"]
     with timed(seconds, "write"):
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
@@ -72,16 +80,12 @@ def _match_tile(job: Job, tile: Tile) -> None:
 
 
 def _checked_statistics(job: Job) -> PairStatistics | None:
-    """Mean and standard deviation of the images, where MC-CNN needs them; its weights are those of the run."""
-    cost, normalization = job.config.cost, job.store.normalization()
-    if not isinstance(cost, Mccnn):
+    """Mean and standard deviation of the images, where MC-CNN needs them."""
+    if not isinstance(job.config.cost, Mccnn):
         return None
+    normalization = job.store.normalization()
     if normalization is None:
         raise RunError(f"what was measured of the images is lost in {job.store.folder}: run the same command again")
-    here, wanted = weights_identity(cost), job.inputs["weights"]
-    for key in ("sha256", "onnxruntime"):
-        if here[key] != wanted[key]:
-            raise SatIntervalsError(f"{here['path']} on this worker differs in {key} from {wanted['path']} of the run")
     return PairStatistics.of_report(normalization)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import whole_file
 
 try:
     from matplotlib import rc_context
@@ -34,7 +35,8 @@ def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterato
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
         try:
-            figure.savefig(path, dpi=dpi, metadata={"Software": "sat-intervals"})
+            with whole_file(path) as new:
+                figure.savefig(new, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
         except OSError as error:
             reason = error.strerror or error
             raise SatIntervalsError(f"{path} cannot be written: {reason}: make room or check its rights") from error

@@ -1,19 +1,21 @@
 """A folder of this machine, or of a disk that it shares with others."""
 
+import errno
 import fcntl
 import os
 import shutil
+import stat
 import time
 import uuid
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 from sat_intervals.errors import SatIntervalsError
 
-_LOCK = ".lock"
+# A file of this name that is regular and empty is ours; any other stays as it is.
+_LOCK = ".sat-intervals.lock"
 # Seconds for which a lock is tried.
 _PATIENCE = 0.2
 
@@ -78,7 +80,7 @@ class LocalFolder:
         file = self.path / name
         temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
         try:
-            temporary.write_text(text)
+            temporary.write_text(text, encoding="utf-8")
             yield temporary, file
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(file)) from error
@@ -129,54 +131,75 @@ class LocalFolder:
         SatIntervalsError
             When another run is at work there, or the folder cannot be used.
         """
-        with self._lock() as lock:
-            try:
-                yield
-            finally:
-                # whoever opened it meanwhile sees that it is gone, see _lock
-                Path(lock.name).unlink(missing_ok=True)
-                self.delete_if_empty()
+        lock = self._lock()
+        try:
+            yield
+        finally:
+            # whoever opened it meanwhile sees that it is gone, see _lock
+            with suppress(FileNotFoundError):
+                ours, there = os.fstat(lock), (self.path / _LOCK).lstat()
+                if os.path.samestat(ours, there) and not ours.st_size:
+                    (self.path / _LOCK).unlink()
+            os.close(lock)
+            self.delete_if_empty()
 
-    def _lock(self) -> TextIO:
-        """The lock's file, open and locked, under its name."""
+    def _lock(self) -> int:
+        """The descriptor of the lock's file, locked, under its name."""
         file = self.path / _LOCK
         end = time.monotonic() + _PATIENCE
         while True:
             is_late = time.monotonic() > end
             try:
                 self.path.mkdir(parents=True, exist_ok=True)
-                lock = file.open("w")
+                lock = _opened(file, os.O_RDWR | os.O_CREAT)
             except OSError as error:
                 if isinstance(error, (FileNotFoundError, FileExistsError)) and not is_late:
                     continue  # removed by the one who left
                 raise SatIntervalsError(f"{self} cannot be written: {error.strerror}: choose another folder") from error
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.path.samestat(os.fstat(lock.fileno()), file.stat()):
+                if os.path.samestat(os.fstat(lock), file.lstat()):
                     return lock
             except FileNotFoundError:
                 pass
             except BlockingIOError as error:
                 if is_late:  # else it may be held by one who only looks whether it is
-                    lock.close()
+                    os.close(lock)
                     raise SatIntervalsError(
                         f"another run is at work in {self}: wait for its end or choose another folder"
                     ) from error
                 time.sleep(_PATIENCE / 20)
             except OSError as error:
-                lock.close()
+                os.close(lock)
                 raise SatIntervalsError(
                     f"{self} cannot be locked: {error.strerror}: choose a folder on a disk that has locks"
                 ) from error
-            lock.close()  # it was removed, or replaced, before it was locked
+            os.close(lock)  # it was removed, or replaced, before it was locked
 
     def is_locked(self) -> bool:
         """Whether a run is at work there."""
         try:
-            with (self.path / _LOCK).open() as lock:
-                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            lock = _opened(self.path / _LOCK, os.O_RDONLY)
         except FileNotFoundError:
             return False
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
+        finally:
+            os.close(lock)
         return False
+
+
+def _opened(file: Path, flags: int) -> int:
+    """The descriptor of a lock's file as it is: neither truncated nor opened through a link."""
+    try:
+        lock = os.open(file, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(errno.ELOOP, f"{file.name} is a symbolic link") from error
+        raise
+    if not stat.S_ISREG(os.fstat(lock).st_mode):
+        os.close(lock)
+        raise OSError(errno.EINVAL, f"{file.name} is no regular file")
+    return lock

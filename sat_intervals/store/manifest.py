@@ -13,6 +13,8 @@ from sat_intervals.tiling import Grid, Window
 MANIFEST = "manifest.json"
 # The key of the checksum of all others.
 _SEAL = "crc32"
+# What a manifest says of a file beside its content: it does not matter where SHA-256 agrees.
+_BESIDE = ("modified", "stamp")
 
 
 class StoreError(SatIntervalsError):
@@ -91,7 +93,7 @@ def digest(manifest: Mapping[str, Any]) -> str:
     """A name of 32 digits that only manifests share in which `differences` finds none."""
 
     def without_times(there: dict[str, Any]) -> dict[str, Any]:
-        return {key: value for key, value in there.items() if key != "modified"}
+        return {key: value for key, value in there.items() if key not in _BESIDE}
 
     same = json.dumps(json.loads(json.dumps(manifest), object_hook=without_times), sort_keys=True)
     return hashlib.sha256(same.encode()).hexdigest()[:32]
@@ -100,10 +102,10 @@ def digest(manifest: Mapping[str, Any]) -> str:
 def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
     """The values in which two manifests differ, each with its path; when a file was changed does not count."""
     if isinstance(there, dict) and isinstance(wanted, dict):
-        for key in sorted(there.keys() | wanted.keys()):
+        for key in sorted((there.keys() | wanted.keys()) - set(_BESIDE)):
             yield from differences(there.get(key), wanted.get(key), f"{path}.{key}".lstrip("."))
     elif isinstance(there, list) and isinstance(wanted, list) and len(there) == len(wanted):
         for place, pair in enumerate(zip(there, wanted, strict=True)):
             yield from differences(*pair, f"{path}.{place}")
-    elif there != wanted and not path.endswith(".modified"):  # when does not matter where SHA-256 agrees
+    elif there != wanted:
         yield f"{path} was {json.dumps(there)}, now {json.dumps(wanted)}"

@@ -124,6 +124,7 @@ def object_tag(url: str) -> dict[str, Any]:
     """Size in bytes and ETag of an object; nothing where fsspec does not reach it."""
     try:
         system, path = fsspec.url_to_fs(url)
+        system.invalidate_cache(path)
         content = system.info(path)
     except Exception:  # of many libraries
         return {}

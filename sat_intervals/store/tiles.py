@@ -9,6 +9,7 @@ manifest may share a store that lies elsewhere than in the folder of one of them
 
 import errno
 import json
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -21,6 +22,7 @@ import numpy as np
 from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
+from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_free, drop
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
@@ -31,8 +33,6 @@ Records = Mapping[str, Mapping[str, Any]]
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
 LAYOUT = 5
 
-# In the folder of the run where its tiles lie elsewhere: it says where.
-_PLACE = "store.json"
 # In the folder of the run from the beginning of one that replaces another to its end.
 _REPLACING = "replacing"
 # In the folder of the run from when its files get their names until its tiles are removed: which run that is.
@@ -41,6 +41,9 @@ _FINISHED = "finished"
 
 class DamagedTilesError(RunError):
     """Tiles that are not what was written; they are no longer done."""
+
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class Store:
     ambiguities
         Largest ambiguity a pixel can have.
     elsewhere
-        Folder or fsspec URL where the tiles lie; by default ``home``.
+        Folder, in the store that the user names, where the tiles lie; by default ``home``.
     """
 
     home: Path
@@ -84,7 +87,8 @@ class Store:
         manifest
             All that decides the bytes of a tile; ``region`` and ``settings`` tell the tiles.
         overwrite
-            Whether what is there is dropped, wherever it lies, and the files of a run before are to be replaced.
+            Whether what is there is dropped, and the files of a run before are to be replaced. Tiles in a store that
+            the user does not name stay.
 
         Raises
         ------
@@ -94,10 +98,10 @@ class Store:
         """
         home, folder = folder_at(self.home), self.folder
         try:
-            before = self._before(overwrite)
+            before = self._place_before(overwrite)
             check_free(folder)
-            text = None if overwrite else before.read(MANIFEST) or None
-            if text is not None:
+            text = None if overwrite or before is None else before.read(MANIFEST) or None
+            if before is not None and text is not None:
                 check_same(text, before, manifest)
                 if before != folder:
                     raise StoreError(
@@ -105,9 +109,10 @@ class Store:
                         "--store to go on, or none where there was none, --overwrite to start afresh"
                     )
             folder.make("")  # so that what cannot be used is told before anything is dropped
-            if overwrite:
+            if overwrite and before is not None:
                 with suppress(OSError):  # what cannot be reached stays
-                    drop(before)
+                    if before == home or is_own(before):
+                        drop(before)
             if overwrite or (text is None and not self.elsewhere):
                 drop(folder)
             if folder.read(MANIFEST) == "":  # as a power loss leaves it
@@ -119,9 +124,9 @@ class Store:
             if overwrite:
                 home.write(_REPLACING, "")
             if self.elsewhere:
-                home.write(_PLACE, json.dumps(str(folder)))
+                home.write(PLACE, json.dumps(str(folder)))
             else:
-                home.delete(_PLACE)
+                home.delete(PLACE)
             self._arrays.create()
             if not folder.create(MANIFEST, sealed(manifest)):
                 self.check(manifest)
@@ -131,11 +136,16 @@ class Store:
                 "the package of its file system is installed (sat-intervals[remote] for s3://)"
             ) from error
 
-    def _before(self, overwrite: bool) -> Folder:
-        """Where the tiles lie that are there; where that cannot be read, this run says it anew."""
+    def _place_before(self, overwrite: bool) -> Folder | None:
+        """Where the tiles of the run before are; with ``overwrite`` None where that is not to be touched."""
         try:
-            return _place(self.home)
-        except StoreError:
+            return place_of(self.home, self.elsewhere and self.elsewhere.rpartition("/")[0])
+        except ElsewhereError as error:
+            if not overwrite:
+                raise
+            _LOG.warning("%s: they stay there", error.said)
+            return None
+        except StoreError:  # the note is damaged: the user says it anew
             if overwrite or self.elsewhere:
                 return self.folder
             raise
@@ -267,13 +277,13 @@ class Store:
 
     def remove(self) -> None:
         """Delete the tiles, and nothing else that may be in their folder."""
-        remove_tiles(self.home)
+        remove_tiles(self.home, self.folder)
 
 
-def remove_tiles(home: Path) -> None:
-    """Delete the tiles of the run to whose folder ``home`` belongs, wherever they lie."""
-    drop(_place(home))
-    for name in (_PLACE, _REPLACING, _FINISHED):
+def remove_tiles(home: Path, place: Folder) -> None:
+    """Delete the tiles in ``place`` of the run to whose folder ``home`` belongs."""
+    drop(place)
+    for name in (PLACE, _REPLACING, _FINISHED):
         folder_at(home).delete(name)
 
 
@@ -297,32 +307,12 @@ def is_replacing(home: Path) -> bool:
     return folder_at(home).read(_REPLACING) is not None
 
 
-def inputs_before(home: Path) -> dict[str, Any]:
+def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
     """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
     try:
-        return dict((unsealed(_place(home).read(MANIFEST)) or {}).get("inputs", {}))
+        return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
     except (OSError, TypeError, ValueError):
         return {}
-
-
-def _place(home: Path) -> Folder:
-    """Where the tiles lie of the run to whose folder ``home`` belongs.
-
-    Raises
-    ------
-    StoreError
-        When that cannot be read.
-    """
-    noted = folder_at(home).read(_PLACE)
-    if noted is None:
-        return folder_at(home)
-    try:
-        place = json.loads(noted)
-        if isinstance(place, str):
-            return folder_at(place)
-    except (ValueError, RecursionError):
-        pass
-    raise StoreError(f"{home / _PLACE} cannot be read: give the --store of before to go on, or --overwrite")
 
 
 def _checksums(records: Records) -> Checksums:
@@ -337,15 +327,17 @@ def _reason(text: str) -> str:
         return "its reason cannot be read"
 
 
-def store_of(home: Path) -> Store:
+def store_of(home: Path, store: str | None = None) -> Store:
     """The store of the run to whose folder ``home`` belongs, to be looked at: how far it is.
+
+    ``store`` is the one that the user names, see `place_of`.
 
     Raises
     ------
     StoreError
         Where there is none.
     """
-    folder = _place(home)
+    folder = place_of(home, store)
     text = folder.read(MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")

@@ -8,6 +8,7 @@ from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
+from sat_intervals.raster import whole_file
 from sat_intervals.results import Results
 from sat_intervals.show.report.contents import Counts, Pixels
 
@@ -24,15 +25,17 @@ def write_report(results: Results) -> Path:
     SatIntervalsError
         Rows that cannot be read, or a file that cannot be written.
     """
+    path = results.out / "report.html"
+    results.check_kept([path], [results.truth.image.path if results.truth else None])
     # Inside a script element a "<" of the contents could be taken for its end.
     contents = json.dumps(_contents(results), separators=(",", ":")).replace("<", "\\u003c")
     page = _asset("report.html")
     script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
     for name, text in (("style", _asset("report.css")), ("script", script), ("contents", contents)):
         page = page.replace(f"/* {name} */", text)
-    path = results.out / "report.html"
     try:
-        path.write_text(page, encoding="utf-8")
+        with whole_file(path) as new:
+            new.write_text(page, encoding="utf-8")
     except OSError as error:
         raise SatIntervalsError(f"{path} cannot be written: {error.strerror}: make room or check its rights") from error
     return path
