@@ -10,7 +10,7 @@ import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.tiling import Window
@@ -142,6 +142,7 @@ def check_pair(left: Image, right: Image, minimum: int, maximum: int) -> None:
 @contextmanager
 def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
     """A raster open for reading, of which ``window`` is wanted; what GDAL has against it is an `InputError`."""
+    check_regular(path)
     try:
         with gdal.reading(path) as dataset:
             yield dataset
