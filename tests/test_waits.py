@@ -174,7 +174,7 @@ def test_connected__refuses_processes_that_cannot_reach_each_other(tmp_path, mon
 def test_connected__ends_when_worker_processes_do_not_start(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "STARTING", 0.05)
     with (
-        pytest.raises(RunError, match=r"the 1 worker processes did not start within 0 s: give fewer --workers"),
+        pytest.raises(RunError, match=r"the 1 worker processes did not start within 0 s \(.*\): give fewer --workers"),
         connected(Cluster(kind="processes", workers=1), tmp_path),
     ):
         pass

@@ -142,10 +142,16 @@ def _local(settings: Cluster) -> LocalCluster:
                 silence_logs=logging.CRITICAL,
                 **({"death_timeout": STARTING} if processes else {}),
             )
-        except (RuntimeError, TimeoutError) as error:
+        except Exception as error:  # whatever keeps processes from starting, such as a full /dev/shm
+            if not processes:
+                raise
+            cause: BaseException = error
+            while cause.__cause__ is not None:
+                cause = cause.__cause__
+            why = " ".join(str(cause).split()) or type(cause).__name__
             raise RunError(
-                f"the {workers} worker processes did not start within {STARTING:.0f} s: give fewer --workers, or "
-                "--cluster threads"
+                f"the {workers} worker processes did not start within {STARTING:.0f} s ({why}): give fewer --workers "
+                "or more room in /dev/shm, or use --cluster threads"
             ) from error
 
 
