@@ -13,8 +13,8 @@ from sat_intervals.errors import SatIntervalsError
 _GEOGRAPHIC = "EPSG:4326"
 # Degrees beyond the area of a CRS at which its map still serves: the next UTM zone.
 _BEYOND = 6.0
-# By which a map's scale may be off: UTM reaches it 8 degrees from the middle of a zone.
-_LARGEST_DISTORTION = 0.01
+# By which a map's scale may be off: beyond what UTM has in the next zone (1 %), and polar maps at their edges (4 %).
+_LARGEST_DISTORTION = 0.05
 # Metres.
 _LARGEST_UNDULATION = 120.0
 
