@@ -4,8 +4,11 @@ The library is imported by the command that needs it: help and usage errors do n
 """
 
 import atexit
+import errno
 import gc
 import os
+import sys
+from contextlib import suppress
 from typing import Any
 
 import click
@@ -19,6 +22,7 @@ from sat_intervals.cli.export import export
 from sat_intervals.cli.match import match
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
+from sat_intervals.cli.process import check_process
 from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
@@ -26,6 +30,9 @@ from sat_intervals.cli.status import status
 from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
+# As of a process that SIGPIPE ends.
+READER_GONE = 141
+_NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
 RESUMED = ("match", "demo", "batch")
 
 
@@ -43,6 +50,8 @@ class _Commands(click.Group):
         atexit.register(gc.freeze)
         try:
             with armed():
+                if context.invoked_subcommand != "config":
+                    check_process()
                 return super().invoke(context)
         except click.exceptions.Exit:
             raise
@@ -54,7 +63,27 @@ class _Commands(click.Group):
             again = "; the same command goes on from the tiles that are done" if resumed else ""
             return _end(ended.status, f"{ended}{again}")
         except Exception as error:
+            if isinstance(error, OSError) and _is_of_stdout(error):
+                _forget_stdout()
+                if isinstance(error, BrokenPipeError):
+                    raise click.exceptions.Exit(READER_GONE) from None
+                return _end(FAILED, f"stdout cannot be written: {error.strerror}")
             return _end(*_explained(error))
+
+
+def _is_of_stdout(error: OSError) -> bool:
+    """Whether what is printed failed to be written: it has no file name, and comes from those who print."""
+    trace = error.__traceback__
+    while trace and trace.tb_next:
+        trace = trace.tb_next
+    place = trace.tb_frame.f_globals.get("__name__", "") if trace else ""
+    return error.filename is None and place.startswith(("click.", "rich.", "sat_intervals.cli."))
+
+
+def _forget_stdout() -> None:
+    """Let nobody complain at the end of the process of what stdout did not take."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _explained(error: Exception) -> tuple[int, str]:
@@ -64,11 +93,18 @@ def _explained(error: Exception) -> tuple[int, str]:
         return FAILED, str(error)
     if isinstance(error, SatIntervalsError):
         return USER_ERROR, str(error)
+    if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+        return FAILED, f"{_NO_MEMORY} ({error})"
     if isinstance(error, OSError) and error.strerror:
         return FAILED, f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, MemoryError):
-        return FAILED, f"not enough memory: choose a smaller --tile-size or fewer --workers ({error})"
-    return FAILED, f"{type(error).__name__}: {error} (this should not happen; --debug shows where)"
+        return FAILED, f"{_NO_MEMORY} ({error})"
+    line = " ".join(str(error).split())
+    if isinstance(error, SystemError):  # Python's word for a library that failed and did not say why
+        return FAILED, f"a library failed without a reason, as they do out of memory: {_NO_MEMORY} ({line})"
+    if isinstance(error, ValueError) and line.startswith("A dask config file"):
+        return USER_ERROR, f"{line}: mend it, or point DASK_CONFIG elsewhere"
+    return FAILED, f"{type(error).__name__}: {line} (this should not happen; --debug shows where)"
 
 
 def _end(status: int, message: str) -> None:

@@ -26,12 +26,21 @@ STAGES = {
 }
 
 
+class _Terminal(Terminal):
+    """A terminal whose reader may go: rich would end the process with status 1."""
+
+    def on_broken_pipe(self) -> None:
+        """Called inside the handler of a BrokenPipeError."""
+        self.quiet = True
+        raise BrokenPipeError
+
+
 class Console:
     """Progress as a bar on a terminal, as plain lines elsewhere, not at all when quiet."""
 
     def __init__(self, quiet: bool) -> None:
         # A path is no markup: square brackets and colons in it are its own.
-        self._terminal = Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
+        self._terminal = _Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, Regularization, load_config
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS
 from sat_intervals.raster import (
@@ -213,6 +213,7 @@ def open_run(out: str | Path) -> Run:
     out = Path(out)
     file = out / "run.json"
     try:
+        check_regular(file)
         report = json.loads(file.read_text(encoding="utf-8"))
         config = load_config(report["settings"])
         for side in ("left", "right"):

@@ -223,6 +223,25 @@ def low_confidence(confidence, threshold, kernel):
     return low
 
 
+def textureless(view, minimum, count, window):
+    """Section 4: no usable window of the pixel and of its candidates changes along a row."""
+    radius = window // 2
+    result = np.zeros(view.left.shape, bool)
+
+    def flat(image, state, r, c):
+        """None where the window is not usable."""
+        rows, columns = image.shape
+        if not (radius <= r < rows - radius and radius <= c < columns - radius):
+            return None
+        around = np.s_[r - radius : r + radius + 1, c - radius : c + radius + 1]
+        return None if state[around].any() else bool((np.ptp(image[around], axis=1) == 0).all())
+
+    for r, c in np.ndindex(result.shape):
+        candidates = [flat(view.right, view.right_state, r, c + minimum + k) for k in range(count)]
+        result[r, c] = flat(view.left, view.left_state, r, c) is True and False not in candidates
+    return result
+
+
 # ---- 5. Possibility and alpha-cut --------------------------------------------------------------------------
 def alpha_cut(volume, alpha, cost_span, extend):
     """Section 5: the first and the last index with possibility >= alpha, pushed out at S = min S."""
@@ -439,15 +458,16 @@ def facing_winners(view, volume, config):
 
 
 def percentiles_of(amounts, searched, config):
-    """Section 4: p1 and p99 as given, or 0 and the largest possible ambiguity, or of the whole image."""
+    """Section 4: p1 and p99 as given, of the whole image, or 0 and the largest ambiguity if those are equal."""
     settings = config.ambiguity
     if settings.p1 is not None:
         return settings.p1, settings.p99
+    largest = float(len(etas(settings.eta_max, settings.eta_step)) * config.disparity.count)
     if settings.normalization == "range":
-        count = config.disparity.maximum - config.disparity.minimum + 1
-        return 0.0, float(len(etas(settings.eta_max, settings.eta_step)) * count)
+        return 0.0, largest
     histogram = np.bincount(amounts[searched])
-    return float(percentile(histogram, 1)), float(percentile(histogram, 99))
+    p1, p99 = float(percentile(histogram, 1)), float(percentile(histogram, 99))
+    return (p1, p99) if p1 < p99 else (0.0, largest)
 
 
 def match_arrays(left, right, left_state, right_state, config):
@@ -471,9 +491,11 @@ def match_arrays(left, right, left_state, right_state, config):
         refined[:] = False
     flags = validity(left_state, left_windows, right_windows, refined)
     lower, upper = (np.full(winner.shape, np.nan, np.float32) for _ in range(2))
+    doubtful = searched & textureless(view, minimum, config.disparity.count, config.cost.window)
     if config.interval is not None:
         bounds = alpha_cut(volume, config.interval.alpha, cost_span, extend=config.refinement is not None)
         lower, upper = (np.where(searched, b + minimum, np.nan).astype(np.float32) for b in bounds)
+        lower[doubtful], upper[doubtful] = minimum, maximum
     raw = SimpleNamespace(volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags)
 
     flags = flags.copy()
@@ -485,6 +507,7 @@ def match_arrays(left, right, left_state, right_state, config):
     confidence = np.full(winner.shape, np.nan, np.float32)
     if config.ambiguity is not None and searched.any():
         amounts = ambiguity(volume, config.ambiguity.eta_max, config.ambiguity.eta_step, cost_span)
+        amounts[doubtful] = len(etas(config.ambiguity.eta_max, config.ambiguity.eta_step)) * config.disparity.count
         confidence = normalize(amounts, searched, *percentiles_of(amounts, searched, config))
 
     if config.median is not None:

@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from sat_intervals.config import Ambiguity
 from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import Settings, match
+from sat_intervals.match.postprocess import confidence_scale
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
 
@@ -135,6 +137,14 @@ def test_percentiles__of_a_very_large_image():
 
 def test_percentiles__of_nothing_is_nan():
     assert np.isnan(percentiles(np.zeros(5, np.int64))).all()
+
+
+def test_confidence_scale__of_equal_percentiles_is_the_whole_range():
+    histogram = np.zeros(71, np.int64)
+    histogram[[3, 40]] = 1, 1000
+    assert confidence_scale(Ambiguity(), histogram) == (0, 70)
+    histogram[3] = 100
+    assert confidence_scale(Ambiguity(), histogram) == (3, 40)
 
 
 # ---- Confidence --------------------------------------------------------------------------------------------

@@ -391,6 +391,34 @@ def test_match_arrays__equals_reference(seed, config, holes):
 
 
 @some
+@given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3), left_also=st.booleans())
+def test_match_arrays__equals_reference_where_texture_ends(seed, config, holes, left_also):
+    left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
+    first = int(seed % 14)
+    right[:, first:] = 7
+    if left_also:
+        left[:, first:] = 5
+    left[left_state != 0] = np.nan
+    right[right_state != 0] = np.nan
+    found = match_arrays(left, right, config)
+    expected = reference.match_arrays(left, right, left_state * 0, right_state * 0, config)
+    bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
+    check(bands, found["validity"].values, expected)
+
+
+@pytest.mark.parametrize("more", [{}, {"sgm": None}, {"cross_check": {"method": "accurate"}}])
+@pytest.mark.parametrize(("minimum", "maximum"), [(0, 60), (-30, 30), (-60, 0)])
+def test_match_arrays__of_images_without_texture_is_certain_of_nothing(minimum, maximum, more):
+    flat = np.full((40, 200), 65535, np.uint16)
+    found = match_arrays(flat, flat, {"disparity": {"minimum": minimum, "maximum": maximum}} | more)
+    valid = found["validity"].values & INVALID == 0
+    assert valid.any()
+    assert (found["lower"].values[valid] == minimum).all()
+    assert (found["upper"].values[valid] == maximum).all()
+    assert (found["confidence"].values[valid] == 0).all()
+
+
+@some
 @given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3))
 def test_match_arrays__interval_holds_the_disparity(seed, config, holes):
     left, right, left_state, right_state = image_pair(seed, config.disparity, holes)

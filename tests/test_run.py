@@ -64,6 +64,25 @@ def test_match_pair__equals_match_arrays_in_one_tile(pair, tmp_path, more):
     np.testing.assert_array_equal(validity, whole["validity"])
 
 
+def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
+    left, right, settings = pair
+    match_pair(left, right, tmp_path / "textured", settings, window=Window(100, 100, 64, 64))
+    warned = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert not warned
+    with rasterio.open(left) as file:
+        pixels, profile = file.read(1), file.profile
+    pixels[:, 60:] = 900
+    for name in ("left", "right"):
+        with rasterio.open(tmp_path / f"{name}.tif", "w", **profile) as file:
+            file.write(pixels, 1)
+    flat = {"disparity": {"minimum": -4, "maximum": 4}}
+    counts = match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "out", flat)["counts"]
+    _, lower, upper, _ = bands(tmp_path / "out")[0]
+    assert counts["ambiguous"] == ((lower == -4) & (upper == 4)).sum() > counts["valid"] / 2
+    (record,) = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert f"left.tif: the interval of {counts['ambiguous']} of {counts['valid']} valid pixels" in record.getMessage()
+
+
 @pytest.mark.parametrize("more", [{}, {"cross_check": {"method": "accurate"}}])
 def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, tmp_path, more):
     left, right, settings = pair

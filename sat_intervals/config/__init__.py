@@ -1,7 +1,7 @@
 """What a user may set: its default, its range, its one-line meaning, and the thresholds that follow."""
 
 from sat_intervals.config.penalties import InverseSgm, MccnnSgm, NegativeSgm, Sgm
-from sat_intervals.config.reading import load_config, load_yaml, preset_names, preset_text
+from sat_intervals.config.reading import load_config, load_yaml, preset_names, preset_text, read_small
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -34,4 +34,5 @@ __all__ = [
     "load_yaml",
     "preset_names",
     "preset_text",
+    "read_small",
 ]

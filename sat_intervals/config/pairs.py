@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.config.reading import read_small
+from sat_intervals.errors import SatIntervalsError, check_regular
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
 _COLUMNS = ("left", "right", "truth", "minimum", "maximum")
@@ -77,7 +78,9 @@ def group_beside(image: str | Path) -> str:
 
 def _meta(file: Path) -> dict[str, Any]:
     try:
-        meta = json.loads(file.read_text(encoding="utf-8"))
+        meta = json.loads(read_small(file).decode())
+    except SatIntervalsError:
+        raise
     except OSError as error:
         raise SatIntervalsError(f"{file} cannot be read: {error.strerror}") from error
     except ValueError as error:
@@ -103,6 +106,7 @@ def _of_folder(folder: Path) -> Pair:
 
 
 def _of_table(file: Path) -> list[Pair]:
+    check_regular(file)
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets begin with a mark
             reader = csv.DictReader(stream)

@@ -11,6 +11,10 @@ from pydantic import ValidationError
 from sat_intervals.config.sections import ConfigError
 from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import explained, known, shown
+from sat_intervals.errors import SatIntervalsError, check_regular
+
+# Bytes of a file of settings or pairs, and nodes of YAML of a file of settings, an alias counted as what it repeats.
+_LARGEST_FILE, _NODES = 10**6, 10_000
 
 
 def load_config(
@@ -97,8 +101,27 @@ def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
     return bool(path)  # an error without a path is between sections
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML's safe subset, where a key given twice is an error: plain YAML keeps the last without a word."""
+class _Loader(yaml.SafeLoader):
+    """YAML's safe subset with a bounded number of nodes, where a key given twice is an error.
+
+    Plain YAML keeps the last of two keys without a word, and some lines of aliases in aliases or merge keys fill any
+    memory.
+    """
+
+    def __init__(self, text: str | bytes, most: int) -> None:
+        super().__init__(text)
+        self._most, self._nodes = most, 0
+        self._sizes: dict[int, int] = {}
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        before, event = self._nodes, self.peek_event()  # type: ignore[no-untyped-call]
+        node = super().compose_node(parent, index)
+        self._nodes += self._sizes.get(id(node), 1) if isinstance(event, yaml.AliasEvent) else 1
+        if self._nodes > self._most:
+            problem = f"more than {self._most} values, those that aliases repeat included: give fewer"
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+        self._sizes.setdefault(id(node), self._nodes - before)
+        return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -112,20 +135,42 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return node
 
 
-def load_yaml(text: str | bytes) -> Any:
-    """What a text of YAML holds; a key given twice is an error.
+def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
+    """What a text of YAML holds; a key given twice is an error, and so are more than ``most`` nodes.
 
     Raises
     ------
     yaml.YAMLError, ValueError, RecursionError
         For what is none.
     """
-    return yaml.load(text, _UniqueKeyLoader)  # a SafeLoader
+    loader = _Loader(text, most)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
+
+
+def read_small(file: Path) -> bytes:
+    """Content of a file of settings or pairs.
+
+    Raises
+    ------
+    OSError
+        For a file that cannot be read.
+    SatIntervalsError
+        For one of more than 1 MB, and for what is no regular file.
+    """
+    check_regular(file)
+    with file.open("rb") as stream:
+        content = stream.read(_LARGEST_FILE + 1)
+    if len(content) > _LARGEST_FILE:
+        raise SatIntervalsError(f"{file} has more than {_LARGEST_FILE // 10**6} MB: is it the right file?")
+    return content
 
 
 def _read_yaml(file: Path) -> Mapping[str, Any]:
     try:
-        values = load_yaml(file.read_bytes())
+        values = load_yaml(read_small(file))
     except OSError as error:
         preset = (
             isinstance(error, FileNotFoundError) and file.name == f"{file.stem}.yaml" and file.stem in preset_names()
@@ -135,6 +180,8 @@ def _read_yaml(file: Path) -> Mapping[str, Any]:
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(f"{file}: {line}{error.problem}") from error
+    except SatIntervalsError:
+        raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{file}: {' '.join(str(error).split())}") from error
     if values is None:

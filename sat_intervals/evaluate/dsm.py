@@ -8,7 +8,15 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.metrics import Histogram
-from sat_intervals.raster import Georeferencing, is_surface, read_heights, read_layers, read_place, resolution_of
+from sat_intervals.raster import (
+    Georeferencing,
+    check_reference,
+    is_surface,
+    read_heights,
+    read_layers,
+    read_place,
+    resolution_of,
+)
 from sat_intervals.tiling import Window, strips
 
 # Judged heights of a strip, some hundred bytes each.
@@ -74,6 +82,7 @@ def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, An
     if not is_surface(surface):
         raise SatIntervalsError(f"{surface} is no surface model of sat-intervals dsm: is it the --reference?")
     read_place(reference)
+    check_reference(reference, surface)
     assert place.pixel_size is not None
     finer = max(1, round(place.pixel_size[0] / resolution_of(reference, place)))
     whole = _Class()

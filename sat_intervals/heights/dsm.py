@@ -6,6 +6,7 @@ never filled.
 """
 
 import math
+import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -40,6 +41,8 @@ _TILE_ROWS, _TILE_COLUMNS = 512, 2048
 _STRIP_CELLS, _LOWEST = 1 << 22, 64
 # A surface of more cells than this for a point is a wrong resolution, or points of two places.
 _CELLS_PER_POINT = 1000
+# Cells that a point reaches: the work grows with their square.
+_REACH = 32
 # Metres: no cell is wider, and no point reaches further.
 _LARGEST = 10_000.0
 
@@ -93,6 +96,11 @@ def make_surface(
     for name, value in (("resolution", resolution), ("radius", radius)):
         if not 0 < value <= _LARGEST:
             raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, up to {_LARGEST:g}")
+    if radius > _REACH * resolution:
+        raise SatIntervalsError(
+            f"radius is {radius:g} m, {radius / resolution:.0f} cells of {resolution:g} m: choose at most "
+            f"{_REACH * resolution:g} m, or a coarser --resolution"
+        )
     if interval not in ("envelope", "mean"):
         raise SatIntervalsError(f"interval is {interval!r}, allowed: envelope or mean")
     _check_target(path)
@@ -198,10 +206,11 @@ def _place(cells: Cells, crs: str) -> Georeferencing:
 def _strips(
     threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, interval: str
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Bands of full-width strips, from the top, with the first row of each."""
+    """Bands of full-width strips, from the top, with the first row of each; tiles in work end early at an error."""
+    ended = threading.Event()
 
     def tile(window: Window) -> np.ndarray:
-        return fused([cells_of_run(cloud.splat(cells, window, radius), interval) for cloud in clouds])
+        return fused([cells_of_run(cloud.splat(cells, window, radius, ended), interval) for cloud in clouds])
 
     rows = min(_TILE_ROWS, max(_LOWEST, _STRIP_CELLS // cells.columns))
     for row in range(0, cells.rows, rows):
@@ -210,4 +219,9 @@ def _strips(
             Window(row, column, height, min(_TILE_COLUMNS, cells.columns - column))
             for column in range(0, cells.columns, _TILE_COLUMNS)
         )
-        yield row, np.concatenate(list(threads.map(tile, windows)), axis=2)
+        try:
+            tiles = list(threads.map(tile, windows))
+        except BaseException:
+            ended.set()
+            raise
+        yield row, np.concatenate(tiles, axis=2)

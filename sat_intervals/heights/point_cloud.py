@@ -1,6 +1,7 @@
 """Points of a run on the map, and the cells of a surface model that they reach."""
 
 import math
+import threading
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -107,11 +108,16 @@ class PointCloud:
         left, bottom, right, top = zip(*(extent for _, extent in self._extents), strict=True)
         return Extent(min(left), min(bottom), max(right), max(top))
 
-    def splat(self, cells: Cells, window: Window, radius: float) -> np.ndarray:
-        """What the points gather in a window of the cells, see `kernels.splat`; ``radius`` in metres."""
+    def splat(self, cells: Cells, window: Window, radius: float, ended: threading.Event) -> np.ndarray:
+        """What the points gather in a window of the cells, see `kernels.splat`; ``radius`` in metres.
+
+        Once ``ended`` is set, nobody waits for the rest.
+        """
         gathered = empty_cells(window.height, window.width)
         place = cells.extent(window)
         for source, extent in self._extents:
+            if ended.is_set():
+                break
             if extent.grown(radius).meets(place):
                 bands = read_layers(self._path, source)
                 known = np.isfinite(bands[_POINT["height"]])

@@ -1,6 +1,7 @@
 """From the pixels of two views to the matching costs of areas, and to the penalties that their gradients make."""
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -62,11 +63,12 @@ class Area(NamedTuple):
 
 
 class MatchingCost(NamedTuple):
-    """What the kernels match an area by, and the states of its base's pixels."""
+    """What the kernels match an area by, the states of its base's pixels, and which of them are `_textureless`."""
 
     costs: Costs
     gradients: Gradients | None
     state: np.ndarray
+    textureless: np.ndarray
 
 
 class _View(NamedTuple):
@@ -105,8 +107,14 @@ def cost_areas(
         costs = _correlations(*views, areas, statistics, load_network(weights_file(config.cost.weights)))
     else:
         costs = _hamming(*views, areas, config.cost.window)
+    varying = [_varies(view) for view in views]
     return [
-        MatchingCost(found, _gradients(area, *views, config, statistics), _of_base(area, *views))
+        MatchingCost(
+            found,
+            _gradients(area, *views, config, statistics),
+            _of_base(area, *views),
+            _textureless(area, found, *views, *varying),
+        )
         for area, found in zip(areas, costs, strict=True)
     ]
 
@@ -121,6 +129,35 @@ def _read(read: Reader, windows: list[Window], config: Config) -> _View:
 def _of_base(area: Area, left: _View, right: _View) -> np.ndarray:
     view = right if area.mirrored else left
     return view.inner(view.state, area.base)
+
+
+# ---- Texture -----------------------------------------------------------------------------------------------
+def _varies(view: _View) -> np.ndarray:
+    """Where a pixel's window changes along any of its rows: bool of the view's window."""
+    height, width, radius = view.window.height, view.window.width, view.radius
+    differs = view.pixels[:, 1:] != view.pixels[:, :-1]
+    in_column = reduce(np.logical_or, (differs[row : row + height] for row in range(2 * radius + 1)))
+    varies: np.ndarray = reduce(np.logical_or, (in_column[:, column : column + width] for column in range(2 * radius)))
+    return varies
+
+
+def _textureless(
+    area: Area, costs: Costs, left: _View, right: _View, left_varies: np.ndarray, right_varies: np.ndarray
+) -> np.ndarray:
+    """Pixels of the base whose window, and all usable windows that it faces, do not change along the row.
+
+    All their candidates cost the same. SGM would still choose among them, by what it carries in from the images' ends.
+    """
+    base, there = (right, left) if area.mirrored else (left, right)
+    base_varies, there_varies = (right_varies, left_varies) if area.mirrored else (left_varies, right_varies)
+    flat: np.ndarray = ~base_varies[area.base.relative_to(base.window).slices] & (costs.left_state == 0)
+    if not flat.any():
+        return flat
+    telling = there_varies[area.facing.relative_to(there.window).slices] & (costs.right_state == 0)
+    upto = np.pad(np.cumsum(telling, axis=1, dtype=np.int32), [(0, 0), (1, 0)])
+    columns = area.base.width
+    flat &= upto[:, -columns:] == upto[:, :columns]
+    return flat
 
 
 # ---- Census ------------------------------------------------------------------------------------------------

@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 
 # Pixels around one that its feature sees.
 RADIUS = 5
 # The distribution of the official weights, and the file that the reference implementation takes.
 _DISTRIBUTION, _OFFICIAL = "MCCNN", "mc_cnn_fast_int8_excl_01.onnx"
 _INSTALL = "pip install sat-intervals[mccnn]"
+# Bytes of a file of weights; the official one has 0.4 MB.
+_LARGEST = 256 * 10**6
 # How far from 1 a feature may be long.
 _UNIT = 1e-3
 
@@ -31,8 +33,15 @@ def weights_file(weights: str | None) -> Path:
         There is none.
     """
     if weights is not None:
+        check_regular(weights)
         if not Path(weights).is_file():
             raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or null")
+        size = Path(weights).stat().st_size
+        if size > _LARGEST:
+            raise SatIntervalsError(
+                f"cost.weights {weights} has {size / 1e6:.0f} MB, a network like MC-CNN has less than "
+                f"{_LARGEST / 1e6:.0f} MB: name an ONNX network, or null"
+            )
         return Path(weights).resolve()
     try:
         found = [file for file in files(_DISTRIBUTION) or [] if file.name == _OFFICIAL]

@@ -84,6 +84,7 @@ def match_patch(
     raw, right_view = _matched(matching_costs[0], areas[0], settings, output, seen)
     inside = output.relative_to(areas[0].base).slices
     raw.validity[matching_costs[0].state[inside] & MASKED != 0] |= LEFT_MASKED
+    _doubt(raw, matching_costs[0].textureless[inside], config)
     if method == "accurate":
         right_view = _match_from_right(matching_costs[1], areas[1], core, settings)
     return Patch(raw, output, right_view)
@@ -93,6 +94,14 @@ def _matched(cost: MatchingCost, area: Area, settings: Settings, output: Window,
     """Match an area; returns the products of ``output`` and the right view of ``core``."""
     windows = output.relative_to(area.base), core.relative_to(area.base)
     return match(cost.costs, settings, *windows, cost.gradients)
+
+
+def _doubt(raw: Raw, textureless: np.ndarray, config: Config) -> None:
+    """Give pixels without texture the whole search range as interval, and the largest ambiguity."""
+    doubtful = textureless & (raw.winner != NO_DISPARITY)
+    if config.interval:
+        raw.lower[doubtful], raw.upper[doubtful] = config.disparity.minimum, config.disparity.maximum
+    raw.ambiguity[doubtful] = config.largest_ambiguity
 
 
 def _seen_area(core: Window, image: Window, config: Config) -> Area:

@@ -64,13 +64,16 @@ class ConfidenceScale(NamedTuple):
 def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceScale:
     """What confidence is relative to: given figures, the whole range, or percentiles of the whole image.
 
+    Equal percentiles do not tell pixels apart, so the whole range takes their place.
+
     ``histogram`` counts the ambiguities, ``0 .. etas * count``, of all pixels with a possible candidate.
     """
     if settings.p1 is not None and settings.p99 is not None:
         return ConfidenceScale(settings.p1, settings.p99)
-    if settings.normalization == "range":
+    p1, p99 = percentiles(histogram)
+    if settings.normalization == "range" or p1 == p99:
         return ConfidenceScale(0.0, float(histogram.size - 1))
-    return ConfidenceScale(*percentiles(histogram))
+    return ConfidenceScale(p1, p99)
 
 
 def halo(config: Config) -> int:

@@ -15,7 +15,7 @@ from sat_intervals.raster.layers import (
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
-from sat_intervals.raster.surfaces import is_surface, read_heights, read_place, resolution_of
+from sat_intervals.raster.surfaces import check_reference, is_surface, read_heights, read_place, resolution_of
 from sat_intervals.raster.windows import read_window
 from sat_intervals.raster.writer import OutputError, OutputWriter, check_space
 
@@ -31,6 +31,7 @@ __all__ = [
     "OutputWriter",
     "Projection",
     "check_pair",
+    "check_reference",
     "check_space",
     "is_surface",
     "north_up",

@@ -1,5 +1,6 @@
 """Images in: what a raster file holds, and whether two make a pair."""
 
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +11,7 @@ import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.tiling import Window
@@ -19,6 +20,8 @@ from sat_intervals.tiling import Window
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
 # Pixel sizes that differ by less, relatively, are one size written with other digits.
 _SAME_SIZE = 1e-6
+
+_LOG = logging.getLogger(__name__)
 
 
 class InputError(SatIntervalsError):
@@ -105,6 +108,14 @@ def open_image(
             mask=None if mask is None else _absolute(mask),
             georeferencing=Georeferencing.of(dataset),
         )
+        if dataset.colorinterp[band - 1] == ColorInterp.palette:
+            raise InputError(
+                f"{name}: band {band} has a colour table, so its values are no grey levels: expand it first, as by "
+                "gdal_translate -expand gray"
+            )
+        pages = len(dataset.subdatasets) if dataset.driver == "GTiff" else 0
+    if pages > 1:
+        _LOG.warning("%s has %d pages: the first is taken; name another as GTIFF_DIR:2:%s", name, pages, name)
     if "complex" in image.dtype:
         raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
     if image.mask is not None:
@@ -142,6 +153,7 @@ def check_pair(left: Image, right: Image, minimum: int, maximum: int) -> None:
 @contextmanager
 def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
     """A raster open for reading, of which ``window`` is wanted; what GDAL has against it is an `InputError`."""
+    check_regular(path)
     try:
         with gdal.reading(path) as dataset:
             yield dataset

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS, Proj, Transformer
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
@@ -13,6 +13,8 @@ from sat_intervals.errors import SatIntervalsError
 _GEOGRAPHIC = "EPSG:4326"
 # Degrees beyond the area of a CRS at which its map still serves: the next UTM zone.
 _BEYOND = 6.0
+# By which a map's scale may be off: beyond what UTM has in the next zone (1 %), and polar maps at their edges (4 %).
+_LARGEST_DISTORTION = 0.05
 # Metres.
 _LARGEST_UNDULATION = 120.0
 
@@ -56,6 +58,7 @@ class Projection:
             raise SatIntervalsError(f"{crs} ({target.name}) has heights too: give a map alone, and a geoid by --geoid")
         self.crs = crs
         self._area = target.area_of_use
+        self._proj = Proj(target)
         self._map = Transformer.from_crs(_GEOGRAPHIC, target, always_xy=True)
         self._geoid = None if geoid is None else _geoid(geoid)
 
@@ -71,6 +74,13 @@ class Projection:
                     f"{self.crs} is for longitudes {area.west:g} to {area.east:g} and latitudes {area.south:g} to "
                     f"{area.north:g}, the points are at {here}: give the CRS of this place, or none for its UTM zone"
                 )
+        factors = self._proj.get_factors(longitude, latitude)
+        scale = max(factors.meridional_scale, factors.parallel_scale, key=lambda factor: abs(factor - 1))
+        if not abs(scale - 1) <= _LARGEST_DISTORTION:
+            raise SatIntervalsError(
+                f"a metre of {self.crs} is {1 / scale:.3g} m on the ground at {here}: give a map true to scale there, "
+                f"such as its UTM zone {utm_of(longitude, latitude)}"
+            )
         undulation = float(self.undulation(np.array([longitude]), np.array([latitude]))[0])
         if not abs(undulation) <= _LARGEST_UNDULATION:
             raise SatIntervalsError(

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pyproj
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform
@@ -38,6 +39,30 @@ def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
         if place.crs is None or place.transform is None or place.transform.b or place.transform.d:
             raise SatIntervalsError(f"{path} does not say where it lies: give a north-up raster with a CRS")
         return dataset.shape, place
+
+
+def check_reference(path: Path, surface: Path) -> None:
+    """Refuse reference heights that cannot be laid on a surface model, or count from another level.
+
+    Raises
+    ------
+    SatIntervalsError
+        A CRS that is local, or one with heights above a geoid where those of the surface are above the ellipsoid.
+    """
+    with opened(str(path)) as dataset:
+        crs = pyproj.CRS.from_wkt(dataset.crs.to_wkt())
+    with opened(str(surface)) as dataset:
+        level = dataset.tags().get("HEIGHTS", "")
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    if not (parts[0].is_geographic or parts[0].is_projected):
+        raise SatIntervalsError(
+            f"the CRS of {path}, {crs.name}, is a local one: give a reference with a CRS of the Earth"
+        )
+    if len(parts) > 1 and level.endswith("ellipsoid") and "ellipsoid" not in parts[1].name.lower():
+        raise SatIntervalsError(
+            f"{path} has heights of {parts[1].name}, {surface} heights {level}: make the surface with --geoid, or "
+            "bring the reference to the ellipsoid"
+        )
 
 
 def resolution_of(path: Path, place: Georeferencing) -> float:

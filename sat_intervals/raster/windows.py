@@ -4,11 +4,13 @@ import numpy as np
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.products import MASKED, NO_DATA
-from sat_intervals.raster.images import Image, opened
+from sat_intervals.raster.images import Image, InputError, opened
 from sat_intervals.tiling import Window
 
 # Types whose every value is a float32.
 _FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
+# Integers up to this are floats of 64 bits.
+_EXACT = 2**53
 
 
 def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
@@ -35,8 +37,20 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
     if inside.height and inside.width:
         place = inside.relative_to(window).slices
         values, state[place] = read_inside(image, inside)
+        _check_exact(image.path, values, state[place] == 0)
         np.copyto(pixels[place], values, where=state[place] == 0)
     return pixels, state
+
+
+def _check_exact(path: str, values: np.ndarray, usable: np.ndarray) -> None:
+    """Refuse integers of which float64 would make one what are several."""
+    if values.dtype.kind in "iu" and values.dtype.itemsize == 8:
+        large = usable & ((values > _EXACT) | (values < -_EXACT if values.dtype.kind == "i" else False))
+        if large.any():
+            raise InputError(
+                f"{path} has {values.dtype} values such as {values[large][0]}, beyond 2^53, which lose their texture "
+                "as float64: subtract an offset, or give their no-data value"
+            )
 
 
 def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """From the tiles of a job to the files of its run: strips, final bands, report."""
 
 import json
+import logging
 import platform
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +28,10 @@ Item = TypeVar("Item")
 
 # Pixels of a strip, in whole rows: what is held of one takes about 100 bytes a pixel, several times.
 STRIP_PIXELS = 1 << 20
+# Disparities up to which refinement alone makes an interval the whole search range.
+_FEW = 3
+
+_LOG = logging.getLogger(__name__)
 
 
 def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_tiles: bool = False) -> dict[str, Any]:
@@ -78,6 +83,7 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
         report = _report(job, scale, tally, seconds, seams)
+        _warn_of_ambiguity(job, report["counts"])
         if not keep_tiles:
             mark_finished(store.home, job.name)
         writer.publish(report=("run.json", json.dumps(report, indent=1) + "\n"))
@@ -130,6 +136,17 @@ def _check_matched(job: Job, records: Records, searched: int) -> None:
         f"no pixel of {job.left.path} can be matched in {job.right.path} over disparities {search.minimum} to "
         f"{search.maximum}, {reason}: check no-data values, masks, window and search range"
     )
+
+
+def _warn_of_ambiguity(job: Job, counts: dict[str, Any]) -> None:
+    """Say that most intervals tell nothing."""
+    search = job.config.disparity
+    if 2 * counts["ambiguous"] > counts["valid"] and search.count > _FEW:
+        _LOG.warning(
+            "%s: the interval of %d of %d valid pixels is the whole search range %d to %d: there the images have no "
+            "texture that tells disparities apart",
+            job.left.path, counts["ambiguous"], counts["valid"], search.minimum, search.maximum,
+        )  # fmt: skip
 
 
 def _tags(config: Config) -> dict[str, str]:

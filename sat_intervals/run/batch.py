@@ -18,8 +18,8 @@ from typing import Any
 import yaml
 from distributed import Client
 
-from sat_intervals.config import Cluster, Config, load_config, load_yaml
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.config import Cluster, Config, load_config, load_yaml, read_small
+from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image, other_files
 from sat_intervals.raster.identity import check_not_replaced
@@ -36,6 +36,8 @@ from sat_intervals.store.tiles import remove_tiles
 _LOG = logging.getLogger(__name__)
 
 _IMAGES = ("left", "right", "left_mask", "right_mask")
+# Nodes of a list of pairs in YAML or JSON, which may have thousands of rows.
+_NODES = 200_000
 # Names in the folder of a batch that are not those of pairs.
 _TAKEN = (REPORT, "logs")
 # Completes settings whose search range the pairs bring.
@@ -67,8 +69,13 @@ def read_batch(file: Path) -> list[PairOfBatch]:
         With file, row and what is wrong there.
     """
     try:
-        text = file.read_text(encoding="utf-8-sig")
-        rows = _rows_of_csv(text) if file.suffix.lower() == ".csv" else load_yaml(text)
+        check_regular(file)
+        if file.suffix.lower() == ".csv":
+            rows = _rows_of_csv(file.read_text(encoding="utf-8-sig"))
+        else:
+            rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
+    except SatIntervalsError:
+        raise
     except (OSError, ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
         raise SatIntervalsError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):
@@ -121,7 +128,7 @@ def _set(settings: dict[str, Any], key: str, value: Any) -> None:
             raise ValueError(f"the row gives {section} as a whole too")
     if last in settings:
         raise ValueError(f"the row gives parts of {last} too" if isinstance(settings[last], dict) else "given twice")
-    settings[last] = yaml.safe_load(value) if isinstance(value, str) else value
+    settings[last] = load_yaml(value) if isinstance(value, str) else value
 
 
 def _path(path: str, file: Path) -> str:

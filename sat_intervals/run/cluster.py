@@ -4,8 +4,10 @@ import gc
 import logging
 import os
 import signal
+import socket
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -24,6 +26,8 @@ from sat_intervals.machine import usable_cores
 
 # Seconds without any worker of a batch system, after there were some, at which a run ends.
 WORKERS_GONE = 300.0
+# Seconds for worker processes of this machine to start.
+STARTING = 120.0
 # Seconds from one word on the first worker, for which a run waits, to the next.
 _TOLD_EVERY = 60.0
 
@@ -31,6 +35,7 @@ _TOLD_EVERY = 60.0
 _CHARGE_PROJECTS = "lsf", "sge"
 
 _LOOPBACK = "127.0.0.1"
+_LOOPBACK_PATIENCE = 5.0
 
 _LOG = logging.getLogger(__name__)
 
@@ -121,15 +126,48 @@ def _client_of(address: str | None) -> Client:
 def _local(settings: Cluster) -> LocalCluster:
     workers = settings.workers or usable_cores()
     processes = settings.kind == "processes"
-    return LocalCluster(
-        n_workers=workers if processes else 1,
-        threads_per_worker=1 if processes else workers,
-        processes=processes,
-        host=_LOOPBACK if processes else None,
-        dashboard_address=f"{_LOOPBACK}:0",
-        worker_dashboard_address=f"{_LOOPBACK}:0",
-        silence_logs=logging.CRITICAL,
-    )
+    if processes:
+        _check_loopback()
+    with warnings.catch_warnings():
+        # of a machine without a network, which none of this needs
+        warnings.filterwarnings("ignore", "Couldn't detect a suitable IP address", RuntimeWarning)
+        try:
+            return LocalCluster(
+                n_workers=workers if processes else 1,
+                threads_per_worker=1 if processes else workers,
+                processes=processes,
+                host=_LOOPBACK if processes else None,
+                dashboard_address=f"{_LOOPBACK}:0",
+                worker_dashboard_address=f"{_LOOPBACK}:0",
+                silence_logs=logging.CRITICAL,
+                **({"death_timeout": STARTING} if processes else {}),
+            )
+        except Exception as error:  # whatever keeps processes from starting, such as a full /dev/shm
+            if not processes:
+                raise
+            cause: BaseException = error
+            while cause.__cause__ is not None:
+                cause = cause.__cause__
+            why = " ".join(str(cause).split()) or type(cause).__name__
+            raise RunError(
+                f"the {workers} worker processes did not start within {STARTING:.0f} s ({why}): give fewer --workers "
+                "or more room in /dev/shm, or use --cluster threads"
+            ) from error
+
+
+def _check_loopback() -> None:
+    """Hold that processes of this machine can talk to each other: dask would wait for them without end."""
+    try:
+        with (
+            socket.create_server((_LOOPBACK, 0)) as server,
+            socket.create_connection(server.getsockname(), timeout=_LOOPBACK_PATIENCE),
+        ):
+            pass
+    except OSError as error:
+        raise SatIntervalsError(
+            f"processes cannot reach each other at {_LOOPBACK}: {error.strerror or error}: bring up the loopback "
+            "interface, or use --cluster threads"
+        ) from error
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """A run before it is run: tiles, work, memory, disk, and the time it will take by a sample of it."""
 
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,10 +109,22 @@ def _work(grid: Grid, region: Window, config: Config) -> int:
     """Pixels that the two sweeps visit, on average of both: all of the patch but the rows behind its core."""
     overlap = config.tiles.overlap
     total = 0
-    for tile in grid:
-        patch = tile.core.grown(overlap, overlap).clipped(region)
-        total += patch.width * (tile.core.height + patch.height) // 2
+    for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
+        for column, columns in _kinds(grid.columns, -(-overlap // grid.size)):
+            core = grid.tile(row, column).core
+            patch = core.grown(overlap, overlap).clipped(region)
+            total += rows * columns * (patch.width * (core.height + patch.height) // 2)
     return total
+
+
+def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
+    """Places along a grid, which may be too long to visit all, with how many are like them: those far from its ends."""
+    ends = reach + 1
+    if count <= 2 * ends:
+        yield from ((place, 1) for place in range(count))
+    else:
+        yield from ((place, 1) for place in (*range(ends), *range(count - ends, count)))
+        yield ends, count - 2 * ends
 
 
 def _expected_seconds(left: Image, right: Image, config: Config, workers: int, work: int, region: Window) -> float:

@@ -18,6 +18,7 @@ class Tally:
         # How often each sum of flags occurs tells all that is asked of them.
         self._sums = np.zeros(1 << (max(flag.bit for flag in FLAGS) + 1), np.int64)
         self._widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
+        self._whole = round((count - 1) / _WIDTH_STEP)
 
     def add(self, intervals: np.ndarray, validity: np.ndarray) -> None:
         """Count some rows: ``intervals`` ``(4, rows, columns)`` in the order of BANDS, and their ``validity``."""
@@ -31,7 +32,10 @@ class Tally:
         return int(self._sums[wanted].sum())
 
     def report(self) -> dict[str, Any]:
-        """Counts and shares; the median width in pixels, to 0.01, is None where there is no interval."""
+        """Counts of pixels; ``ambiguous``: valid, with the whole search range as interval.
+
+        The median width in pixels, to 0.01, is None where there is no interval.
+        """
         upto = np.cumsum(self._widths)
         median = float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP) if upto[-1] else None
         sums = np.arange(self._sums.size)
@@ -39,6 +43,7 @@ class Tally:
         return {
             "pixels": int(self._sums.sum()),
             "valid": self._count(valid),
+            "ambiguous": int(self._widths[self._whole]),
             "low_confidence": self._count(valid & (sums & REGULARIZED != 0)),
             "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
             "median_interval_width": None if median is None else round(median, 2),

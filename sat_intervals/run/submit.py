@@ -17,6 +17,10 @@ from sat_intervals.run.cluster import workers_there
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
 _LOOK_AGAIN = 2.0
+# Seconds without a heartbeat, of which workers send one every few seconds, after which a worker is named.
+SILENT = 30.0
+# Seconds without a heartbeat of any worker, after there was one, at which a run ends.
+DEAD = 600.0
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,6 +74,7 @@ class Submission:
         self._suspects: list[Task] = []
         self._width, self._looked = 2, float("-inf")
         self._workers: set[str] = set()
+        self._heartbeats = _Heartbeats()
 
     def __iter__(self) -> Iterator[Outcome | None]:
         self._fill()
@@ -104,6 +109,7 @@ class Submission:
         if time.monotonic() - self._looked > _LOOK_AGAIN:
             with _scheduler_needed():
                 cores = workers_there(self._client)
+                self._heartbeats.check(self._client)
             self._width = 2 * max(1, sum(cores.values()))
             self._note_workers(set(cores))
             self._looked = time.monotonic()
@@ -125,6 +131,41 @@ class Submission:
             future = self._client.submit(task.function, *task.arguments, key=key, retries=task.retries, pure=False)
         self._in_flight[key] = task, is_alone, future
         future.add_done_callback(self._ended.put)
+
+
+class _Heartbeats:
+    """When the workers were last heard of: one that was stopped holds its tasks for ever, and says nothing."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[float, float]] = {}  # by worker: the scheduler's time of it, and ours
+        self._heard = self._told = time.monotonic()
+
+    def check(self, client: Client) -> None:
+        """Name workers that are silent.
+
+        Raises
+        ------
+        RunError
+            When all are, for DEAD seconds.
+        """
+        now = time.monotonic()
+        workers = client.scheduler_info()["workers"]
+        for address, worker in workers.items():
+            if self._last.get(address, (None,))[0] != worker["last_seen"]:
+                self._last[address] = worker["last_seen"], now
+                self._heard = now
+        silent = sorted(address for address in workers if now - self._last[address][1] > SILENT)
+        is_told_of = hasattr(client.cluster, "refusals")  # see `workers_there`
+        if not workers and now - self._heard > SILENT and not is_told_of:
+            silent = ["any worker"]
+        if self._last and now - self._heard > DEAD:
+            raise RunError(
+                f"no worker has answered for {DEAD:.0f} s: they were stopped, or their machine hangs; the same command "
+                "goes on from the tiles that are done"
+            )
+        if silent and now - self._told > SILENT:
+            self._told = now
+            _LOG.warning("waiting for %s, not heard of for %.0f s", ", ".join(silent), SILENT)
 
 
 def _end_of(future: Future[Any]) -> tuple[Any, BaseException | None]:

@@ -1,0 +1,28 @@
+"""Limits and variables with which the libraries cannot start."""
+
+import os
+import resource
+
+# Bytes of addresses that the libraries take before the first pixel; with less they abort, or wait without end.
+_ADDRESSES = 15 * 10**8
+
+
+def check_process() -> None:
+    """Refuse what the libraries would abort of, before any is imported.
+
+    Raises
+    ------
+    SatIntervalsError
+        With what is set and what is needed.
+    """
+    from sat_intervals.errors import SatIntervalsError
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _ADDRESSES:
+        raise SatIntervalsError(
+            f"the address space is limited to {limit / 1e9:.1f} GB, at least {_ADDRESSES / 1e9:.1f} GB are needed: "
+            "raise ulimit -v"
+        )
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+    if not threads.isdecimal() or int(threads) < 1:
+        raise SatIntervalsError(f"NUMBA_NUM_THREADS is {threads!r}: set it to a number above 0, or not at all")
