@@ -30,6 +30,7 @@ from sat_intervals.run.pair import match_pair, matched
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_tile
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.tiles import mark_finished
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,15 @@ def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(
     assert {end["state"] for end in report.values()} == {"done before"}
     told = CliRunner().invoke(main, ["status", str(tmp_path / "out")])
     assert told.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
+
+
+def test_match_batch__removes_tiles_that_a_death_left_and_none_that_were_kept(images, tmp_path):
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path, keep_tiles=True)
+    mark_finished(tmp_path / "pair2" / "tiles", "the run of pair2")  # as a run does before it removes its tiles
+    assert {end["state"] for end in match_batch(pairs, tmp_path).values()} == {"done before"}
+    assert (tmp_path / "pair1" / "tiles" / "manifest.json").exists()
+    assert not (tmp_path / "pair2" / "tiles").exists()
 
 
 def test_match_batch__never_takes_another_run_for_its_own(images, tmp_path):

@@ -31,7 +31,7 @@ from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
-from sat_intervals.store.tiles import remove_tiles
+from sat_intervals.store.tiles import finished_run, remove_tiles
 
 _LOG = logging.getLogger(__name__)
 
@@ -240,9 +240,9 @@ def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stac
 
 
 def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
-    """Remove tiles that a death between the files and the end of their run left."""
+    """Remove tiles that a death between the files and the end of their run left; those that are to be kept stay."""
     home = folder / "tiles"
-    if keep_tiles or not home.exists() or home.is_symlink():
+    if keep_tiles or home.is_symlink() or finished_run(home) is None:
         return
     try:
         place = place_of(home, store)
@@ -331,6 +331,7 @@ def _assembled(
     client: Client, job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress
 ) -> dict[str, Any]:
     def match() -> None:
+        measure_images(client, job, progress)
         for _, failures in matched(client, [job], progress):
             check_failures(job, failures)
 
