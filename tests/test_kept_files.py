@@ -228,6 +228,13 @@ def finished(tmp_path):
     return write_run(tmp_path, *random_bands(40, 50))
 
 
+@pytest.mark.parametrize("name", ["run.json", "intervals.tif"])
+def test_log_file__is_no_file_of_the_run(finished, name):
+    before = contents(finished)
+    refused(["report", finished, "--log-file", finished / name], f"{name} is an input")
+    assert contents(finished) == before
+
+
 def rename_left(out, name):
     """Give the left image of a run another name beside its files."""
     report = json.loads((out / "run.json").read_text())
