@@ -170,7 +170,7 @@ def match_batch(
     RunError
         What stops all pairs, such as a full disk.
     """
-    _check_not_replaced(pairs, out, overwrite)
+    _check_not_replaced(pairs, [config] if isinstance(config, (str, Path)) else [], out, overwrite)
     ended: dict[str, dict[str, Any]] = {}
     cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
     _allow_files()
@@ -202,13 +202,13 @@ def match_batch(
     return ended
 
 
-def _check_not_replaced(pairs: Sequence[PairOfBatch], out: Path, overwrite: bool) -> None:
-    """Hold that no pair's input is among what another pair writes."""
+def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Path], out: Path, overwrite: bool) -> None:
+    """Hold that no pair's input, and none of the other files that are read, is among what any pair writes."""
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
     names = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     files = [name for name in names if name and os.path.isfile(name)]
     check_not_replaced(
-        [file for name in files for file in (name, *other_files(name))],
+        [*others, *(file for name in files for file in (name, *other_files(name)))],
         [out / REPORT, *(folder / name for folder in written for name in OUTPUTS)],
         [folder / "tiles" for folder in written],
     )
