@@ -40,12 +40,12 @@ class _Commands(click.Group):
     """Turns whatever goes wrong in a command into one line and an exit status."""
 
     def invoke(self, context: click.Context) -> Any:
-        # The libraries make two hundred thousand objects that live as long as the process. To look for garbage among
-        # them takes a fifth of a second while they are imported, and half a second at the end.
         try:
             os.getcwd()
         except OSError:
             _end(USER_ERROR, "the working directory is gone: change to a folder that is there")
+        # The libraries make two hundred thousand objects that live as long as the process. To look for garbage among
+        # them takes a fifth of a second while they are imported, and half a second at the end.
         gc.set_threshold(5000)
         atexit.register(gc.freeze)
         try:

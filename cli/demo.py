@@ -36,7 +36,7 @@ def demo(
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up, put_back, write_once
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.job import check_output
+    from sat_intervals.run.job import OUTPUTS, check_output
     from sat_intervals.run.pair import match_pair
     from sat_intervals.run.status import is_replacing
 
@@ -48,7 +48,7 @@ def demo(
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed)
         config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum)))
-        check_not_replaced([config_file], layers)
+        check_not_replaced([config_file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         nodata = 0, 0, float("nan")
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
             write_once(path, pixels, value, somewhere, overwrite=overwrite)

@@ -11,6 +11,9 @@ import click
 
 from sat_intervals.cli.signals import Ended
 
+# Files in the folders that commands are given, to which no log is added.
+_OF_RUNS = ("intervals.tif", "validity.tif", "run.json", "points.tif", "dsm.tif", "batch.json")
+
 _LOG = logging.getLogger(__name__)
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 _WARNINGS = logging.Formatter("sat-intervals: %(message)s")
@@ -95,7 +98,8 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
 
     given = {**click.get_current_context().params, "log_file": None}.values()
     names = [name for value in given for name in (value if isinstance(value, tuple) else (value,))]
-    check_not_replaced([name for name in names if isinstance(name, (str, Path))], [log_file])
+    paths = [Path(name) for name in names if isinstance(name, (str, Path))]
+    check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
     try:
         file = log_file.open("a", encoding="utf-8", errors="backslashreplace", buffering=1)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The one family of errors this package raises for what a user can put right."""
+"""The one family of errors this package raises for what a user can put right; and the check that a path is a file."""
 
 import os
 import stat

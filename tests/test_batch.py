@@ -30,6 +30,7 @@ from sat_intervals.run.pair import match_pair, matched
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_tile
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.tiles import mark_finished
 
 
 @pytest.fixture(scope="module")
@@ -262,11 +263,13 @@ def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, t
     assert bytes_of(tmp_path / "pair1") == before
 
 
-def test_match_batch__removes_tiles_that_a_death_left_beside_a_result(images, tmp_path):
+def test_match_batch__removes_tiles_that_a_death_left_beside_a_result_and_none_that_were_kept(images, tmp_path):
     pairs = read_batch(rows(images))
     first = match_batch(pairs, tmp_path, keep_tiles=True)
+    mark_finished(tmp_path / "pair2" / "tiles", "the run of pair2")  # as a run does before it removes its tiles
     again = match_batch(pairs, tmp_path)
-    assert not list(tmp_path.glob("*/tiles"))
+    assert [path.parent.name for path in tmp_path.glob("*/tiles")] == ["pair1"]
+    assert (tmp_path / "pair1" / "tiles" / "manifest.json").exists()
     assert {name: end["counts"] for name, end in again.items()} == {name: end["counts"] for name, end in first.items()}
 
 

@@ -14,6 +14,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.run import pair as run
+from sat_intervals.run.assemble import assemble
 from sat_intervals.run.tile import match_tile
 from sat_intervals.store.tiles import Store
 
@@ -171,6 +172,26 @@ def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp
     again = match_pair(*images, out, settings)
     assert again["normalization"] == once["normalization"]
     assert [(out / name).read_bytes() for name in ("intervals.tif", "validity.tif")] == expected
+
+
+@pytest.mark.usefixtures("mccnn_extra")
+def test_match__measures_images_again_where_their_figures_are_damaged_before_it_is_assembled(
+    scene, tmp_path, monkeypatch
+):
+    weights = write_network(tmp_path / "network.onnx", random_weights())
+    settings = yaml.safe_load((scene / "settings.yaml").read_text())
+    settings |= {"cost": {"method": "mccnn", "weights": str(weights)}}
+    damaged = []
+
+    def damage_and_assemble(job, *arguments, **named):
+        if not damaged:
+            damaged.append(job.store.normalization())
+            damage(job.store.home / "normalization.json", "empty")
+        return assemble(job, *arguments, **named)
+
+    monkeypatch.setattr(run, "assemble", damage_and_assemble)
+    report = match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+    assert report["normalization"] == damaged[0]
 
 
 @pytest.mark.parametrize("text", ["", "{", "5", "\xff"])

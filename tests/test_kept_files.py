@@ -185,6 +185,36 @@ def test_match__refuses_an_input_that_it_would_lose(pair, way):
     assert contents(folder) == before
 
 
+@pytest.mark.parametrize("name", ["run.json", "tiles/manifest.json"])
+def test_commands__refuse_settings_that_they_would_lose(pair, name):
+    folder, _ = pair
+    for out in (folder / "out", folder / "batch" / "one"):
+        (out / "tiles").mkdir(parents=True)
+        shutil.copy(folder / "settings.yaml", out / name)
+    rows = [{"name": "one", "left": str(folder / "left.tif"), "right": str(folder / "right.tif")}]
+    (folder / "pairs.json").write_text(json.dumps(rows))
+    before = contents(folder)
+    config = ["--config", folder / "out" / name, "--overwrite"]
+    refused(["match", folder / "left.tif", folder / "right.tif", folder / "out", *config], f"{name} is an input")
+    refused(["demo", folder / "out", "--size", "100", "100", *config], f"{name} is an input")
+    config = ["--config", folder / "batch" / "one" / name, "--overwrite"]
+    refused(["batch", folder / "pairs.json", folder / "batch", *config], f"{name} is an input")
+    assert contents(folder) == before
+
+
+def test_match__takes_no_file_of_the_user_for_a_mark_of_its_own(pair):
+    folder, settings = pair
+    images, out = (folder / "left.tif", folder / "right.tif"), folder / "out"
+    marks = {out / "tiles" / name: "mine" for name in ("replacing", "finished")}
+    (out / "tiles").mkdir(parents=True)
+    for mark, text in marks.items():
+        mark.write_text(text)
+    match_pair(*images, out, settings)
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(*images, out, settings | {"median": None})
+    assert {mark: mark.read_text() for mark in marks} == marks
+
+
 def test_match__refuses_an_input_inside_the_store(pair):
     folder, settings = pair
     settings["cluster"]["store"] = str(folder / "store")
@@ -226,6 +256,13 @@ def test_log_file__is_no_input(pair):
 def finished(tmp_path):
     """A run made up, with its images; its left image bears a name that each tool writes to."""
     return write_run(tmp_path, *random_bands(40, 50))
+
+
+@pytest.mark.parametrize("name", ["run.json", "intervals.tif"])
+def test_log_file__is_no_file_of_the_run(finished, name):
+    before = contents(finished)
+    refused(["report", finished, "--log-file", finished / name], f"{name} is an input")
+    assert contents(finished) == before
 
 
 def rename_left(out, name):

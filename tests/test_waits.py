@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -160,6 +161,21 @@ def test_submission__does_not_end_for_a_task_that_takes_long(tmp_path, monkeypat
         outcomes = [outcome for outcome in Submission(client, iter([Task(0, time.sleep, (9,), 0)])) if outcome]
     assert [outcome.error for outcome in outcomes] == [None]
     assert not [record for record in caplog.records if record.name.startswith("sat_intervals")]
+
+
+def test_heartbeats__do_not_count_a_time_in_which_this_process_was_stopped(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(submit.time, "monotonic", lambda: now[0])
+    worker = SimpleNamespace(cluster=None, scheduler_info=lambda n_workers: {"workers": {"one": {"last_seen": 1.0}}})
+    heartbeats = submit._Heartbeats()
+    heartbeats.check(worker)
+    now[0] += 2 * submit.DEAD
+    heartbeats.check(worker)
+    now[0] += submit.DEAD
+    heartbeats.check(worker)
+    now[0] += 1
+    with pytest.raises(RunError, match="no worker has answered for 600 s"):
+        heartbeats.check(worker)
 
 
 def test_connected__refuses_processes_that_cannot_reach_each_other(tmp_path, monkeypatch):

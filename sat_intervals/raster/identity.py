@@ -1,4 +1,4 @@
-"""Which file an input is: what the manifest of a run compares, and run.json tells."""
+"""Which file an input is, as manifests and run.json tell; whether it still is; whether an output would replace it."""
 
 import hashlib
 import os

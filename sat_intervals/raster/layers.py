@@ -1,4 +1,4 @@
-"""Single layers that fit in memory: those of the demo, and the truth that results are held against."""
+"""Single layers that fit in memory, such as those of the demo, and files that replace others when they are whole."""
 
 import os
 import shutil

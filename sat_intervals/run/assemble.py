@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, Mccnn
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
 from sat_intervals.products import FLAGS
@@ -58,8 +58,8 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         No pixel could be matched.
     """
     config, store, region = job.config, job.store, job.store.grid.region
-    records = store.records()
-    _check_done(job, records)
+    records, normalization = store.records(), store.normalization()
+    _check_done(job, records, normalization)
     histogram, seams = store.histogram(records), store.seams(records)
     _check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
@@ -82,7 +82,7 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
-        report = _report(job, scale, tally, seconds, seams)
+        report = _report(job, normalization, scale, tally, seconds, seams)
         _warn_of_ambiguity(job, report["counts"])
         if not keep_tiles:
             mark_finished(store.home, job.name)
@@ -111,8 +111,12 @@ def _ahead(items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _check_done(job: Job, records: Records) -> None:
-    """What went missing since the tiles were matched is matched again by the next try."""
+def _check_done(job: Job, records: Records, normalization: dict[str, Any] | None) -> None:
+    """What went missing since the tiles were matched is made again by the next try."""
+    if isinstance(job.config.cost, Mccnn) and normalization is None:
+        raise DamagedTilesError(
+            f"what was measured of the images is lost in {job.store.folder}: run the same command again"
+        )
     missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
         raise DamagedTilesError(
@@ -161,7 +165,12 @@ def _tags(config: Config) -> dict[str, str]:
 
 
 def _report(
-    job: Job, scale: ConfidenceScale, tally: Tally, seconds: dict[str, float], seams: np.ndarray
+    job: Job,
+    normalization: dict[str, Any] | None,
+    scale: ConfidenceScale,
+    tally: Tally,
+    seconds: dict[str, float],
+    seams: np.ndarray,
 ) -> dict[str, Any]:
     """The content of run.json."""
     grid, config = job.store.grid, job.config
@@ -178,7 +187,7 @@ def _report(
             "overlap": config.tiles.overlap,
         },
         "cost_span": config.cost_span,
-        "normalization": job.store.normalization(),
+        "normalization": normalization,
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),
         "validity_bits": {

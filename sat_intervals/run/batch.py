@@ -31,7 +31,7 @@ from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
-from sat_intervals.store.tiles import remove_tiles
+from sat_intervals.store.tiles import finished_run, remove_tiles
 
 _LOG = logging.getLogger(__name__)
 
@@ -170,7 +170,7 @@ def match_batch(
     RunError
         What stops all pairs, such as a full disk.
     """
-    _check_not_replaced(pairs, out, overwrite)
+    _check_not_replaced(pairs, [config] if isinstance(config, (str, Path)) else [], out, overwrite)
     ended: dict[str, dict[str, Any]] = {}
     cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
     _allow_files()
@@ -202,13 +202,13 @@ def match_batch(
     return ended
 
 
-def _check_not_replaced(pairs: Sequence[PairOfBatch], out: Path, overwrite: bool) -> None:
-    """Hold that no pair's input is among what another pair writes."""
+def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Path], out: Path, overwrite: bool) -> None:
+    """Hold that no pair's input, and none of the other files that are read, is among what any pair writes."""
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
     names = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     files = [name for name in names if name and os.path.isfile(name)]
     check_not_replaced(
-        [file for name in files for file in (name, *other_files(name))],
+        [*others, *(file for name in files for file in (name, *other_files(name)))],
         [out / REPORT, *(folder / name for folder in written for name in OUTPUTS)],
         [folder / "tiles" for folder in written],
     )
@@ -240,9 +240,9 @@ def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stac
 
 
 def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
-    """Remove tiles that a death between the files and the end of their run left."""
+    """Remove tiles that a death between the files and the end of their run left; those that are to be kept stay."""
     home = folder / "tiles"
-    if keep_tiles or not home.exists() or home.is_symlink():
+    if keep_tiles or home.is_symlink() or finished_run(home) is None:
         return
     try:
         place = place_of(home, store)
@@ -331,6 +331,7 @@ def _assembled(
     client: Client, job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress
 ) -> dict[str, Any]:
     def match() -> None:
+        measure_images(client, job, progress)
         for _, failures in matched(client, [job], progress):
             check_failures(job, failures)
 

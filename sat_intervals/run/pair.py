@@ -1,4 +1,4 @@
-"""All tiles of a pair, all pairs of a batch, a bounded number of them in flight."""
+"""A pair, files to files, and what it shares with a batch: images measured, tiles matched, damaged ones again."""
 
 import errno
 import logging

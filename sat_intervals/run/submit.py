@@ -138,7 +138,7 @@ class _Heartbeats:
 
     def __init__(self) -> None:
         self._last: dict[str, tuple[float, float]] = {}  # by worker: the scheduler's time of it, and ours
-        self._heard = self._told = time.monotonic()
+        self._heard = self._told = self._checked = time.monotonic()
 
     def check(self, client: Client) -> None:
         """Name workers that are silent.
@@ -149,7 +149,10 @@ class _Heartbeats:
             When all are, for DEAD seconds.
         """
         now = time.monotonic()
-        workers = client.scheduler_info()["workers"]
+        if now - self._checked > DEAD:  # this process was stopped itself, and its workers maybe with it
+            self._heard = now
+        self._checked = now
+        workers = client.scheduler_info(n_workers=-1)["workers"]  # some releases of dask give five by default
         for address, worker in workers.items():
             if self._last.get(address, (None,))[0] != worker["last_seen"]:
                 self._last[address] = worker["last_seen"], now

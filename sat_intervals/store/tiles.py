@@ -33,10 +33,11 @@ Records = Mapping[str, Mapping[str, Any]]
 # To be counted up when arrays or records change: tiles of before cannot be gone on with.
 LAYOUT = 5
 
+# Names of ours alone, as that of the lock: files of the user in the folder mean nothing, and stay.
 # In the folder of the run from the beginning of one that replaces another to its end.
-_REPLACING = "replacing"
+_REPLACING = ".sat-intervals.replacing"
 # In the folder of the run from when its files get their names until its tiles are removed: which run that is.
-_FINISHED = "finished"
+_FINISHED = ".sat-intervals.finished"
 
 
 class DamagedTilesError(RunError):
