@@ -6,7 +6,7 @@ EXTRAS ?= test,lint,plot
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test lint bench pictures clean
+.PHONY: demo test lint bench tune pictures clean
 
 demo: $(READY)
 	$(BIN)/sat-intervals demo demo-out --overwrite
@@ -24,6 +24,11 @@ lint: $(READY)
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python tests/benchmarks/table.py
+
+# The tables of docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; about ten minutes.
+tune: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[mccnn]'
+	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/tune.py
 
 # Those of README.md; 256 colours keep them small.
 pictures: $(READY)

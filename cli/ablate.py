@@ -15,6 +15,7 @@ from sat_intervals.cli.pairs import judging_options, overrides, say_json
 def ablate(
     pairs: tuple[Path, ...],
     cost: str | None,
+    preset: str | None,
     config_file: Path | None,
     accurate: bool,
     tolerance: float,
@@ -36,7 +37,9 @@ def ablate(
     from sat_intervals.evaluate.paper import SceneMetrics, table_2
 
     found = find_pairs(pairs)
-    configs = [load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, cost)) for pair in found]
+    configs = [
+        load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, preset, cost)) for pair in found
+    ]
     scenes = []
     for pair, config in zip(found, configs, strict=True):
         click.echo(f"matching {pair.name}", err=True)

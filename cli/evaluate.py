@@ -54,6 +54,7 @@ def evaluate(
     reference: Path | None,
     cost: tuple[str, ...],
     config_file: Path | None,
+    preset: str | None,
     accurate: bool,
     tolerance: float,
     as_json: bool,
@@ -77,7 +78,7 @@ def evaluate(
     if dsm or reference:
         for name, value in (
             ("--truth", truth), ("--mask", mask), ("--remove-bias", remove_bias), ("--group", group), ("--cost", cost),
-            ("--config", config_file), ("--accurate", accurate), ("--tolerance", tolerance),
+            ("--config", config_file), ("--preset", preset), ("--accurate", accurate), ("--tolerance", tolerance),
         ):  # fmt: skip
             if value:
                 raise click.UsageError(f"{name} is for runs and pairs, not for --dsm: leave it out.")
@@ -90,7 +91,7 @@ def evaluate(
     from sat_intervals.evaluate.paper import SceneMetrics, table_1
 
     sources = _sources(folders, truth, mask, cost)
-    configs = _configs(sources, config_file, accurate, cost)
+    configs = _configs(sources, config_file, preset, accurate, cost)
     scenes = []
     for source, config in zip(sources, configs, strict=True):
         judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
@@ -158,13 +159,18 @@ def _sources(
 
 
 def _configs(
-    sources: list[_Source], config_file: Path | None, accurate: bool, costs: tuple[str, ...]
+    sources: list[_Source], config_file: Path | None, preset: str | None, accurate: bool, costs: tuple[str, ...]
 ) -> "list[Config | None]":
     """The settings to match each pair with, None for a run, which has its own."""
     from sat_intervals.config import load_config
     from sat_intervals.errors import SatIntervalsError
 
-    given = {"--accurate": accurate, f"--config {config_file}": config_file, f"--cost {' '.join(costs)}": costs}
+    given = {
+        "--accurate": accurate,
+        f"--config {config_file}": config_file,
+        f"--preset {preset}": preset,
+        f"--cost {' '.join(costs)}": costs,
+    }
     option = next((name for name, value in given.items() if value), None)
     if option and not any(source.pair for source in sources):
         raise SatIntervalsError(f"{option} is for pairs to be matched, every OUT is a run that was: leave it out")
@@ -172,7 +178,7 @@ def _configs(
     for source in sources:
         config = None
         if source.pair:
-            more = overrides(source.pair.minimum, source.pair.maximum, accurate, source.cost)
+            more = overrides(source.pair.minimum, source.pair.maximum, accurate, preset, source.cost)
             config = load_config(config_file, more | {"products": {"keep_rejected": True}})
             if config.interval is None:
                 raise SatIntervalsError(f"{config_file}: interval is null, but intervals are to be judged: leave it on")

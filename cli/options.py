@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from sat_intervals.raster import Image
 
 COSTS = ("census", "mccnn")
+# As of `sat_intervals.config`, which help does not wait for.
+PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homogeneous", "mccnn")
 
 Command = Callable[..., Any]
 Number = TypeVar("Number", int, float)
@@ -35,6 +37,12 @@ def path(context: click.Context, parameter: click.Parameter, value: str | None) 
 
 
 quiet_option = click.option("--quiet", is_flag=True, help="Print errors only.")
+preset_option = click.option(
+    "--preset",
+    type=click.Choice(PRESETS),
+    help="Settings that fill in what is left out: satellite for satellite images, satellite-mccnn for different dates "
+    "or little texture, paper (default) for the paper's figures.",
+)
 cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
 store_option = click.option(
     "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles until the run is finished."
@@ -104,6 +112,7 @@ def settings_options(command: Command) -> Command:
     @wraps(command)
     def with_settings(
         *,
+        preset: str | None,
         cost: str | None,
         tile_size: int | None,
         overlap: int | None,
@@ -127,13 +136,15 @@ def settings_options(command: Command) -> Command:
             name: {key: value for key, value in section.items() if value is not None}
             for name, section in sections.items()
         }
-        return command(given={name: section for name, section in set_keys.items() if section}, **others)
+        given: dict[str, Any] = {name: section for name, section in set_keys.items() if section}
+        return command(given=given | ({"preset": preset} if preset else {}), **others)
 
     return _with(
         with_settings,
         click.option(
             "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
         ),
+        preset_option,
         cost_option,
         click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
         click.option("--overlap", type=int, help="Pixels read around a core."),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import log_options
+from sat_intervals.cli.options import log_options, preset_option
 
 if TYPE_CHECKING:
     from sat_intervals.evaluate.paper import SceneMetrics
@@ -26,6 +26,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--config", "config_file", type=click.Path(path_type=Path), help="Settings to match pairs with (YAML)."
         ),
+        preset_option,
         click.option(
             "--accurate",
             is_flag=True,
@@ -47,9 +48,13 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def overrides(minimum: int, maximum: int, accurate: bool, cost: str | None = None) -> dict[str, Any]:
+def overrides(
+    minimum: int, maximum: int, accurate: bool, preset: str | None, cost: str | None = None
+) -> dict[str, Any]:
     """The settings that a pair and the command line give, as sections."""
     sections: dict[str, Any] = {"disparity": {"minimum": minimum, "maximum": maximum}}
+    if preset is not None:
+        sections["preset"] = preset
     if cost is not None:
         sections["cost"] = {"method": cost}
     return sections | ({"cross_check": {"method": "accurate"}} if accurate else {})

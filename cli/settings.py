@@ -2,11 +2,11 @@
 
 import click
 
-PRESETS = ("default", "homogeneous", "mccnn", "mountain", "urban")
+from sat_intervals.cli.options import PRESETS
 
 
 @click.command(short_help="Print a complete, commented file of settings.")
-@click.option("--preset", type=click.Choice(PRESETS), default="default", show_default=True, help="Which settings.")
+@click.option("--preset", type=click.Choice(PRESETS), default=PRESETS[0], show_default=True, help="Which settings.")
 def config(preset: str) -> None:
     """Print a complete YAML file of settings, every one commented, to change and give to `match --config`."""
     from sat_intervals.config import preset_text

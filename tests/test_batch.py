@@ -22,6 +22,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import fitted, tile_bytes
 from sat_intervals.raster import north_up, write_layer
+from sat_intervals.results import open_run
 from sat_intervals.run import batch
 from sat_intervals.run.batch import PairOfBatch, match_batch, read_batch
 from sat_intervals.run.cluster import connected, parse_memory
@@ -64,6 +65,17 @@ def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
         match_pair(images / f"left{seed}.tif", images / f"right{seed}.tif", tmp_path / f"alone{seed}", settings)
         assert bytes_of(tmp_path / "batch" / f"pair{seed}") == bytes_of(tmp_path / f"alone{seed}")
         assert not (tmp_path / "batch" / f"pair{seed}" / "tiles").exists()
+
+
+def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path):
+    lines = ["name,left,right,minimum,maximum,preset", "one,left1.tif,right1.tif,-18,40,"]
+    lines += ["two,left2.tif,right2.tif,-18,40,mountain"]
+    (images / "presets.csv").write_text("\n".join(lines) + "\n")
+    overrides = {"preset": "satellite", "tiles": {"size": 64, "overlap": 20}}
+    report = match_batch(read_batch(images / "presets.csv"), tmp_path, overrides=overrides)
+    assert {name: end["state"] for name, end in report.items()} == {"one": "done", "two": "done"}
+    settings = [open_run(tmp_path / name).config for name in ("one", "two")]
+    assert [(one.preset, one.sgm.p2) for one in settings] == [("satellite", 128), ("mountain", 464)]
 
 
 def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(images, tmp_path):

@@ -24,8 +24,8 @@ from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals import load_config, match_arrays
-from sat_intervals.cli import main
-from sat_intervals.config import preset_names, preset_text
+from sat_intervals.cli import main, options
+from sat_intervals.config import PRESETS, preset_text
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
 from sat_intervals.products import BANDS, FLAGS, INVALID
@@ -744,9 +744,9 @@ def test_match__command_line_wins_over_the_file(folder, tmp_path):
 
 
 # ---- The other commands -----------------------------------------------------------------------------------------
-@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize("preset", PRESETS)
 def test_config__prints_settings_that_match_takes(folder, tmp_path, preset, request):
-    if preset == "mccnn":
+    if "mccnn" in preset:
         request.getfixturevalue("mccnn_extra")
     result = invoke("config", "--preset", preset)
     assert (result.exit_code, result.stderr) == (0, "")
@@ -761,8 +761,32 @@ def test_config__prints_settings_that_match_takes(folder, tmp_path, preset, requ
 
 
 def test_config__prints_the_defaults_unless_told_otherwise():
-    assert invoke("config").stdout == preset_text("default")
-    assert_refused(invoke("config", "--preset", "sea"), "'--preset': 'sea' is not one of 'default', 'homogeneous', ")
+    assert invoke("config").stdout == preset_text("paper")
+    assert_refused(invoke("config", "--preset", "sea"), "'--preset': 'sea' is not one of 'paper', 'satellite', ")
+
+
+def test_match__takes_a_preset_and_what_is_given_beside_it(folder, tmp_path):
+    (tmp_path / "beside.yaml").write_text("disparity: {minimum: -9, maximum: 9}\nsgm: {p2: 99}\n")
+    beside = ("--window", 60, 80, 70, 90, "--preset", "satellite", "--overlap", 40)
+    command(*matching(folder, tmp_path / "out", *beside, config=tmp_path / "beside.yaml"))
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    settings = report["settings"]
+    assert settings["preset"] == "satellite"
+    assert (settings["cost"]["window"], settings["sgm"]["p1"], settings["sgm"]["p2"]) == (7, 20, 99)
+    assert settings["tiles"]["overlap"] == 40
+    del settings["preset"]  # known by what it set
+    config = {name: settings[name] for name in ("disparity", "cost", "sgm", "tiles")}
+    (tmp_path / "spelt.yaml").write_text(json.dumps(config))
+    command(*matching(folder, tmp_path / "spelt", "--window", 60, 80, 70, 90, config=tmp_path / "spelt.yaml"))
+    for name in ("intervals.tif", "validity.tif"):
+        assert (tmp_path / "spelt" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert options.PRESETS == PRESETS
+
+
+def test_match__refuses_two_presets(folder, tmp_path):
+    (tmp_path / "urban.yaml").write_text(preset_text("urban"))
+    arguments = matching(folder, tmp_path / "out", "--preset", "satellite", config=tmp_path / "urban.yaml")
+    assert_refused(invoke(*arguments), "urban.yaml: preset is 'urban', and 'satellite' is asked for: leave one out")
 
 
 def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(tmp_path):

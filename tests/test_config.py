@@ -15,19 +15,21 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sat_intervals.config import (
+    PRESETS,
     Ambiguity,
     Census,
     Config,
     ConfigError,
+    CosineSgm,
     Disparity,
     Interval,
     Sgm,
     allowed,
     load_config,
-    preset_names,
     preset_text,
 )
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import COSINE_STEPS
 
 RANGE = {"disparity": {"minimum": -60, "maximum": 0}}
 
@@ -64,13 +66,14 @@ def test_load_config__completes_with_the_defaults() -> None:
 def test_default_yaml__holds_every_setting_at_its_default() -> None:
     values = yaml.safe_load(preset_text())
     assert list(values) == list(Config.model_fields)
+    assert values.pop("preset") == settings().preset
     for section, keys in values.items():
         model = getattr(settings(), section)
         assert list(keys) == list(type(model).model_fields)
     assert load_config(values) == settings()
 
 
-@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("name", PRESETS)
 def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: str) -> None:
     config = load_config(yaml.safe_load(preset_text(name)))
     section = None
@@ -78,36 +81,78 @@ def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: st
     for line in preset_text(name).splitlines():
         if found := re.fullmatch(r"(\w+):", line):
             section = type(getattr(config, found[1]))
-        elif found := re.fullmatch(r"  (\w+): \S+ +# (.*)", line):
+        elif found := re.fullmatch(r"(?:  |(?=preset))(\w+): \S+ +# (.*)", line):
+            section = section or Config
             field = section.model_fields[found[1]]
             assert found[2] == f"{field.description} ({allowed(field)})"
             commented.append((section, found[1]))
         else:
             assert not line or line.startswith("#")
-    models = [type(getattr(config, name)) for name in Config.model_fields]
-    assert commented == [(model, key) for model in models for key in model.model_fields]
+    models = [type(getattr(config, name)) for name in Config.model_fields if name != "preset"]
+    assert commented == [(Config, "preset"), *((model, key) for model in models for key in model.model_fields)]
 
 
 def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
-    assert load_config(yaml.safe_load(preset_text("mccnn"))) == settings(cost={"method": "mccnn"})
+    assert load_config(yaml.safe_load(preset_text("mccnn"))) == settings(preset="mccnn", cost={"method": "mccnn"})
 
 
-@pytest.mark.parametrize(("name", "p1", "p2"), [("urban", 20, 80), ("mountain", 38, 464), ("homogeneous", 72, 309)])
-def test_preset_text__changes_census_and_penalties_only(name: str, p1: int, p2: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "window", "p1", "p2"),
+    [("satellite", 7, 20, 128), ("urban", 11, 20, 80), ("mountain", 11, 38, 464), ("homogeneous", 11, 72, 309)],
+)
+def test_preset_text__changes_census_and_penalties(name: str, window: int, p1: int, p2: int) -> None:
     config = load_config(yaml.safe_load(preset_text(name)))
-    assert config == settings(cost={"window": 11}, sgm={"p1": p1, "p2": p2})
+    tiles = {"overlap": 128} if name == "satellite" else {}
+    assert config == settings(preset=name, cost={"window": window}, sgm={"p1": p1, "p2": p2}, tiles=tiles)
 
 
-def test_preset_names__are_the_shipped_files() -> None:
-    assert preset_names() == ("default", "homogeneous", "mccnn", "mountain", "urban")
+def test_preset_text__satellite_mccnn_has_constant_penalties_with_their_span() -> None:
+    config = load_config(yaml.safe_load(preset_text("satellite-mccnn")))
+    sgm = {"penalty": "constant", "p1": 0.6, "p2": 3.5, "span": 42}
+    assert isinstance(config.sgm, CosineSgm)
+    assert config == settings(preset="satellite-mccnn", cost={"method": "mccnn"}, sgm=sgm)
+    assert config.cost_span == 42 * COSINE_STEPS
 
 
-def test_preset_text__unknown_name_tells_the_known_ones() -> None:
-    with pytest.raises(ConfigError) as caught:
-        preset_text("urbn")
-    assert str(caught.value) == (
-        "unknown preset 'urbn', did you mean urban? (known: default, homogeneous, mccnn, mountain, urban)"
-    )
+# --- presets beside settings
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_load_config__a_preset_fills_in_what_is_left_out(name: str, write) -> None:
+    whole = load_config(yaml.safe_load(preset_text(name)), RANGE)
+    assert load_config(RANGE | {"preset": name}) == load_config(RANGE, {"preset": name}) == whole
+    assert load_config(write(f"preset: {name}\n"), RANGE) == whole
+    assert Config.model_validate(RANGE | {"preset": name}) == whole
+    assert load_config(whole.model_dump(mode="json")) == whole
+    assert load_config(whole, {"tiles": {"size": 64}}).sgm == whole.sgm
+
+
+def test_load_config__settings_beside_a_preset_win() -> None:
+    config = settings(preset="satellite", sgm={"p2": 99}, median=None)
+    assert config.sgm == Sgm(p1=20, p2=99)
+    assert config.cost == Census(window=7)
+    assert config.median is None
+    assert settings(preset="satellite", cost={"window": 5}).sgm == Sgm(p1=20, p2=128)
+
+
+def test_load_config__another_cost_beside_a_preset_takes_its_penalties_along() -> None:
+    other = settings(preset="satellite", cost={"method": "mccnn"})
+    assert (other.cost, other.sgm) == (settings(preset="mccnn").cost, settings(preset="mccnn").sgm)
+    assert settings(preset="mccnn", cost={"method": "census"}).sgm == Sgm()
+
+
+def test_load_config__other_penalties_beside_a_preset_need_their_own_span() -> None:
+    assert message(RANGE | {"preset": "satellite-mccnn", "sgm": {"p2": 7}}).startswith("sgm.span is null, allowed: ")
+    config = settings(preset="satellite-mccnn", sgm={"p2": 7, "span": 60})
+    assert (config.sgm.p1, config.sgm.span) == (Decimal("0.6"), 60)
+    assert message(RANGE | {"preset": "mccnn", "sgm": {"p1": 0.6}}).startswith("sgm: span is missing: the default, 16")
+
+
+def test_load_config__two_presets_are_refused(write) -> None:
+    file = write("preset: urban\n")
+    expected = f"{file}: preset is 'urban', and 'mccnn' is asked for: leave one out"
+    assert message(file, RANGE | {"preset": "mccnn"}) == expected
+    assert load_config(file, RANGE | {"preset": "urban"}).preset == "urban"
 
 
 # --- sources
@@ -265,9 +310,13 @@ REFUSED = [
     (
         "regularisation",
         {},
-        "unknown key 'regularisation', did you mean regularization? (known: disparity, cost",
+        "unknown key 'regularisation', did you mean regularization? (known: preset, disparity, cost",
     ),
-    (7, {}, "unknown key '7' (known: disparity, cost, sgm"),
+    ("preset", "urbn", "preset is 'urbn', allowed: paper or satellite or satellite-mccnn or urban or"),
+    ("preset", None, "preset is null, allowed: paper or satellite"),
+    ("preset", ["urban"], "preset is ['urban'], allowed: paper or satellite"),
+    ("sgm", {"p2": 40, "span": 9}, "sgm.span is given, but with cost.method census it follows from p2: leave it out"),
+    (7, {}, "unknown key '7' (known: preset, disparity, cost, sgm"),
 ]
 
 
@@ -322,8 +371,8 @@ def test_config_error__is_of_the_family() -> None:
         ("sgm: !!python/name:os.system\n", "line 1: could not determine a constructor"),
         ("sgm: *nowhere\n", "line 1: found undefined alias"),
         ("[1, 2]: 3\n", "line 1: found unhashable key"),
-        ("- disparity\n", "holds ['disparity'], allowed: sections disparity, cost, sgm"),
-        ("urban", "holds 'urban', allowed: sections disparity, cost, sgm"),
+        ("- disparity\n", "holds ['disparity'], allowed: sections preset, disparity, cost"),
+        ("urban", "holds 'urban', allowed: sections preset, disparity, cost"),
         ("sgm: {p1: 2024-13-45}\n", "month must be in 1..12"),
         (b"II*\x00\x08\x00\x00\x00", "unacceptable character"),
         (b"sgm: \xff\n", "unacceptable character"),
@@ -343,9 +392,7 @@ def test_load_config__unreadable_file_is_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing.yaml"
     assert message(missing) == f"{missing}: No such file or directory"
     preset = tmp_path / "mccnn.yaml"
-    assert message(preset).endswith(
-        f"mccnn.yaml: No such file or directory (sat-intervals config --preset mccnn > {preset} writes one)"
-    )
+    assert message(preset).endswith("mccnn.yaml: No such file or directory (--preset mccnn takes it from the package)")
     assert message(tmp_path) == f"{tmp_path}: Is a directory"
 
 

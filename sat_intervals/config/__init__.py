@@ -1,7 +1,8 @@
 """What a user may set: its default, its range, its one-line meaning, and the thresholds that follow."""
 
-from sat_intervals.config.penalties import InverseSgm, MccnnSgm, NegativeSgm, Sgm
-from sat_intervals.config.reading import load_config, load_yaml, preset_names, preset_text, read_small
+from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
+from sat_intervals.config.presets import PRESETS, preset_text
+from sat_intervals.config.reading import load_config, load_yaml, read_small
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -16,11 +17,13 @@ from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import allowed
 
 __all__ = [
+    "PRESETS",
     "Ambiguity",
     "Census",
     "Cluster",
     "Config",
     "ConfigError",
+    "CosineSgm",
     "Disparity",
     "Interval",
     "InverseSgm",
@@ -32,7 +35,6 @@ __all__ = [
     "allowed",
     "load_config",
     "load_yaml",
-    "preset_names",
     "preset_text",
     "read_small",
 ]

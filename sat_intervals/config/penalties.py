@@ -1,10 +1,11 @@
 """Sections of semi-global matching, one for each way in which its penalties may follow the images."""
 
+from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from sat_intervals.config.sections import Exact, Section
 
@@ -24,11 +25,25 @@ class _Penalties(Section):
 
 
 class Sgm(_Penalties):
-    """Constant penalties."""
+    """Constant penalties of Census, in bits."""
 
     penalty: Literal["constant"] = Field("constant", description="the same everywhere; or negative or inverse")
     p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")
     p2: int = Field(32, ge=1, description="penalty of a larger step, at least p1")
+
+    @property
+    def largest_p2(self) -> Fraction:
+        """What a larger step costs at most."""
+        return Fraction(self.p2)
+
+
+class CosineSgm(_Penalties):
+    """Constant penalties of MC-CNN, in units of the cosine. Like them, the span has no default that fits all images."""
+
+    penalty: Literal["constant"] = Field("constant", description="the same everywhere; or mc_cnn_fast")
+    p1: Exact = Field(gt=0, description="penalty of a disparity step of one pixel")
+    p2: Exact = Field(gt=0, description="penalty of a larger step, at least p1")
+    span: Exact = Field(gt=0, description="cost that etas and alpha are shares of, after SGM")
 
     @property
     def largest_p2(self) -> Fraction:
@@ -70,7 +85,9 @@ class InverseSgm(_Penalties):
 class MccnnSgm(_Penalties):
     """Penalties of MC-CNN, in units of the cosine: they fall where an image has an edge along the path."""
 
-    penalty: Literal["mc_cnn_fast"] = Field("mc_cnn_fast", description="they fall where the images have edges")
+    penalty: Literal["mc_cnn_fast"] = Field(
+        "mc_cnn_fast", description="they fall where the images have edges; or constant"
+    )
     p1: Exact = Field(Decimal("0.5"), gt=0, description="penalty of a disparity step of one pixel")
     p2: Exact = Field(Decimal("0.75"), gt=0, description="penalty of a larger step, at least p1")
     q1: Exact = Field(Decimal(3), ge=1, description="divides both where one of the images has an edge")
@@ -98,3 +115,22 @@ class MccnnSgm(_Penalties):
     def largest_p2(self) -> Fraction:
         """What a larger step costs at most."""
         return Fraction(self.p2)
+
+
+def sgm_kind(section: Any) -> str | None:
+    """The tag of the section's type: its penalty, or ``cosine`` for constant penalties with a span."""
+    has = section.__contains__ if isinstance(section, Mapping) else lambda key: hasattr(section, key)
+    if not has("penalty"):
+        return None
+    penalty = section["penalty"] if isinstance(section, Mapping) else section.penalty
+    return "cosine" if penalty == "constant" and has("span") else str(penalty)
+
+
+AnySgm = Annotated[
+    Annotated[Sgm, Tag("constant")]
+    | Annotated[NegativeSgm, Tag("negative")]
+    | Annotated[InverseSgm, Tag("inverse")]
+    | Annotated[MccnnSgm, Tag("mc_cnn_fast")]
+    | Annotated[CosineSgm, Tag("cosine")],
+    Discriminator(sgm_kind),
+]

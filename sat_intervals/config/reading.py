@@ -1,16 +1,16 @@
-"""Settings from YAML files, mappings and the command line, and the files of settings that come with the package."""
+"""Settings from YAML files, mappings and the command line."""
 
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import ValidationError
 
+from sat_intervals.config.presets import PRESETS, merged, without_other_cost
 from sat_intervals.config.sections import ConfigError
 from sat_intervals.config.settings import Config
-from sat_intervals.config.wording import explained, known, shown
+from sat_intervals.config.wording import explained, shown
 from sat_intervals.errors import SatIntervalsError, check_regular
 
 # Bytes of a file of settings or pairs, and nodes of YAML of a file of settings, an alias counted as what it repeats.
@@ -26,7 +26,8 @@ def load_config(
     Parameters
     ----------
     source
-        A YAML file, a mapping of sections, or settings checked before; None for the defaults.
+        A YAML file, a mapping of sections, or settings checked before; None for the defaults. ``preset`` names the
+        settings that fill in what is left out.
     overrides
         Sections and keys that win over ``source``, as those of the command line do.
 
@@ -49,48 +50,16 @@ def load_config(
             values = source
         case _:
             raise ConfigError(f"settings are {shown(source)}, allowed: a YAML file, a mapping or a Config")
+    names = [settings["preset"] for settings in (values, overrides) if settings.get("preset") is not None]
+    if len(set(map(str, names))) > 1:
+        raise ConfigError(f"{file}preset is {shown(names[0])}, and {shown(names[1])} is asked for: leave one out")
     try:
-        return Config.model_validate(_merged(_without_other_cost(values, overrides), overrides))
+        return Config.model_validate(merged(without_other_cost(values, overrides), overrides))
     except ValidationError as error:
         problems = error.errors(include_url=False)
         if all(_given(overrides, problem["loc"]) for problem in problems):
             file = ""  # not to blame for what the overrides brought
         raise ConfigError(file + "; ".join(map(explained, problems))) from error
-
-
-def preset_names() -> tuple[str, ...]:
-    """Return the names of the settings files that come with the package."""
-    files = resources.files("sat_intervals.configs").iterdir()
-    return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
-
-
-def preset_text(name: str = "default") -> str:
-    """Return the text of a settings file that comes with the package: complete, commented YAML."""
-    if name not in preset_names():
-        raise ConfigError(f"unknown preset {name!r}{known(name, preset_names())}")
-    return (resources.files("sat_intervals.configs") / f"{name}.yaml").read_text(encoding="utf-8")
-
-
-def _without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The settings without cost and penalties where the overrides choose another method, whose keys are others."""
-
-    def method(settings: Mapping[str, Any]) -> Any:
-        cost = settings.get("cost")
-        return cost.get("method") if isinstance(cost, Mapping) else None
-
-    if method(overrides) in (None, method(values) or "census"):
-        return values
-    return {key: value for key, value in values.items() if key != "cost" and (key != "sgm" or value is None)}
-
-
-def _merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(values)
-    for key, value in overrides.items():
-        below = merged.get(key)
-        if isinstance(below, Mapping) and isinstance(value, Mapping):
-            value = _merged(below, value)
-        merged[key] = value
-    return merged
 
 
 def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
@@ -172,10 +141,8 @@ def _read_yaml(file: Path) -> Mapping[str, Any]:
     try:
         values = load_yaml(read_small(file))
     except OSError as error:
-        preset = (
-            isinstance(error, FileNotFoundError) and file.name == f"{file.stem}.yaml" and file.stem in preset_names()
-        )
-        hint = f" (sat-intervals config --preset {file.stem} > {file} writes one)" if preset else ""
+        preset = isinstance(error, FileNotFoundError) and file.suffix == ".yaml" and file.stem in PRESETS
+        hint = f" (--preset {file.stem} takes it from the package)" if preset else ""
         raise ConfigError(f"{file}: {error.strerror}{hint}") from error
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""

@@ -4,13 +4,14 @@ from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
 from math import ceil, floor
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from sat_intervals.config.penalties import InverseSgm, MccnnSgm, NegativeSgm, Sgm
+from sat_intervals.config.penalties import AnySgm, CosineSgm, MccnnSgm, Sgm
+from sat_intervals.config.presets import PRESETS, with_preset
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -34,9 +35,10 @@ SGM_PATHS = 8
 class Config(Section):
     """All settings of a run; a section that is None switches its step off."""
 
+    preset: Literal[PRESETS] = Field(PRESETS[0], description="settings that fill in what is left out")  # type: ignore[valid-type]
     disparity: Disparity
     cost: Census | Mccnn = Field(Census(), discriminator="method")
-    sgm: Sgm | NegativeSgm | InverseSgm | MccnnSgm | None = Field(Sgm(), discriminator="penalty")
+    sgm: AnySgm | None = Sgm()
     ambiguity: Ambiguity | None = Ambiguity()
     interval: Interval | None = Interval()
     refinement: Refinement | None = Refinement()
@@ -50,17 +52,22 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _choose_methods(cls, values: Any) -> Any:
-        """Where a section does not say its kind: census, and the penalties of the cost."""
+        """Complete with the preset; where a section does not say its kind: census, and the penalties of the cost."""
         if not isinstance(values, Mapping):
             return values
-        values = dict(values)
+        values = with_preset(values)
         cost = values.setdefault("cost", {})
         if isinstance(cost, Mapping):
             cost = values["cost"] = {"method": "census", **cost}
         method = cost.get("method") if isinstance(cost, Mapping) else getattr(cost, "method", None)
         sgm = values.setdefault("sgm", {})
         if isinstance(sgm, Mapping):
-            values["sgm"] = {"penalty": "mc_cnn_fast" if method == "mccnn" else "constant", **sgm}
+            sgm = {"penalty": "mc_cnn_fast" if method == "mccnn" else "constant", **sgm}
+            if sgm["penalty"] == "constant" and method == "mccnn":
+                sgm.setdefault("span", None)  # by which `sgm_kind` knows whose constant penalties they are
+            elif sgm["penalty"] == "constant" and "span" in sgm:
+                raise ValueError(f"sgm.span is given, but with cost.method {method} it follows from p2: leave it out")
+            values["sgm"] = sgm
         return values
 
     @model_validator(mode="after")
@@ -81,9 +88,9 @@ class Config(Section):
             )
         return self
 
-    def _check_sgm(self, sgm: Sgm | NegativeSgm | InverseSgm | MccnnSgm) -> None:
-        if isinstance(sgm, MccnnSgm) != isinstance(self.cost, Mccnn):
-            known = "mc_cnn_fast" if isinstance(self.cost, Mccnn) else "constant, negative or inverse"
+    def _check_sgm(self, sgm: AnySgm) -> None:
+        if isinstance(sgm, CosineSgm | MccnnSgm) != isinstance(self.cost, Mccnn):
+            known = "constant or mc_cnn_fast" if isinstance(self.cost, Mccnn) else "constant, negative or inverse"
             raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: {known} with cost.method {self.cost.method}")
         # The largest uint16 is kept free: it marks the summed cost of an impossible candidate.
         largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.cost.largest
@@ -93,13 +100,13 @@ class Config(Section):
                 f"sgm.{key} is {float(sgm.largest_p2):g}, allowed: <= {largest // self.cost.steps} with "
                 f"{self._cost_in_words}, so that costs summed over {SGM_PATHS} paths fit in 16 bits"
             )
-        if isinstance(sgm, MccnnSgm):
-            if self.cost_span > self.largest_sum:
-                raise ValueError(
-                    f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
-                )
-            if sgm.gradients == "raw" and not self.disparity.minimum <= 0 <= self.disparity.maximum:
-                raise ValueError("sgm.gradients raw looks at the right image at disparity 0, which is not searched")
+        if isinstance(sgm, CosineSgm | MccnnSgm) and self.cost_span > self.largest_sum:
+            raise ValueError(
+                f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
+            )
+        is_raw = isinstance(sgm, MccnnSgm) and sgm.gradients == "raw"
+        if is_raw and not self.disparity.minimum <= 0 <= self.disparity.maximum:
+            raise ValueError("sgm.gradients raw looks at the right image at disparity 0, which is not searched")
 
     @property
     def _cost_in_words(self) -> str:
@@ -132,7 +139,7 @@ class Config(Section):
         depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they come nowhere near, and
         differ: see ``span`` in its settings.
         """
-        return self.in_steps(self.sgm.span) if isinstance(self.sgm, MccnnSgm) else self.largest_sum
+        return self.in_steps(self.sgm.span) if isinstance(self.sgm, CosineSgm | MccnnSgm) else self.largest_sum
 
     @property
     def cut_level(self) -> int | None:

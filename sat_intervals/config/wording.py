@@ -12,6 +12,7 @@ from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from sat_intervals.config.penalties import CosineSgm
 from sat_intervals.config.sections import Section, check_odd
 from sat_intervals.config.settings import Config
 
@@ -21,7 +22,7 @@ def allowed(field: FieldInfo) -> str:
     nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false", str: "text"}
     signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
     kinds = get_args(field.annotation) or (field.annotation,)
-    sections = _sections(field)
+    sections = _sections(field.annotation)
     kind = (
         f"section of {', '.join(sections[0].model_fields)}" if sections else nouns.get(kinds[0]) or " or ".join(kinds)
     )
@@ -36,10 +37,17 @@ def allowed(field: FieldInfo) -> str:
     return " ".join(filter(None, [kind, ", ".join(bounds), "or null" if NoneType in kinds else ""]))
 
 
-def _sections(field: FieldInfo) -> list[type[Section]]:
+def _sections(annotation: Any) -> list[type[Section]]:
     """The kinds of section that a field holds."""
-    kinds = get_args(field.annotation) or (field.annotation,)
-    return [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)]
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return [annotation]
+    return [kind for part in get_args(annotation) for kind in _sections(part)]
+
+
+def _name(kind: type[Section]) -> tuple[str, str]:
+    """The key that tells a kind of section from others, which is its first, and what it says."""
+    key, field = next(iter(kind.model_fields.items()))
+    return key, str(field.default)
 
 
 def explained(problem: ErrorDetails) -> str:
@@ -50,13 +58,13 @@ def explained(problem: ErrorDetails) -> str:
     owner: type[Section] = Config
     if path and path[0] in Config.model_fields:
         field = Config.model_fields[path[0]]
-        kinds = _sections(field)
+        kinds = _sections(field.annotation)
         if problem["type"] == "union_tag_invalid":
-            methods = " or ".join(str(kind.model_fields[str(field.discriminator)].default) for kind in kinds)
-            return f"{path[0]}.{field.discriminator} is {shown(problem['ctx']['tag'])}, allowed: {methods}"
+            methods = " or ".join(dict.fromkeys(_name(kind)[1] for kind in kinds))
+            return f"{path[0]}.{_name(kinds[0])[0]} is {shown(problem['ctx']['tag'])}, allowed: {methods}"
         if len(kinds) > 1 and len(path) > 1:
             tag = path.pop(1)  # pydantic names the kind as well
-            kinds = [kind for kind in kinds if kind.model_fields[str(field.discriminator)].default == tag]
+            kinds = [kind for kind in kinds if tag == ("cosine" if kind is CosineSgm else _name(kind)[1])]
         owner = kinds[0] if len(path) > 1 else Config
     where = ".".join(path)
     if problem["type"] == "value_error":

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config, Sgm
+from sat_intervals.config import Config, CosineSgm, Sgm
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match
 from sat_intervals.match.matching_cost import Area, MatchingCost, Reader, cost_areas
 from sat_intervals.match.normalization import PairStatistics
@@ -32,13 +32,14 @@ class Patch(NamedTuple):
 
 def kernel_settings(config: Config) -> Settings:
     """What the kernels need to know of a configuration."""
-    constant = config.sgm if isinstance(config.sgm, Sgm) else None  # others come with the gradients that they follow
+    # others come with the gradients that they follow
+    constant = config.sgm if isinstance(config.sgm, Sgm | CosineSgm) else None
     return Settings(
         minimum=config.disparity.minimum,
         count=config.disparity.count,
         impossible=config.impossible_cost,
-        p1=constant.p1 if constant else 0,
-        p2=constant.p2 if constant else 0,
+        p1=config.in_steps(constant.p1) if constant else 0,
+        p2=config.in_steps(constant.p2) if constant else 0,
         regularized=config.sgm is not None,
         cut_level=-1 if config.cut_level is None else config.cut_level,
         weights=np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights,

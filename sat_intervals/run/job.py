@@ -28,8 +28,8 @@ from sat_intervals.store.manifest import differences, digest
 from sat_intervals.store.tiles import LAYOUT, Store, finished_run, inputs_before, is_replacing
 from sat_intervals.tiling import Grid, Tile, Window
 
-# Sections of the settings that no tile knows of.
-_AFTER_THE_TILES = {"median", "regularization", "products", "cluster"}
+# What no tile knows of the settings: a preset is known by what it set.
+_AFTER_THE_TILES = {"preset", "median", "regularization", "products", "cluster"}
 OUTPUTS = ("intervals.tif", "validity.tif", "run.json")
 
 
@@ -162,12 +162,12 @@ def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: 
     """
     config = fitted_to_jobs(config)
     before = {
-        "settings": load_config(report["settings"]).model_dump(mode="json", exclude={"cluster"}),
+        "settings": load_config(report["settings"]).model_dump(mode="json", exclude={"cluster", "preset"}),
         "inputs": report["inputs"],
         "region": report["tiles"]["region"],
     }
     now = {
-        "settings": config.model_dump(mode="json", exclude={"cluster"}),
+        "settings": config.model_dump(mode="json", exclude={"cluster", "preset"}),
         "inputs": _inputs(left, right, config, report["inputs"])[0],
         "region": asdict(checked_region(left, None)),
     }

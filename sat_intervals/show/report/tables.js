@@ -154,8 +154,8 @@ function drawTiles(wide, worst) {
 function showRun() {
   const place = find("run");
   const words = (value) => (value === null ? "none" : typeof value === "object" ? JSON.stringify(value) : String(value));
-  const section = ([name, values]) => (values === null
-    ? [[name, "off", ""]]
+  const section = ([name, values]) => (values === null || typeof values !== "object"
+    ? [[name, values ?? "off", ""]]
     : Object.entries(values).map(([key, value], i) => [i ? "" : name, key, words(value)]));
   const seconds = Object.entries(run.seconds).map(([stage, value]) => [
     stage.includes(".") ? `${stage.replace(".", ", ")} (sum over workers)` : stage, `${fixed(value, 2)} s`,
