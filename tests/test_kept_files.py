@@ -387,12 +387,13 @@ def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(pair)
     assert (folder / "real" / "run.json").exists()
 
 
-def test_store__replaces_a_link_among_its_folders_and_does_not_follow_it(pair):
+@pytest.mark.parametrize("name", ["records", "arrays.zarr", "arrays.zarr/uint32"])
+def test_store__replaces_a_link_among_its_folders_and_does_not_follow_it(pair, name):
     folder, settings = pair
     (folder / "precious").mkdir()
     (folder / "precious" / "0_0.json").write_text("mine")
-    (folder / "out" / "tiles").mkdir(parents=True)
-    (folder / "out" / "tiles" / "records").symlink_to(folder / "precious")
+    (folder / "out" / "tiles" / name).parent.mkdir(parents=True)
+    (folder / "out" / "tiles" / name).symlink_to(folder / "precious")
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     assert contents(folder / "precious") == {str(folder / "precious" / "0_0.json"): b"mine"}
 

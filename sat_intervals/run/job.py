@@ -206,6 +206,8 @@ def weights_identity(cost: Mccnn) -> dict[str, Any]:
 
 def check_output(out: Path, overwrite: bool) -> None:
     """Make the folder of a run, or tell why it cannot be used."""
+    if os.path.lexists(out) and not out.is_dir():
+        raise SatIntervalsError(f"{out} is no folder: choose another")
     try:
         there = [name for name in OUTPUTS if (out / name).exists()]
         # run.json is the last: without it, but with tiles, a run was killed between the names of its files
@@ -214,8 +216,6 @@ def check_output(out: Path, overwrite: bool) -> None:
         is_under_way = is_unfinished if "run.json" in there else home.exists()
         if there and not overwrite and not is_under_way:
             raise _holds_run(out, there)
-        if os.path.lexists(out) and not out.is_dir():
-            raise SatIntervalsError(f"{out} is no folder: choose another")
         if (out / "tiles").is_symlink():
             raise SatIntervalsError(f"{out / 'tiles'} is a symbolic link: name the place of the tiles with --store")
         out.mkdir(parents=True, exist_ok=True)

@@ -109,8 +109,14 @@ class LocalFolder:
         return LocalFolder(self.path / folder)
 
     def make(self, folder: str) -> None:
-        """See `Folder`."""
-        (self.path / folder).mkdir(parents=True, exist_ok=True)
+        """See `Folder`; a symbolic link on the way is replaced, not followed."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        place = self.path
+        for name in filter(None, folder.split("/")):
+            place /= name
+            if place.is_symlink():
+                place.unlink()
+            place.mkdir(exist_ok=True)
 
     def place(self, name: str) -> Path:
         """See `Folder`."""

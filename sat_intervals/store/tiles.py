@@ -118,7 +118,7 @@ class Store:
                 drop(folder)
             if folder.read(MANIFEST) == "":  # as a power loss leaves it
                 folder.delete(MANIFEST)
-            for name in ("", RECORDS, FAILURES):
+            for name in ("", RECORDS, FAILURES, ARRAYS):
                 folder.make(name)
             home.make("")
             home.delete(_FINISHED)

@@ -77,8 +77,8 @@ class TileArrays:
         """Write what describes the arrays, where that is not there or damaged; every run writes the same."""
         texts, _ = _descriptions(self.grid, self.count, self.ambiguities)
         for name, text in texts.items():
+            self.folder.make(name.rpartition("/")[0])
             if self.folder.read(name) != text:
-                self.folder.make(name.rpartition("/")[0])
                 self.folder.write(name, text)
 
     def _array(self, name: str, store: Store) -> zarr.Array[Any]:
