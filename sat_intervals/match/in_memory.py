@@ -85,7 +85,8 @@ def _pixels(array: Array, side: str) -> np.ma.MaskedArray:
             f"the {side} array has {values.ndim} dimensions of {values.dtype}: "
             "give 2, rows and columns, of real numbers"
         )
-    if values.dtype.kind in "iu" and ((values.compressed() > 2**53) | (values.compressed() < -(2**53))).any():
+    is_long = values.dtype in (np.int64, np.uint64)
+    if is_long and ((values.compressed() > 2**53) | (values.compressed() < -(2**53))).any():
         raise SatIntervalsError(
             f"the {side} array has {values.dtype} values that float64 does not hold, so that texture is lost: subtract "
             "an offset"

@@ -151,12 +151,11 @@ def _textureless(
     base, there = (right, left) if area.mirrored else (left, right)
     base_varies, there_varies = (right_varies, left_varies) if area.mirrored else (left_varies, right_varies)
     flat: np.ndarray = ~base_varies[area.base.relative_to(base.window).slices] & (costs.left_state == 0)
-    if not flat.any():
-        return flat
-    telling = there_varies[area.facing.relative_to(there.window).slices] & (costs.right_state == 0)
+    rows = flat.any(axis=1)  # few, as a rule: the rest costs nothing
+    telling = there_varies[area.facing.relative_to(there.window).slices][rows] & (costs.right_state[rows] == 0)
     upto = np.pad(np.cumsum(telling, axis=1, dtype=np.int32), [(0, 0), (1, 0)])
     columns = area.base.width
-    flat &= upto[:, -columns:] == upto[:, :columns]
+    flat[rows] &= upto[:, -columns:] == upto[:, :columns]
     return flat
 
 

@@ -99,6 +99,8 @@ def _matched(cost: MatchingCost, area: Area, settings: Settings, output: Window,
 
 def _doubt(raw: Raw, textureless: np.ndarray, config: Config) -> None:
     """Give pixels without texture the whole search range as interval, and the largest ambiguity."""
+    if not textureless.any():
+        return
     doubtful = textureless & (raw.winner != NO_DISPARITY)
     if config.interval:
         raw.lower[doubtful], raw.upper[doubtful] = config.disparity.minimum, config.disparity.maximum
