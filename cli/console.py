@@ -14,11 +14,11 @@ from sat_intervals.cli import signals
 STAGES = {
     "scene": "making a scene",
     "pairs": "looking at pairs",
-    "pairs.files": "finishing pairs",
+    "pairs.files": "writing files of pairs",
     "kernels": "preparing kernels (compiled once a machine, then about a second)",
     "images": "measuring images",
     "tiles": "matching tiles",
-    "bands": "finishing rows",
+    "bands": "postprocessing rows",
     "points": "triangulating rows",
     "extent": "reading points",
     "cells": "filling rows of cells",

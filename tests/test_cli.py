@@ -189,7 +189,7 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: disparity, cost, sgm, "),
+        ("sgn: {p1: 8}", "unknown key 'sgn', did you mean sgm? (known: preset, disparity, cost, sgm, "),
         ("sgm: {p3: 8}", "unknown key 'sgm.p3' (known: penalty, p1, p2)"),
         ("sgm: {p1: eight}", "sgm.p1 is 'eight', allowed: integer >= 1"),
         ("sgm: {p1: 40}", "sgm: p1 40 is above p2 32"),
@@ -198,7 +198,7 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
         ("median: {size: 4}", "median.size is 4, allowed: integer >= 3"),
         ("interval: null", "regularization needs interval, which null switches off"),
         ("sgm: {p1: 8, p1: 9}", "line 1: key 'p1' appears twice"),
-        ("- sgm", "holds ['sgm'], allowed: sections disparity, "),
+        ("- sgm", "holds ['sgm'], allowed: sections preset, disparity, "),
         ("sgm: {", "line 1: "),
         ("", "disparity is missing, allowed: section of minimum, maximum"),
     ],
@@ -563,7 +563,7 @@ def test_match__prints_plain_lines_and_a_table(done):
     assert lines[0].startswith("preparing kernels")
     assert any(re.fullmatch(r"matching tiles: \d+/20, (\d+/s|\d+ s each), \d+ s left", line) for line in lines)
     assert "matching tiles: 20/20" in lines
-    assert "finishing rows: 200/200" in lines
+    assert "postprocessing rows: 200/200" in lines
     assert "writing files" in lines
     assert lines[-3:] == [str(out / name) for name in ("intervals.tif", "validity.tif", "run.json")]
     report = json.loads((out / "run.json").read_text())
