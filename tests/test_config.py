@@ -142,10 +142,30 @@ def test_load_config__another_cost_beside_a_preset_takes_its_penalties_along() -
 
 
 def test_load_config__other_penalties_beside_a_preset_need_their_own_span() -> None:
-    assert message(RANGE | {"preset": "satellite-mccnn", "sgm": {"p2": 7}}).startswith("sgm.span is null, allowed: ")
+    assert message(RANGE | {"preset": "satellite-mccnn", "sgm": {"p2": 7}}).startswith("sgm lacks span: constant ")
     config = settings(preset="satellite-mccnn", sgm={"p2": 7, "span": 60})
     assert (config.sgm.p1, config.sgm.span) == (Decimal("0.6"), 60)
     assert message(RANGE | {"preset": "mccnn", "sgm": {"p1": 0.6}}).startswith("sgm: span is missing: the default, 16")
+
+
+def test_load_config__another_kind_of_penalties_beside_a_preset_takes_p1_and_p2_only() -> None:
+    constant = {"penalty": "constant", "p1": 0.6, "p2": 3.5, "span": 42}
+    assert settings(preset="mccnn", sgm=constant).sgm == settings(preset="satellite-mccnn").sgm
+    fallen = settings(preset="satellite", sgm={"penalty": "negative", "alpha": 1, "gamma": 300}).sgm
+    assert (fallen.penalty, fallen.p1, fallen.p2) == ("negative", 20, 128)
+    own = settings(preset="satellite-mccnn", sgm={"penalty": "constant"})
+    assert own == settings(preset="satellite-mccnn")
+
+
+@pytest.mark.parametrize("named_by", ["file", "overrides"])
+def test_load_config__penalties_beside_a_preset_stay_with_its_cost_and_go_with_another(named_by: str) -> None:
+    preset = {"preset": "satellite-mccnn"}
+    file = RANGE | {"sgm": {"p2": 4, "span": 45}} | (preset if named_by == "file" else {})
+    more = preset if named_by == "overrides" else {}
+    same = load_config(file, {"cost": {"method": "mccnn"}} | more)
+    assert same == load_config(file, more)
+    assert (same.sgm.p2, same.sgm.span) == (4, 45)
+    assert load_config(file, {"cost": {"method": "census"}} | more).sgm == Sgm()
 
 
 def test_load_config__two_presets_are_refused(write) -> None:
@@ -316,6 +336,11 @@ REFUSED = [
     ("preset", None, "preset is null, allowed: paper or satellite"),
     ("preset", ["urban"], "preset is ['urban'], allowed: paper or satellite"),
     ("sgm", {"p2": 40, "span": 9}, "sgm.span is given, but with cost.method census it follows from p2: leave it out"),
+    (
+        "sgm",
+        {"penalty": "cosine", "span": 9},
+        "sgm.penalty is 'cosine', allowed: constant or negative or inverse or mc",
+    ),
     (7, {}, "unknown key '7' (known: preset, disparity, cost, sgm"),
 ]
 

@@ -117,13 +117,17 @@ class MccnnSgm(_Penalties):
         return Fraction(self.p2)
 
 
+# Unlike any penalty that a user may name.
+COSINE = "constant with span"
+
+
 def sgm_kind(section: Any) -> str | None:
-    """The tag of the section's type: its penalty, or ``cosine`` for constant penalties with a span."""
+    """The tag of the section's type: its penalty, with a word more for constant penalties with a span."""
     has = section.__contains__ if isinstance(section, Mapping) else lambda key: hasattr(section, key)
     if not has("penalty"):
         return None
     penalty = section["penalty"] if isinstance(section, Mapping) else section.penalty
-    return "cosine" if penalty == "constant" and has("span") else str(penalty)
+    return COSINE if penalty == "constant" and has("span") else str(penalty)
 
 
 AnySgm = Annotated[
@@ -131,6 +135,6 @@ AnySgm = Annotated[
     | Annotated[NegativeSgm, Tag("negative")]
     | Annotated[InverseSgm, Tag("inverse")]
     | Annotated[MccnnSgm, Tag("mc_cnn_fast")]
-    | Annotated[CosineSgm, Tag("cosine")],
+    | Annotated[CosineSgm, Tag(COSINE)],
     Discriminator(sgm_kind),
 ]

@@ -19,16 +19,26 @@ def with_preset(values: Mapping[str, Any]) -> dict[str, Any]:
     """Complete settings with those of the preset that they name; what is given beside it wins, key by key.
 
     The search range is never that of a preset. Where another matching cost is given, cost and penalties of the preset
-    do not fit and are left out; where other penalties are given without their span, so is the span.
+    do not fit and are left out; where another kind of penalties is given, all but p1 and p2; where other penalties are
+    given without their span, the span.
     """
     name = values.get("preset", PRESETS[0])
     if name == PRESETS[0] or name not in PRESETS:  # the defaults; or to be refused
         return dict(values)
-    preset = {key: value for key, value in yaml.safe_load(preset_text(name)).items() if key != "disparity"}
-    sgm = values.get("sgm")
-    if isinstance(sgm, Mapping) and sgm.keys() - {"span"} and "span" not in sgm:
-        preset["sgm"].pop("span", None)
+    preset = _settings(name)
+    sgm, own = values.get("sgm"), preset["sgm"]
+    if isinstance(sgm, Mapping):
+        if sgm.get("penalty", own["penalty"]) != own["penalty"]:
+            preset["sgm"] = {key: own[key] for key in ("p1", "p2")}
+        elif sgm.keys() - {"penalty", "span"} and "span" not in sgm:
+            own.pop("span", None)
     return merged(without_other_cost(preset, values), values)
+
+
+def _settings(name: Any) -> dict[str, Any]:
+    """What a preset sets, without its search range; nothing for an unknown one."""
+    values = yaml.safe_load(preset_text(name)) if name in PRESETS else {}
+    return {key: value for key, value in values.items() if key != "disparity"}
 
 
 def without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -38,7 +48,11 @@ def without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) 
         cost = settings.get("cost")
         return cost.get("method") if isinstance(cost, Mapping) else getattr(cost, "method", None)
 
-    if method(overrides) in (None, method(values) or "census"):
+    chosen = method(overrides)
+    if chosen is None:
+        return values
+    preset = values.get("preset") or overrides.get("preset")
+    if chosen == (method(values) or method(_settings(preset)) or "census"):
         return values
     return {key: value for key, value in values.items() if key != "cost" and (key != "sgm" or value is None)}
 

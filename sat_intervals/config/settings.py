@@ -64,7 +64,11 @@ class Config(Section):
         if isinstance(sgm, Mapping):
             sgm = {"penalty": "mc_cnn_fast" if method == "mccnn" else "constant", **sgm}
             if sgm["penalty"] == "constant" and method == "mccnn":
-                sgm.setdefault("span", None)  # by which `sgm_kind` knows whose constant penalties they are
+                if missing := [key for key in ("p1", "p2", "span") if key not in sgm]:
+                    raise ValueError(
+                        f"sgm lacks {' and '.join(missing)}: constant penalties have no defaults with cost.method "
+                        "mccnn (config --preset satellite-mccnn shows some)"
+                    )
             elif sgm["penalty"] == "constant" and "span" in sgm:
                 raise ValueError(f"sgm.span is given, but with cost.method {method} it follows from p2: leave it out")
             values["sgm"] = sgm

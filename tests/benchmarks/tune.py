@@ -16,7 +16,7 @@ import numpy as np
 import rasterio
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sat_intervals import load_config, match_arrays
+from sat_intervals import match_arrays
 from sat_intervals.config import PRESETS
 
 DATA = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
@@ -40,7 +40,6 @@ COSINE = [
     (0.5, 3, 40),
     (0.6, 3.5, 36),
     (0.6, 3.5, 42),
-    (0.7, 4, 35),
     (0.7, 4, 40),
     (0.7, 4, 45),
     (1, 6, 60),
@@ -168,7 +167,6 @@ def presets() -> None:
     figures = "good", "bad-3", "kept", "coverage", "median width", "score"
     header("preset", "scenes", *figures)
     for preset in PRESETS:
-        load_config({"preset": preset, "disparity": {"minimum": 0, "maximum": 1}})
         for label, names in (("WorldView-3", WORLDVIEW), ("synthetic cities", SYNTHETIC), ("Middlebury", MIDDLEBURY)):
             found = means(names, {"preset": preset})
             row(preset, label, *(found[name] for name in figures))
