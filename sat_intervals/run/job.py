@@ -69,7 +69,7 @@ class Job:
     @property
     def name(self) -> str:
         """A name that this run shares with no other: all that decides the bytes of its files."""
-        return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster"})})
+        return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster", "preset"})})
 
     def is_finished(self) -> bool:
         """Whether the folder holds the files of this very run, which died before it removed its tiles."""
