@@ -6,11 +6,13 @@ import shutil
 import subprocess
 import sysconfig
 import threading
+import zipfile
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import yaml
 from click.testing import CliRunner
 from finished import random_bands, write_run
@@ -26,6 +28,7 @@ from sat_intervals.raster import (
     OutputWriter,
     north_up,
     open_image,
+    other_files,
     put_back,
     write_layer,
 )
@@ -128,6 +131,38 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     match_pair(*images, folder / "once", settings)
     for file in ("intervals.tif", "validity.tif"):
         assert (folder / "out" / file).read_bytes() == (folder / "once" / file).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["/vsizip/{}", "/vsizip/{{{}}}"])
+def test_match_pair__knows_an_image_in_an_archive(pair, kind):
+    folder, settings = pair
+    left = kind.format(folder / "a.zip") + "/left.tif"
+
+    def pack(name):
+        with zipfile.ZipFile(folder / "a.zip", "w") as archive:
+            archive.write(folder / name, "left.tif")
+
+    pack("left.tif")
+    report = match_pair(left, folder / "right.tif", folder / "out", settings, keep_tiles=True)
+    assert report["inputs"]["left"]["path"] == left
+    assert report["inputs"]["left"]["sha256"] == identity(str(folder / "a.zip"))["sha256"]
+    assert open_results(folder / "out").left.path == left
+    (folder / "out" / "run.json").unlink()
+    (folder / "out" / "tiles" / "records" / "1_1.json").unlink()
+    pack("other.tif")
+    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: inputs\.left\.bytes was "):
+        match_pair(left, folder / "right.tif", folder / "out", settings)
+    (folder / "in" / "tiles").mkdir(parents=True)
+    inside = shutil.copy(folder / "a.zip", folder / "in" / "tiles")
+    with pytest.raises(SatIntervalsError, match="is an input inside"):
+        match_pair(f"/vsizip/{inside}/left.tif", folder / "right.tif", folder / "in", settings)
+
+
+def test_other_files__are_those_of_the_sources_of_a_virtual_raster_too(pair):
+    folder, _ = pair
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(folder / "mask.tif", "r+") as file:
+        file.write_mask(np.full((150, 180), 255, np.uint8))
+    assert other_files(str(folder / "mask.vrt")) == [str(folder / "mask.tif"), str(folder / "mask.tif.msk")]
 
 
 def test_match_pair__goes_on_where_an_input_is_touched_and_not_changed(pair):
