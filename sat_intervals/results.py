@@ -223,7 +223,7 @@ def open_run(out: str | Path) -> Run:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}") from error
-    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
     for name, bands in _BANDS.items():
         _check_raster(out / name, bands, region)

@@ -1,6 +1,7 @@
 """A store that was damaged, or shares its folder with files of the user: right bytes or a clear line, nothing lost."""
 
 import json
+import os
 import shutil
 
 import pytest
@@ -256,6 +257,31 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     out, options = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
     match(scene, out, *options, "--keep-tiles")
     (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
+@pytest.mark.parametrize("how", ["half", "bit", "empty"])
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tmp_path, monkeypatch, name, how):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, status=1)
+    damage(out / name, how)
+    said = match(scene, out, status=2)
+    assert f"{out / name} was changed after the run, whose tiles are still there: delete it" in said
+    assert (out / name).stat().st_size == 0 or how != "empty"
+    (out / name).unlink()
+    match(scene, out)
+    assert_same(scene, out)
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "store.json", "finished", "replacing", "arrays.zarr/zarr.json"])
+def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
+    tiles = unfinished(scene, tmp_path / "out")
+    (tiles / name).unlink(missing_ok=True)
+    os.mkfifo(tiles / name)
+    assert f"{tiles / name} is a named pipe" in match(scene, tmp_path / "out", status=2)
+
+
     shutil.rmtree(tiles)
     shutil.rmtree(out)
     names = ["notes.txt", "records/notes.json", "failures/all.json", "arrays.zarr/int16/table", "arrays.zarr/.zattrs"]

@@ -413,6 +413,25 @@ def elsewhere(tmp_path):
     precious = tmp_path / "precious"
     for name in ("records/0_0.json", "arrays.zarr/zarr.json", "manifest.json", "normalization.json"):
         (precious / name).parent.mkdir(parents=True, exist_ok=True)
+def test_match__takes_the_tiles_of_a_user_for_no_run_of_its_own(pair):
+    folder, settings = pair
+    (folder / "out" / "tiles").mkdir(parents=True)
+    (folder / "out" / "tiles" / "12_34.png").write_text("mine")
+    (folder / "out" / "validity.tif").write_text("mine")
+    before = contents(folder)
+    with pytest.raises(SatIntervalsError, match=r"already holds a run \(validity.tif\)"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("content", [b'{"finished": 1}', b"II*\0some raster", b"<html>"])
+def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", file], "is no log", "--log-file")
+    assert file.read_bytes() == content
+
+
         (precious / name).write_text("{}")
     with HTTPServer(("127.0.0.1", 0), Handler) as server:
         thread = threading.Thread(target=server.serve_forever)

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 
 # A file of this name that is regular and empty is ours; any other stays as it is.
 _LOCK = ".sat-intervals.lock"
@@ -37,6 +37,7 @@ class LocalFolder:
 
     def read_bytes(self, name: str) -> bytes | None:
         """See `Folder`."""
+        check_regular(self.path / name)
         try:
             return (self.path / name).read_bytes()
         except FileNotFoundError:
