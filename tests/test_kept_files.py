@@ -385,34 +385,20 @@ def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(pair)
     assert (folder / "real" / "run.json").exists()
 
 
-def test_store__replaces_a_link_among_its_folders_and_does_not_follow_it(pair):
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["records", "failures", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
+def test_match__refuses_a_link_among_the_folders_of_its_tiles(pair, name, overwrite):
     folder, settings = pair
     (folder / "precious").mkdir()
     (folder / "precious" / "0_0.json").write_text("mine")
-    (folder / "out" / "tiles").mkdir(parents=True)
-    (folder / "out" / "tiles" / "records").symlink_to(folder / "precious")
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    link = folder / "out" / "tiles" / name
+    link.parent.mkdir(parents=True)
+    link.symlink_to(folder / "precious")
+    with pytest.raises(SatIntervalsError, match=rf"{name} is a file or a symbolic link, .*: move it away"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, overwrite=overwrite)
     assert contents(folder / "precious") == {str(folder / "precious" / "0_0.json"): b"mine"}
 
 
-@pytest.fixture
-def elsewhere(tmp_path):
-    """A web server that counts what it is asked for, and a folder of the user's own that looks like a store."""
-    asked = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self):
-            asked.append(self.path)
-            self.send_error(404)
-
-        do_HEAD = do_GET  # noqa: N815
-
-        def log_message(self, *_):
-            """Say nothing."""
-
-    precious = tmp_path / "precious"
-    for name in ("records/0_0.json", "arrays.zarr/zarr.json", "manifest.json", "normalization.json"):
-        (precious / name).parent.mkdir(parents=True, exist_ok=True)
 def test_match__takes_the_tiles_of_a_user_for_no_run_of_its_own(pair):
     folder, settings = pair
     (folder / "out" / "tiles").mkdir(parents=True)

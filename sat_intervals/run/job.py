@@ -25,7 +25,7 @@ from sat_intervals.raster.identity import ChangedInputError, check_not_replaced,
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import differences, digest
-from sat_intervals.store.tiles import LAYOUT, Store, finished_run, inputs_before, is_replacing
+from sat_intervals.store.tiles import LAYOUT, Store, finished_run, has_begun, inputs_before, is_replacing
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Sections of the settings that no tile knows of.
@@ -211,7 +211,7 @@ def check_output(out: Path, overwrite: bool) -> None:
         # run.json is the last: without it, but with tiles, a run was killed between the names of its files
         home = out / "tiles"
         is_unfinished = is_replacing(home) or finished_run(home) is not None
-        is_under_way = is_unfinished if "run.json" in there else home.exists()
+        is_under_way = is_unfinished or ("run.json" not in there and has_begun(home))
         if there and not overwrite and not is_under_way:
             raise _holds_run(out, there)
         if os.path.lexists(out) and not out.is_dir():

@@ -51,8 +51,8 @@ class LocalFolder:
     def sizes(self) -> dict[str, int]:
         """See `Folder`."""
         found = {}
-        for place, _, names in os.walk(self.path):
-            for name in names:
+        for place, folders, files in os.walk(self.path):
+            for name in (*files, *(folder for folder in folders if os.path.islink(f"{place}/{folder}"))):
                 with suppress(FileNotFoundError):  # others may be at work here
                     found[os.path.relpath(f"{place}/{name}", self.path)] = os.lstat(f"{place}/{name}").st_size
         return found

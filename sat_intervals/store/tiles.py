@@ -23,7 +23,7 @@ from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
-from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_free, drop
+from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_free, drop, is_of_run
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -311,6 +311,11 @@ def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
     """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
     try:
         return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
+def has_begun(home: Path) -> bool:
+    """Whether a run made this folder of tiles; that of a user may have the same name."""
+    return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
+
+
     except (OSError, TypeError, ValueError):
         return {}
 
