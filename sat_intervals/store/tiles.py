@@ -11,7 +11,7 @@ import errno
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -287,14 +287,18 @@ def remove_tiles(home: Path, place: Folder) -> None:
         folder_at(home).delete(name)
 
 
-def mark_finished(home: Path, run: str) -> None:
-    """Note which run is about to give its files their names, after which its tiles are to be removed."""
-    folder_at(home).write(_FINISHED, run)
+def mark_finished(home: Path, run: str, stamps: Sequence[str] = ()) -> None:
+    """Note which run is about to give its files their names, after which its tiles are to be removed.
+
+    To be called again, with the stamps of these files, when they have their names.
+    """
+    folder_at(home).write(_FINISHED, "\n".join([run, *stamps]))
 
 
-def finished_run(home: Path) -> str | None:
+def finished_run(home: Path) -> tuple[str, list[str]] | None:
     """What `mark_finished` noted, where the tiles have not been removed since."""
-    return folder_at(home).read(_FINISHED)
+    run, *stamps = (folder_at(home).read(_FINISHED) or "").split("\n")
+    return (run, stamps) if run else None
 
 
 def mark_replaced(home: Path) -> None:
@@ -307,15 +311,15 @@ def is_replacing(home: Path) -> bool:
     return folder_at(home).read(_REPLACING) is not None
 
 
-def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
-    """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
-    try:
-        return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
 def has_begun(home: Path) -> bool:
     """Whether a run made this folder of tiles; that of a user may have the same name."""
     return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
 
 
+def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
+    """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
+    try:
+        return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
     except (OSError, TypeError, ValueError):
         return {}
 
