@@ -15,8 +15,9 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.run import pair as run
+from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_tile
-from sat_intervals.store.tiles import Store
+from sat_intervals.store.tiles import DamagedTilesError, Store
 
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
 SHARDS = ["arrays.zarr/int16/c/0/1/0", "arrays.zarr/uint32/c/0/1/0", "arrays.zarr/right/c/1/0"]
@@ -157,6 +158,22 @@ def test_match__in_a_file_system_of_fsspec_checks_what_it_reads(scene, tmp_path)
     assert_same(scene, tmp_path / "out")
 
 
+def test_strips__of_a_file_that_changes_between_two_of_them_end(tmp_path, scene):
+    settings = yaml.safe_load((scene / "settings.yaml").read_text()) | {"tiles": {"size": 256, "overlap": 10}}
+    made = make_scene(256, 150, seed=3)
+    for side in ("left", "right"):
+        write_layer(tmp_path / f"{side}.tif", getattr(made, side), 0, north_up(32631, 0, 0, 0.5))
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    job = prepare(*images, tmp_path / "out", settings)
+    match_pair(*images, tmp_path / "out", settings, keep_tiles=True)
+    assert len(list(job.store.strips(128, job.store.records()))) == 2
+    strips = job.store.strips(128, job.store.records())
+    next(strips)
+    damage(tmp_path / "out/tiles/arrays.zarr/uint32/c/0/0/0", "bit")
+    with pytest.raises(DamagedTilesError, match=r"tiles 0_0 in .* are damaged"):
+        next(strips)
+
+
 @pytest.mark.usefixtures("mccnn_extra")
 @pytest.mark.parametrize("how", DAMAGES)
 def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp_path, how):
@@ -240,23 +257,6 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
     assert "already holds a run" in match(scene, out, *store, status=2)
 
 
-def with_files(folder, names):
-    """Files of the user, with their content."""
-    for name in names:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(f"mine: {name}")
-    return {folder / name: f"mine: {name}" for name in names}
-
-
-def assert_kept(mine):
-    assert {file: file.read_text() for file in mine} == mine
-
-
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_path, monkeypatch, elsewhere):
-    out, options = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
-    match(scene, out, *options, "--keep-tiles")
-    (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
 @pytest.mark.parametrize("how", ["half", "bit", "empty"])
 @pytest.mark.parametrize("name", OUTPUTS)
 def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tmp_path, monkeypatch, name, how):
@@ -282,6 +282,23 @@ def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
     assert f"{tiles / name} is a named pipe" in match(scene, tmp_path / "out", status=2)
 
 
+def with_files(folder, names):
+    """Files of the user, with their content."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(f"mine: {name}")
+    return {folder / name: f"mine: {name}" for name in names}
+
+
+def assert_kept(mine):
+    assert {file: file.read_text() for file in mine} == mine
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_path, monkeypatch, elsewhere):
+    out, options = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
+    match(scene, out, *options, "--keep-tiles")
+    (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
     shutil.rmtree(tiles)
     shutil.rmtree(out)
     names = ["notes.txt", "records/notes.json", "failures/all.json", "arrays.zarr/int16/table", "arrays.zarr/.zattrs"]

@@ -33,7 +33,7 @@ from sat_intervals.raster import (
     write_layer,
 )
 from sat_intervals.raster.identity import ChangedInputError, identity
-from sat_intervals.results import open_results
+from sat_intervals.results import Run, open_results
 from sat_intervals.run import assemble
 from sat_intervals.run.batch import PairOfBatch, match_batch
 from sat_intervals.run.job import prepare
@@ -263,6 +263,20 @@ def finished(tmp_path):
     return write_run(tmp_path, *random_bands(40, 50))
 
 
+def test_export__ends_where_another_run_replaces_the_one_it_reads(finished, tmp_path, monkeypatch):
+    read = Run.read_bands
+
+    def and_replace(run, window):
+        shutil.copy(finished / "run.json", tmp_path / "new")
+        os.replace(tmp_path / "new", finished / "run.json")
+        return read(run, window)
+
+    monkeypatch.setattr(Run, "read_bands", and_replace)
+    with pytest.raises(RunError, match="was replaced while it was read: run the command again"):
+        export(finished, "otb", tmp_path / "target")
+    assert not list((tmp_path / "target").glob("*.tif"))
+
+
 def rename_left(out, name):
     """Give the left image of a run another name beside its files."""
     report = json.loads((out / "run.json").read_text())
@@ -418,6 +432,24 @@ def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
     assert file.read_bytes() == content
 
 
+@pytest.fixture
+def elsewhere(tmp_path):
+    """A web server that counts what it is asked for, and a folder of the user's own that looks like a store."""
+    asked = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_error(404)
+
+        do_HEAD = do_GET  # noqa: N815
+
+        def log_message(self, *_):
+            """Say nothing."""
+
+    precious = tmp_path / "precious"
+    for name in ("records/0_0.json", "arrays.zarr/zarr.json", "manifest.json", "normalization.json"):
+        (precious / name).parent.mkdir(parents=True, exist_ok=True)
         (precious / name).write_text("{}")
     with HTTPServer(("127.0.0.1", 0), Handler) as server:
         thread = threading.Thread(target=server.serve_forever)
