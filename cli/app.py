@@ -39,6 +39,16 @@ RESUMED = ("match", "demo", "batch")
 class _Commands(click.Group):
     """Turns whatever goes wrong in a command into one line and an exit status."""
 
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return super().main(*args, **kwargs)
+        except OSError as error:  # of --help and --version, which print before a command is invoked
+            if not _is_of_stdout(error):
+                raise
+            _forget_stdout()
+            click.echo(f"sat-intervals: stdout cannot be written: {error.strerror}", err=True)
+            sys.exit(FAILED)
+
     def invoke(self, context: click.Context) -> Any:
         try:
             os.getcwd()

@@ -1,6 +1,7 @@
 """``--debug`` and ``--log-file``: what the library logs, on stderr and in a file, for the time of one command."""
 
 import logging
+import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -94,6 +95,7 @@ def _added(handler: logging.Handler, logger: logging.Logger) -> Iterator[None]:
 
 @contextmanager
 def _opened(log_file: Path) -> Iterator[IO[str]]:
+    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.raster.identity import check_not_replaced
 
     given = {**click.get_current_context().params, "log_file": None}.values()
@@ -101,13 +103,27 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
     paths = [Path(name) for name in names if isinstance(name, (str, Path))]
     check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
     try:
-        file = log_file.open("a", encoding="utf-8", errors="backslashreplace", buffering=1)
+        if log_file.is_file() and not _is_text(log_file):
+            raise SatIntervalsError(f"{log_file} is there and is no log: choose another --log-file")
+        file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1, opener=_at_once)  # noqa: SIM115
     except OSError as error:
-        from sat_intervals.errors import SatIntervalsError
-
         raise SatIntervalsError(f"{log_file} cannot be written: {error.strerror}: choose another --log-file") from error
     try:
         yield file
     finally:
         with suppress(OSError):  # of a full disk, which was told
             file.close()
+
+
+def _is_text(file: Path) -> bool:
+    """Whether lines may be added to a file: it is no raster, nor JSON, HTML or XML such as a run writes."""
+    with file.open("rb") as stream:
+        head = stream.read(4096).lstrip()
+    return b"\0" not in head and not head.startswith((b"{", b"[", b"<"))
+
+
+def _at_once(path: str, flags: int) -> int:
+    """The descriptor of a file to write; an OSError of a pipe that nobody reads, for which `open` waits without end."""
+    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
+    os.set_blocking(descriptor, True)
+    return descriptor

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, Regularization, load_config
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS
 from sat_intervals.raster import (
@@ -94,12 +95,15 @@ class Run:
         Settings of the run.
     region
         The pixels of the left image that were matched. Rows and columns of the results count from its first pixel.
+    which
+        See `_which`, of ``run.json``, which goes before and comes after all other files when a run replaces another.
     """
 
     out: Path
     report: dict[str, Any]
     config: Config
     region: Window
+    which: tuple[int, int] | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -108,7 +112,17 @@ class Run:
 
     def read_bands(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
         """Disparity, lower, upper and confidence ``(4, rows, columns)``, and validity, of a window of the results."""
-        return read_layers(self.out / "intervals.tif", window), read_layers(self.out / "validity.tif", window)[0]
+        with self.unchanged():
+            return read_layers(self.out / "intervals.tif", window), read_layers(self.out / "validity.tif", window)[0]
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """A block that reads bands, and fails where they are no longer those of this run."""
+        try:
+            yield
+        finally:
+            if _which(self.out / "run.json") != self.which:
+                raise RunError(f"the run in {self.out} was replaced while it was read: run the command again")
 
     def windows(self) -> Iterator[Window]:
         """Full-width windows of the results, from the top."""
@@ -173,8 +187,9 @@ class Results(Run):
 
     def read_small(self, shape: tuple[int, int]) -> Bands:
         """All of the results but the truth, as ``shape`` pixels: the bands picked, the left image averaged."""
-        disparity, lower, upper, confidence = read_small_layers(self.out / "intervals.tif", shape)
-        validity = read_small_layers(self.out / "validity.tif", shape)[0]
+        with self.unchanged():
+            disparity, lower, upper, confidence = read_small_layers(self.out / "intervals.tif", shape)
+            validity = read_small_layers(self.out / "validity.tif", shape)[0]
         image = read_small_image(self.left, self.region, shape)
         return Bands(disparity, lower, upper, confidence, validity, image, np.full(shape, np.nan))
 
@@ -214,6 +229,7 @@ def open_run(out: str | Path) -> Run:
     file = out / "run.json"
     try:
         check_regular(file)
+        which = _which(file)
         report = json.loads(file.read_text(encoding="utf-8"))
         config = load_config(report["settings"])
         for side in ("left", "right"):
@@ -223,11 +239,19 @@ def open_run(out: str | Path) -> Run:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}") from error
-    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
     for name, bands in _BANDS.items():
         _check_raster(out / name, bands, region)
-    return Run(out, report, config, region)
+    return Run(out, report, config, region, which)
+
+
+def _which(file: Path) -> tuple[int, int] | None:
+    """What tells a file from one that replaces it; None where there is none."""
+    with suppress(OSError):
+        status = file.stat()
+        return status.st_ino, status.st_mtime_ns
+    return None
 
 
 def _files_told(told: Any) -> Iterator[str]:
@@ -285,7 +309,7 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     if truth is None and run.truth_beside.exists():
         truth = run.truth_beside
     layer = None if truth is None else run.layer(truth)
-    return Results(run.out, run.report, run.config, run.region, left, right, layer)
+    return Results(run.out, run.report, run.config, run.region, run.which, left, right, layer)
 
 
 def _opened(told: dict[str, Any]) -> Image:

@@ -1,6 +1,7 @@
 """A store that was damaged, or shares its folder with files of the user: right bytes or a clear line, nothing lost."""
 
 import json
+import os
 import shutil
 
 import pytest
@@ -15,8 +16,9 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.run import pair as run
 from sat_intervals.run.assemble import assemble
+from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_tile
-from sat_intervals.store.tiles import Store
+from sat_intervals.store.tiles import DamagedTilesError, Store
 
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
 SHARDS = ["arrays.zarr/int16/c/0/1/0", "arrays.zarr/uint32/c/0/1/0", "arrays.zarr/right/c/1/0"]
@@ -157,6 +159,22 @@ def test_match__in_a_file_system_of_fsspec_checks_what_it_reads(scene, tmp_path)
     assert_same(scene, tmp_path / "out")
 
 
+def test_strips__of_a_file_that_changes_between_two_of_them_end(tmp_path, scene):
+    settings = yaml.safe_load((scene / "settings.yaml").read_text()) | {"tiles": {"size": 256, "overlap": 10}}
+    made = make_scene(256, 150, seed=3)
+    for side in ("left", "right"):
+        write_layer(tmp_path / f"{side}.tif", getattr(made, side), 0, north_up(32631, 0, 0, 0.5))
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    job = prepare(*images, tmp_path / "out", settings)
+    match_pair(*images, tmp_path / "out", settings, keep_tiles=True)
+    assert len(list(job.store.strips(128, job.store.records()))) == 2
+    strips = job.store.strips(128, job.store.records())
+    next(strips)
+    damage(tmp_path / "out/tiles/arrays.zarr/uint32/c/0/0/0", "bit")
+    with pytest.raises(DamagedTilesError, match=r"tiles 0_0 in .* are damaged"):
+        next(strips)
+
+
 @pytest.mark.usefixtures("mccnn_extra")
 @pytest.mark.parametrize("how", DAMAGES)
 def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp_path, how):
@@ -258,6 +276,31 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
     assert not list(tmp_path.rglob("arrays.zarr"))
     assert (out / "run.json").read_bytes() == report
     assert "already holds a run" in match(scene, out, *store, status=2)
+
+
+@pytest.mark.parametrize("how", ["half", "bit", "empty"])
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tmp_path, monkeypatch, name, how):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, status=1)
+    damage(out / name, how)
+    said = match(scene, out, status=2)
+    assert f"{out / name} was changed after the run, whose tiles are still there: delete it" in said
+    assert (out / name).stat().st_size == 0 or how != "empty"
+    (out / name).unlink()
+    match(scene, out)
+    assert_same(scene, out)
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "store.json", "finished", "replacing", "arrays.zarr/zarr.json"])
+def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
+    tiles = unfinished(scene, tmp_path / "out")
+    (tiles / name).unlink(missing_ok=True)
+    os.mkfifo(tiles / name)
+    assert f"{tiles / name} is a named pipe" in match(scene, tmp_path / "out", status=2)
 
 
 def with_files(folder, names):

@@ -6,11 +6,13 @@ import shutil
 import subprocess
 import sysconfig
 import threading
+import zipfile
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import yaml
 from click.testing import CliRunner
 from finished import random_bands, write_run
@@ -26,11 +28,12 @@ from sat_intervals.raster import (
     OutputWriter,
     north_up,
     open_image,
+    other_files,
     put_back,
     write_layer,
 )
 from sat_intervals.raster.identity import ChangedInputError, identity
-from sat_intervals.results import open_results
+from sat_intervals.results import Run, open_results
 from sat_intervals.run import assemble
 from sat_intervals.run.batch import PairOfBatch, match_batch
 from sat_intervals.run.job import prepare
@@ -128,6 +131,38 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     match_pair(*images, folder / "once", settings)
     for file in ("intervals.tif", "validity.tif"):
         assert (folder / "out" / file).read_bytes() == (folder / "once" / file).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["/vsizip/{}", "/vsizip/{{{}}}"])
+def test_match_pair__knows_an_image_in_an_archive(pair, kind):
+    folder, settings = pair
+    left = kind.format(folder / "a.zip") + "/left.tif"
+
+    def pack(name):
+        with zipfile.ZipFile(folder / "a.zip", "w") as archive:
+            archive.write(folder / name, "left.tif")
+
+    pack("left.tif")
+    report = match_pair(left, folder / "right.tif", folder / "out", settings, keep_tiles=True)
+    assert report["inputs"]["left"]["path"] == left
+    assert report["inputs"]["left"]["sha256"] == identity(str(folder / "a.zip"))["sha256"]
+    assert open_results(folder / "out").left.path == left
+    (folder / "out" / "run.json").unlink()
+    (folder / "out" / "tiles" / "records" / "1_1.json").unlink()
+    pack("other.tif")
+    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: inputs\.left\.bytes was "):
+        match_pair(left, folder / "right.tif", folder / "out", settings)
+    (folder / "in" / "tiles").mkdir(parents=True)
+    inside = shutil.copy(folder / "a.zip", folder / "in" / "tiles")
+    with pytest.raises(SatIntervalsError, match="is an input inside"):
+        match_pair(f"/vsizip/{inside}/left.tif", folder / "right.tif", folder / "in", settings)
+
+
+def test_other_files__are_those_of_the_sources_of_a_virtual_raster_too(pair):
+    folder, _ = pair
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(folder / "mask.tif", "r+") as file:
+        file.write_mask(np.full((150, 180), 255, np.uint8))
+    assert other_files(str(folder / "mask.vrt")) == [str(folder / "mask.tif"), str(folder / "mask.tif.msk")]
 
 
 def test_match_pair__goes_on_where_an_input_is_touched_and_not_changed(pair):
@@ -265,6 +300,20 @@ def test_log_file__is_no_file_of_the_run(finished, name):
     assert contents(finished) == before
 
 
+def test_export__ends_where_another_run_replaces_the_one_it_reads(finished, tmp_path, monkeypatch):
+    read = Run.read_bands
+
+    def and_replace(run, window):
+        shutil.copy(finished / "run.json", tmp_path / "new")
+        os.replace(tmp_path / "new", finished / "run.json")
+        return read(run, window)
+
+    monkeypatch.setattr(Run, "read_bands", and_replace)
+    with pytest.raises(RunError, match="was replaced while it was read: run the command again"):
+        export(finished, "otb", tmp_path / "target")
+    assert not list((tmp_path / "target").glob("*.tif"))
+
+
 def rename_left(out, name):
     """Give the left image of a run another name beside its files."""
     report = json.loads((out / "run.json").read_text())
@@ -387,15 +436,37 @@ def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(pair)
     assert (folder / "real" / "run.json").exists()
 
 
-@pytest.mark.parametrize("name", ["records", "arrays.zarr", "arrays.zarr/uint32"])
-def test_store__replaces_a_link_among_its_folders_and_does_not_follow_it(pair, name):
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["records", "failures", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
+def test_match__refuses_a_link_among_the_folders_of_its_tiles(pair, name, overwrite):
     folder, settings = pair
     (folder / "precious").mkdir()
     (folder / "precious" / "0_0.json").write_text("mine")
-    (folder / "out" / "tiles" / name).parent.mkdir(parents=True)
-    (folder / "out" / "tiles" / name).symlink_to(folder / "precious")
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    link = folder / "out" / "tiles" / name
+    link.parent.mkdir(parents=True)
+    link.symlink_to(folder / "precious")
+    with pytest.raises(SatIntervalsError, match=rf"{name} is a file or a symbolic link, .*: move it away"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, overwrite=overwrite)
     assert contents(folder / "precious") == {str(folder / "precious" / "0_0.json"): b"mine"}
+
+
+def test_match__takes_the_tiles_of_a_user_for_no_run_of_its_own(pair):
+    folder, settings = pair
+    (folder / "out" / "tiles").mkdir(parents=True)
+    (folder / "out" / "tiles" / "12_34.png").write_text("mine")
+    (folder / "out" / "validity.tif").write_text("mine")
+    before = contents(folder)
+    with pytest.raises(SatIntervalsError, match=r"already holds a run \(validity.tif\)"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("content", [b'{"finished": 1}', b"II*\0some raster", b"<html>"])
+def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", file], "is no log", "--log-file")
+    assert file.read_bytes() == content
 
 
 @pytest.fixture

@@ -110,9 +110,10 @@ def test_main__ends_quietly_when_the_reader_of_its_progress_goes(tmp_path):
     assert (result.returncode, result.stderr) == (141, b"")
 
 
-def test_main__says_that_stdout_cannot_be_written():
+@pytest.mark.parametrize("argument", ["config", "--help", "--version"])
+def test_main__says_that_stdout_cannot_be_written(argument):
     with open("/dev/full", "wb") as full:
-        result = subprocess.run([COMMAND, "config"], stdout=full, stderr=subprocess.PIPE, check=False, timeout=60)
+        result = subprocess.run([COMMAND, argument], stdout=full, stderr=subprocess.PIPE, check=False, timeout=60)
     message = b"sat-intervals: stdout cannot be written: No space left on device\n"
     assert (result.returncode, result.stderr) == (1, message)
 

@@ -21,6 +21,7 @@ from sat_intervals.config.pairs import find_pairs
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.match.mccnn import weights_file
 from sat_intervals.raster import read_place
+from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_run
 from sat_intervals.run import cluster, submit
 from sat_intervals.run.batch import read_batch
@@ -55,6 +56,34 @@ def test_check_regular__refuses_a_pipe_wherever_a_file_is_read(tmp_path, read):
     os.mkfifo(pipe)
     with pytest.raises(SatIntervalsError, match=r"is a named pipe: give a regular file$"):
         read(pipe)
+
+
+@pytest.mark.parametrize("read", [open_image, lambda path: identity(str(path.parent / "pipe"))])
+def test_open_image__refuses_a_virtual_raster_of_a_pipe(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "image.vrt").write_text(
+        '<VRTDataset rasterXSize="9" rasterYSize="9"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+        '<SourceFilename relativeToVRT="1">pipe</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>'
+    )
+    with pytest.raises(SatIntervalsError, match="pipe is a named pipe: give a regular file"):
+        read(tmp_path / "image.vrt")
+
+
+def test_log_file__does_not_wait_for_who_reads_a_pipe(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    result = CliRunner().invoke(main, ["ablate", str(tmp_path), "--log-file", str(tmp_path / "pipe")])
+    assert result.exit_code == 2
+    assert "pipe cannot be written: No such device or address: choose another --log-file" in result.stderr
+
+
+@pytest.mark.parametrize("name", ["run.json", "batch.json", "meta.json"])
+def test_commands__refuse_json_that_is_nested_without_end(tmp_path, name):
+    for file in (name, "left.tif", "right.tif", "truth.tif"):
+        (tmp_path / file).write_text(100_000 * "[")
+    command = {"run.json": "report", "batch.json": "status", "meta.json": "ablate"}[name]
+    result = CliRunner().invoke(main, [command, str(tmp_path)])
+    assert result.exit_code == 2, result.stderr
+    assert name in result.stderr
 
 
 def test_check_regular__passes_what_is_a_file_a_folder_or_elsewhere(tmp_path):

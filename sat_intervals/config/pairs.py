@@ -83,7 +83,7 @@ def _meta(file: Path) -> dict[str, Any]:
         raise
     except OSError as error:
         raise SatIntervalsError(f"{file} cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SatIntervalsError(f"{file} cannot be read: {error}: it must be a JSON object") from error
     if not isinstance(meta, dict):
         raise SatIntervalsError(f"{file} holds {type(meta).__name__}, it must be a JSON object")

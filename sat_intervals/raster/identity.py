@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -11,11 +12,13 @@ from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.store.folder import object_tag
 
 # Names of GDAL, as rasterio takes them too, of objects in the stores that fsspec knows.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
+# What GDAL puts before the name of a file to look inside it: an archive, or, with offset and size, a part of a file.
+_INSIDE = re.compile(r"/vsi\w+/(\d+(_\d+)?,)?")
 # Seconds for a server to answer.
 _PATIENCE = 30
 # How often a file is hashed that is touched meanwhile.
@@ -39,18 +42,22 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     Returns
     -------
     Of a local file its path, size in bytes, time of the last change, SHA-256, and a stamp: inode and times in
-    nanoseconds, of which no user can put back that of the last change of the inode. Of one that a server of HTTP or of
-    objects offers, size in bytes and ETag, or time of the last change where it has none. The path alone of any other,
-    and where the server answers to nobody but GDAL, who has credentials of its own.
+    nanoseconds, of which no user can put back that of the last change of the inode. Of one inside an archive those of
+    the archive. Of one that a server of HTTP or of objects offers, size in bytes and ETag, or time of the last change
+    where it has none. The path alone of any other, and where the server answers to nobody but GDAL, who has credentials
+    of its own.
 
     Raises
     ------
     ChangedInputError
         A file that is being written.
+    SatIntervalsError
+        A pipe or a device.
     """
-    file = Path(path)
-    if file.is_file():
-        return _of_file(file, known or {})
+    check_regular(path)
+    if file := _local_file(path):
+        name = str(file.resolve()) if file == Path(path) else path
+        return {"path": name} | _of_file(file, (known or {}).get(name, {}))
     name = path.removeprefix("/vsicurl/")
     if name.startswith(("http://", "https://")):
         return {"path": path} | _of_url(name)
@@ -60,12 +67,22 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     return {"path": path}
 
 
-def _of_file(file: Path, known: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    path, status, stamp = str(file.resolve()), file.stat(), _stamp(file)
-    before = known.get(path, {})
+def _local_file(path: str) -> Path | None:
+    """The local file that a name of GDAL is read from, such as the archive of ``/vsizip/{a.zip}/left.tif``."""
+    name = path
+    while found := _INSIDE.match(name):
+        name = name[found.end() :]
+    if name == path:
+        return Path(path) if os.path.isfile(path) else None
+    place = Path(name.replace("{", "").replace("}", ""))
+    return next((file for file in (place, *place.parents) if os.path.isfile(file)), None)
+
+
+def _of_file(file: Path, before: Mapping[str, Any]) -> dict[str, Any]:
+    status, stamp = file.stat(), _stamp(file)
     stamp, sha256 = (stamp, before["sha256"]) if before.get("stamp") == stamp else _hashed(file)
     modified = datetime.fromtimestamp(status.st_mtime, UTC).isoformat()
-    return {"path": path, "bytes": status.st_size, "modified": modified, "sha256": sha256, "stamp": stamp}
+    return {"bytes": status.st_size, "modified": modified, "sha256": sha256, "stamp": stamp}
 
 
 def _stamp(file: str | Path) -> str:
@@ -109,8 +126,9 @@ def _of_url(url: str) -> dict[str, Any]:
 def is_changed(path: str, told: Mapping[str, Any]) -> bool:
     """Whether a file is no longer what `identity` told of it; where a server does not answer, it is not."""
     if "sha256" in told:
+        file = _local_file(path)
         try:
-            return bool(_stamp(path) != told.get("stamp") and _hashed(path)[1] != told["sha256"])
+            return file is None or (_stamp(file) != told.get("stamp") and _hashed(file)[1] != told["sha256"])
         except FileNotFoundError:
             return True
     now = identity(path)
@@ -156,11 +174,12 @@ def check_not_replaced(
     """
     outputs, parents = list(outputs), [Path(folder).resolve() for folder in folders]
     for name in inputs:
-        if name is None or not os.path.exists(name):
+        file = name if name is None or os.path.exists(name) else _local_file(os.fspath(name))
+        if file is None:
             continue
-        place = Path(name).resolve()
+        place = Path(file).resolve()
         for output in outputs:
-            is_same = os.path.exists(output) and os.path.samefile(name, output)
+            is_same = os.path.exists(output) and os.path.samefile(file, output)
             if is_same or place == Path(output).resolve():
                 raise SatIntervalsError(f"{name} is an input, and {output} would be written: choose another output")
         for folder in parents:

@@ -96,6 +96,8 @@ def open_image(
     with opened(name) as dataset:
         bands, alphas = _kinds(dataset)
         band = _chosen(name, bands, band)
+        for file in dataset.files:
+            check_regular(file)
         image = Image(
             path=name,
             band=band,
@@ -216,7 +218,7 @@ def _check_range(left: Image, right: Image, minimum: int, maximum: int) -> None:
 
 
 def other_files(name: str) -> list[str]:
-    """The other files that a raster is read from: a mask beside it, the sources of a virtual raster."""
+    """The other files that a raster is read from: a mask beside it, sources of a virtual raster and masks of these."""
     seen: list[str] = []
     waiting = [name]
     while waiting:
@@ -228,5 +230,10 @@ def other_files(name: str) -> list[str]:
             continue
         new = [file for file in files if file not in seen and Path(file).resolve() != Path(name).resolve()]
         seen += new
-        waiting += [file for file in new if file.endswith((".vrt", ".VRT"))]
+        # no pipe, which nobody may ever write to; and of what a server offers only what is known to have sources
+        waiting += [
+            file
+            for file in new
+            if os.path.isfile(file) or (file.endswith((".vrt", ".VRT")) and not os.path.exists(file))
+        ]
     return sorted(seen)

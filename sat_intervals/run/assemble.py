@@ -19,7 +19,7 @@ from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
-from sat_intervals.run.job import Job
+from sat_intervals.run.job import Job, stamps
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
 from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced
@@ -87,6 +87,8 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         if not keep_tiles:
             mark_finished(store.home, job.name)
         writer.publish(report=("run.json", json.dumps(report, indent=1) + "\n"))
+        if not keep_tiles:
+            mark_finished(store.home, job.name, stamps(job.out))
         mark_replaced(store.home)
         progress("files", 1, 1)
     return report

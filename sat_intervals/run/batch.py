@@ -25,7 +25,7 @@ from sat_intervals.raster import Image, open_image, other_files
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.results import open_run
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.job import OUTPUTS, Job, changes_since, compile_kernels, is_complete, prepare
+from sat_intervals.run.job import OUTPUTS, Job, changes_since, check_as_published, compile_kernels, is_complete, prepare
 from sat_intervals.run.pair import assembled, check_failures, matched, measure_images
 from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
@@ -251,6 +251,7 @@ def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
         return
     if place == LocalFolder(home.absolute()) or is_own(place):
         with LocalFolder(home).locked():
+            check_as_published(folder)
             remove_tiles(home, place)
 
 

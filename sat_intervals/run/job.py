@@ -25,7 +25,7 @@ from sat_intervals.raster.identity import ChangedInputError, check_not_replaced,
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import differences, digest
-from sat_intervals.store.tiles import LAYOUT, Store, finished_run, inputs_before, is_replacing
+from sat_intervals.store.tiles import LAYOUT, Store, finished_run, has_begun, inputs_before, is_replacing
 from sat_intervals.tiling import Grid, Tile, Window
 
 # What no tile knows of the settings: a preset is known by what it set.
@@ -73,7 +73,8 @@ class Job:
 
     def is_finished(self) -> bool:
         """Whether the folder holds the files of this very run, which died before it removed its tiles."""
-        return is_complete(self.out) and finished_run(self.store.home) == self.name
+        noted = finished_run(self.store.home)
+        return is_complete(self.out) and noted is not None and noted[0] == self.name
 
     def begin(self, *, overwrite: bool = False) -> None:
         """Open the store for what decides the bytes of a tile; to be called while its folder is locked.
@@ -213,7 +214,7 @@ def check_output(out: Path, overwrite: bool) -> None:
         # run.json is the last: without it, but with tiles, a run was killed between the names of its files
         home = out / "tiles"
         is_unfinished = is_replacing(home) or finished_run(home) is not None
-        is_under_way = is_unfinished if "run.json" in there else home.exists()
+        is_under_way = is_unfinished or ("run.json" not in there and has_begun(home))
         if there and not overwrite and not is_under_way:
             raise _holds_run(out, there)
         if (out / "tiles").is_symlink():
@@ -231,6 +232,29 @@ def _holds_run(out: Path, there: Sequence[str]) -> SatIntervalsError:
 def is_complete(out: Path) -> bool:
     """Whether a folder holds all files of a run, and none has begun that is to replace them."""
     return all((out / name).exists() for name in OUTPUTS) and not is_replacing(out / "tiles")
+
+
+def stamps(out: Path) -> list[str]:
+    """Sizes and times of the files of a run, which a copy of the folder that keeps times has too."""
+    found = [(out / name).stat() for name in OUTPUTS]
+    return [f"{status.st_size:x}-{status.st_mtime_ns:x}" for status in found]
+
+
+def check_as_published(out: Path) -> None:
+    """Hold that a complete run whose tiles are still there has the files that it published, before the tiles go.
+
+    Raises
+    ------
+    SatIntervalsError
+        With the first that is another.
+    """
+    _, noted = finished_run(out / "tiles") or ("", [])
+    for name, before, now in zip(OUTPUTS, noted, stamps(out), strict=False):
+        if now != before:
+            raise SatIntervalsError(
+                f"{out / name} was changed after the run, whose tiles are still there: delete it, and the same command "
+                "makes it again, or start afresh with --overwrite"
+            )
 
 
 def compile_kernels(config: Config) -> None:

@@ -17,7 +17,7 @@ from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.job import Job, compile_kernels, prepare
+from sat_intervals.run.job import Job, check_as_published, compile_kernels, prepare
 from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_tile, measure_block
 from sat_intervals.store.folder import LocalFolder
@@ -90,9 +90,11 @@ def match_pair(
 
     with LocalFolder(job.store.home).locked():
         if not overwrite and job.is_finished():
+            check_as_published(job.out)
+            report = open_run(job.out).report
             job.store.remove()
             _LOG.warning("the run in %s was complete; the tiles that it left are removed now", job.out)
-            return open_run(job.out).report
+            return report
         job.begin(overwrite=overwrite)
         with logged_stage(seconds, "kernels"):
             progress("kernels", 0, 1)

@@ -64,5 +64,5 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
         return {
             str(name): {"error": "", **ended, "state": str(ended["state"])} for name, ended in json.loads(text).items()
         }
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: run the batch again") from error

@@ -26,7 +26,7 @@ class Folder(Protocol):
         """Texts of the JSON files in a folder, by name without ending."""
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of all files in it and in the folders below it, by name."""
+        """Bytes of all files, and of links to folders, in it and in the folders below it, by name."""
 
     def write(self, name: str, text: str) -> None:
         """Write a file that is either there as a whole or not at all."""

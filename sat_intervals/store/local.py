@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 
 # A file of this name that is regular and empty is ours; any other stays as it is.
 _LOCK = ".sat-intervals.lock"
@@ -37,6 +37,7 @@ class LocalFolder:
 
     def read_bytes(self, name: str) -> bytes | None:
         """See `Folder`."""
+        check_regular(self.path / name)
         try:
             return (self.path / name).read_bytes()
         except FileNotFoundError:
@@ -50,8 +51,8 @@ class LocalFolder:
     def sizes(self) -> dict[str, int]:
         """See `Folder`."""
         found = {}
-        for place, _, names in os.walk(self.path):
-            for name in names:
+        for place, folders, files in os.walk(self.path):
+            for name in (*files, *(folder for folder in folders if os.path.islink(f"{place}/{folder}"))):
                 with suppress(FileNotFoundError):  # others may be at work here
                     found[os.path.relpath(f"{place}/{name}", self.path)] = os.lstat(f"{place}/{name}").st_size
         return found
@@ -109,14 +110,8 @@ class LocalFolder:
         return LocalFolder(self.path / folder)
 
     def make(self, folder: str) -> None:
-        """See `Folder`; a symbolic link on the way is replaced, not followed."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        place = self.path
-        for name in filter(None, folder.split("/")):
-            place /= name
-            if place.is_symlink():
-                place.unlink()
-            place.mkdir(exist_ok=True)
+        """See `Folder`."""
+        (self.path / folder).mkdir(parents=True, exist_ok=True)
 
     def place(self, name: str) -> Path:
         """See `Folder`."""

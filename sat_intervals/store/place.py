@@ -37,8 +37,8 @@ def place_of(home: Path, store: str | None) -> Folder:
     ElsewhereError
         Where the note in ``home`` names another store. Nothing was read there.
     """
+    noted = folder_at(home).read(PLACE)
     try:
-        noted = folder_at(home).read(PLACE)
         place = json.loads(noted) if noted else None
     except (ValueError, RecursionError):
         place = None

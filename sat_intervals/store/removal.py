@@ -16,6 +16,10 @@ _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
     rf"|{ARRAYS}/(?:u?int\d+/c/0|right/c|seams/c|histogram/c)/(\d+)/(\d+)(?:/0)*"
 )
+# Folders of a run. Where one of these names is a link, files of the user would be written over behind it.
+_FOLDER = re.compile(
+    rf"{RECORDS}|{FAILURES}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
+)
 # What a death in the middle of a write leaves: names of `LocalFolder` and of zarr, and those that they were to become.
 _UNFINISHED = re.compile(r"(?:(?<=/)|^)\.([^/]+)\.[0-9a-f]{32}$"), re.compile(r"()\.[0-9a-f]{32}\.partial$")
 
@@ -26,7 +30,7 @@ def drop(folder: Folder) -> None:
     A folder without signs of a run keeps everything.
     """
     names = _names(folder)
-    if _is_of_run(folder):
+    if is_of_run(folder):
         # The manifest first: without it nothing of the rest counts. The group last: it tells of a removal cut short.
         folder.delete(MANIFEST)
         folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES))
@@ -37,15 +41,20 @@ def drop(folder: Folder) -> None:
 
 
 def check_free(folder: Folder) -> None:
-    """Refuse a folder in which a run would write over files that no run made.
+    """Refuse a folder in which a run would write over files that no run made, or through a link.
 
     Raises
     ------
     StoreError
         With the names of some.
     """
+    if taken := sorted(name for name in folder.sizes() if _FOLDER.fullmatch(name)):
+        raise StoreError(
+            f"{folder}/{taken[0]} is a file or a symbolic link, where a folder of the tiles must be: move it away or "
+            "choose another folder"
+        )
     names = {name for name, size in _names(folder).items() if size}
-    if not names or _is_of_run(folder):
+    if not names or is_of_run(folder):
         return
     if there := sorted(names & folder.sizes().keys()):  # else another run removed its tiles meanwhile
         raise StoreError(
@@ -71,7 +80,7 @@ def _names(folder: Folder) -> dict[str, int]:
     return {name: size for name, size in folder.sizes().items() if is_named(name)}
 
 
-def _is_of_run(folder: Folder) -> bool:
+def is_of_run(folder: Folder) -> bool:
     """Whether a manifest, the arrays' description or a record tells that a run made this; one of them is enough."""
     with suppress(StoreError):
         if {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys():

@@ -11,7 +11,7 @@ import errno
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
-from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_free, drop
+from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_free, drop, is_of_run
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -118,7 +118,7 @@ class Store:
                 drop(folder)
             if folder.read(MANIFEST) == "":  # as a power loss leaves it
                 folder.delete(MANIFEST)
-            for name in ("", RECORDS, FAILURES, ARRAYS):
+            for name in ("", RECORDS, FAILURES):
                 folder.make(name)
             home.make("")
             home.delete(_FINISHED)
@@ -288,14 +288,18 @@ def remove_tiles(home: Path, place: Folder) -> None:
         folder_at(home).delete(name)
 
 
-def mark_finished(home: Path, run: str) -> None:
-    """Note which run is about to give its files their names, after which its tiles are to be removed."""
-    folder_at(home).write(_FINISHED, run)
+def mark_finished(home: Path, run: str, stamps: Sequence[str] = ()) -> None:
+    """Note which run is about to give its files their names, after which its tiles are to be removed.
+
+    To be called again, with the stamps of these files, when they have their names.
+    """
+    folder_at(home).write(_FINISHED, "\n".join([run, *stamps]))
 
 
-def finished_run(home: Path) -> str | None:
+def finished_run(home: Path) -> tuple[str, list[str]] | None:
     """What `mark_finished` noted, where the tiles have not been removed since."""
-    return folder_at(home).read(_FINISHED)
+    run, *stamps = (folder_at(home).read(_FINISHED) or "").split("\n")
+    return (run, stamps) if run else None
 
 
 def mark_replaced(home: Path) -> None:
@@ -306,6 +310,11 @@ def mark_replaced(home: Path) -> None:
 def is_replacing(home: Path) -> bool:
     """Whether a run has begun that is to replace the files of one before, and has not done so yet."""
     return folder_at(home).read(_REPLACING) is not None
+
+
+def has_begun(home: Path) -> bool:
+    """Whether a run made this folder of tiles; that of a user may have the same name."""
+    return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
 
 
 def inputs_before(home: Path, store: str | None) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import asyncio
 import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -77,8 +78,8 @@ class TileArrays:
         """Write what describes the arrays, where that is not there or damaged; every run writes the same."""
         texts, _ = _descriptions(self.grid, self.count, self.ambiguities)
         for name, text in texts.items():
-            self.folder.make(name.rpartition("/")[0])
             if self.folder.read(name) != text:
+                self.folder.make(name.rpartition("/")[0])
                 self.folder.write(name, text)
 
     def _array(self, name: str, store: Store) -> zarr.Array[Any]:
@@ -257,26 +258,38 @@ class _WrittenStore(WrapperStore[Store]):
 
 
 class _CheckedStore(WrapperStore[Store]):
-    """A store that reads a file as a whole at first and compares its checksum."""
+    """A store that reads a file as a whole and compares its checksum, at first and where it changed since on a disk."""
 
     def __init__(self, store: Store, checksums: Checksums) -> None:
         super().__init__(store)
         self._checksums = checksums
-        self._sound: set[str] = set()
+        self._sound: dict[str, tuple[int, ...]] = {}
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         if key in self._sound:
-            return await self._store.get(key, prototype, byte_range)
+            part = await self._store.get(key, prototype, byte_range)
+            if self._which(key) == self._sound[key]:
+                return part
+        which = self._which(key)
         whole = await self._store.get(key, prototype)
         content = b"" if whole is None else whole.to_bytes()
         if whole is None or await asyncio.to_thread(checksum, content) != list(self._checksums.get(key, ())):
             raise DamagedFileError(key)
-        self._sound.add(key)
+        self._sound[key] = which
         if isinstance(byte_range, RangeByteRequest):
             return whole[byte_range.start : byte_range.end]
         if isinstance(byte_range, OffsetByteRequest):
             return whole[byte_range.offset :]
         return whole if byte_range is None else whole[-byte_range.suffix :]
+
+    def _which(self, key: str) -> tuple[int, ...]:
+        """What any change of a file of this machine changes; nothing of a remote one."""
+        if not isinstance(self._store, LocalStore):
+            return ()
+        with suppress(OSError):
+            status = (self._store.root / key).stat()
+            return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+        return ()
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
