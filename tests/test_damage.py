@@ -295,7 +295,10 @@ def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tm
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "store.json", "finished", "replacing", "arrays.zarr/zarr.json"])
+MARKS = [".sat-intervals.finished", ".sat-intervals.replacing"]
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "store.json", *MARKS, "arrays.zarr/zarr.json"])
 def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
     tiles = unfinished(scene, tmp_path / "out")
     (tiles / name).unlink(missing_ok=True)
