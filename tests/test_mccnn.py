@@ -221,7 +221,7 @@ def test_config__span_is_declared_and_held_to_what_can_be():
     with pytest.raises(SatIntervalsError, match=r"sgm.*: span is missing: the default, 16, .* another p1 and p2: give"):
         settings(-9, 0, sgm={"p1": 2.3, "p2": 42.3, "v": 1.5, "d": 0.08})
     assert settings(-9, 0, sgm={"p1": 0.5, "d": 0.08}) == settings(-9, 0)
-    with pytest.raises(SatIntervalsError, match=r"sgm\.penalty is constant, allowed: mc_cnn_fast with cost"):
+    with pytest.raises(SatIntervalsError, match=r"sgm lacks p1 and p2 and span: constant penalties have no defaults"):
         settings(-9, 0, sgm={"penalty": "constant"})
 
 
