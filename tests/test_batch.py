@@ -67,6 +67,16 @@ def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
         assert not (tmp_path / "batch" / f"pair{seed}" / "tiles").exists()
 
 
+def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(images, tmp_path):
+    pairs = read_batch(rows(images))[:1]
+    match_batch(pairs, tmp_path, {"tiles": {"size": 64}})
+    scratch = tmp_path / "pair1" / ".unpublished-intervals.tif" / "files" / "replaced"
+    scratch.mkdir(parents=True)
+    (scratch / "run.json").write_text("{}")
+    match_batch(pairs, tmp_path, {"tiles": {"size": 64}})
+    assert sorted(file.name for file in (tmp_path / "pair1").iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+
+
 def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path):
     lines = ["name,left,right,minimum,maximum,preset", "one,left1.tif,right1.tif,-18,40,"]
     lines += ["two,left2.tif,right2.tif,-18,40,mountain"]

@@ -154,7 +154,7 @@ def test_match__goes_on_in_a_new_job_after_scancel(slurm, pair, tmp_path):
 
 
 def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_path):
-    with submitted(pair, tmp_path, walltime="00:01:00") as process:
+    with submitted(pair, tmp_path, walltime="00:01:00", is_quiet=False) as process:  # it says whom it waits for
         wait_for_tiles(process, tmp_path, 5)
         (job,) = jobs()
         for worker in workers(tmp_path):  # a pair that takes a minute would do as well
@@ -223,7 +223,7 @@ def test_match__waits_for_the_first_worker_and_says_so(slurm, pair, tmp_path):
     with submitted(pair, tmp_path, programs=programs, constants={"_TOLD_EVERY": 4, "WORKERS_GONE": 5}, is_quiet=False):
         pass
     lines = (tmp_path / "log").read_text().splitlines()
-    assert 1 <= len(lines) <= 8
+    assert 1 <= len(lines) <= 20
     assert all("no worker has come yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
     assert_complete(pair, tmp_path / "out")
 

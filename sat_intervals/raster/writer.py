@@ -276,6 +276,14 @@ class OutputWriter:
                 folder.rmdir()
 
 
+def remove_scratch(folder: Path, files: Sequence[File]) -> None:
+    """Delete what a process that was killed left of files that have their names since."""
+    hidden = folder / _SCRATCH.format(files[0].name)
+    if hidden.is_dir() and not hidden.is_symlink():
+        with LocalFolder(hidden).locked():
+            OutputWriter(folder, files, 0, 0, Georeferencing(), {})._remove_scratch()
+
+
 def check_space(folder: Path, files: Sequence[File], height: int, width: int) -> None:
     """Refuse a folder that has no room for files of so many pixels.
 

@@ -21,7 +21,7 @@ from distributed import Client
 from sat_intervals.config import Cluster, Config, load_config, load_yaml, read_small
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, open_image, other_files
+from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.results import open_run
 from sat_intervals.run.cluster import connected
@@ -240,7 +240,8 @@ def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stac
 
 
 def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
-    """Remove tiles that a death between the files and the end of their run left; those that are to be kept stay."""
+    """Remove what a death between the files and the end of their run left; tiles that are to be kept stay."""
+    remove_scratch(folder, RUN_FILES)
     home = folder / "tiles"
     if keep_tiles or home.is_symlink() or finished_run(home) is None:
         return

@@ -261,6 +261,10 @@ def _batch_system(settings: Cluster, logs: Path) -> Any:
                 raise
             submitted.add(self.job_id)
 
+        async def close(self) -> None:
+            await super().close()
+            self.status = Status.closed  # dask asserts it of every job that is not garbage by then
+
     logged = given.get("log_directory") or own_logs or os.getcwd()
     own = {"job_cls": Job, "submitted": submitted, "refusals": refusals, "logged": logged}
     own |= {"seen": None, "told": time.monotonic()}  # of `workers_there`: when a worker was, when the wait was told of

@@ -12,7 +12,7 @@ from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import Image
+from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
@@ -93,6 +93,7 @@ def match_pair(
             check_as_published(job.out)
             report = open_run(job.out).report
             job.store.remove()
+            remove_scratch(job.out, RUN_FILES)
             _LOG.warning("the run in %s was complete; the tiles that it left are removed now", job.out)
             return report
         job.begin(overwrite=overwrite)
