@@ -184,7 +184,8 @@ class Page:
         return self.find(selector).text
 
     def band(self):
-        return self.find("#band").get_attribute("d")
+        """The interval's outline, read in one step: the page may draw it anew between two."""
+        return self.browser.execute_script("return document.querySelector('#band').getAttribute('d')")
 
     def map(self):
         """What the map shows, as a picture in text."""
