@@ -173,9 +173,7 @@ def test_triangulate__says_what_shareloc_cannot_do(tmp_path):
     out = write_run(tmp_path, np.ones((4, 40, 50), np.float32), np.zeros((40, 50), np.uint16))
     middle = on_the_ground(20, 25, DATUM)[0] - LONGITUDE
     # its iterations run away there: what they end with, NaN or a division by zero, is a matter of the last bit
-    with pytest.raises(
-        SatIntervalsError, match=r"across the 180th meridian is beyond it|cannot use .*: division"
-    ):
+    with pytest.raises(SatIntervalsError, match=r"across the 180th meridian is beyond it|cannot use .*: division"):
         triangulate(out, *cameras(tmp_path, 40, 50, longitude=180 - middle))
 
 
