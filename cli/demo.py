@@ -36,7 +36,7 @@ def demo(
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up, put_back, write_once
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.job import OUTPUTS, check_output
+    from sat_intervals.run.output import OUTPUTS, check_output
     from sat_intervals.run.pair import match_pair
     from sat_intervals.run.status import is_replacing
 

@@ -66,7 +66,7 @@ def match(
         return
     with Console(quiet) as console:
         from sat_intervals.raster.identity import check_not_replaced
-        from sat_intervals.run.job import OUTPUTS
+        from sat_intervals.run.output import OUTPUTS
         from sat_intervals.run.pair import match_pair
 
         check_not_replaced([config_file], [out / name for name in OUTPUTS], [out / "tiles"])

@@ -35,7 +35,7 @@ def status(out: Path, store: str | None) -> None:
 
 
 def _tell(out: Path, store: str | None) -> None:
-    from sat_intervals.run.job import is_complete
+    from sat_intervals.run.output import is_complete
     from sat_intervals.run.status import read_status
 
     if is_complete(out):

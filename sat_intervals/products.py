@@ -1,6 +1,9 @@
 """What is written: bands, validity bits, and the states of an input pixel. One table for every reader."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
 
 # State of an input pixel, and of a census window (the union of its pixels' states). 0 = usable.
 NO_DATA = 1  # outside the image, declared no data, or not finite
@@ -73,6 +76,43 @@ BANDS = (
     Band("upper", "px", "upper bound of the disparity interval"),
     Band("confidence", "", "confidence from ambiguity, 0 to 1, high = easy to tell"),
 )
+
+
+class Bands(NamedTuple):
+    """What a run says of some pixels, and what that is compared with, all ``(rows, columns)``.
+
+    Attributes
+    ----------
+    disparity, lower, upper
+        float32 pixels, NaN for none.
+    confidence
+        float32, 0 to 1, NaN for none.
+    validity
+        uint16 flags.
+    truth
+        True disparity in pixels, floats, NaN where it is not known; empty where it was not read.
+    image
+        Grey values of the left image, floats, NaN where there is no data; empty where it was not read.
+    """
+
+    disparity: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    confidence: np.ndarray
+    validity: np.ndarray
+    truth: np.ndarray = np.empty((0, 0))
+    image: np.ndarray = np.empty((0, 0))
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Pixels that were matched and passed cross-checking."""
+        return np.asarray(self.validity & INVALID == 0)
+
+    @property
+    def known(self) -> np.ndarray:
+        """Pixels with an interval and a truth."""
+        return np.asarray(np.isfinite(self.truth) & np.isfinite(self.lower))
+
 
 # Of points.tif: longitude and latitude in degrees, heights in metres above the ellipsoid of WGS 84 (EPSG:4979).
 POINTS = (

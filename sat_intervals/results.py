@@ -6,14 +6,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.kernels.confidence import low_confidence
-from sat_intervals.products import BANDS
+from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import (
     Image,
     open_image,
@@ -30,40 +30,6 @@ from sat_intervals.tiling import Window, strips
 _STRIP = 1 << 23
 _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
 _REGION = ("row", "column", "height", "width")
-
-
-class Bands(NamedTuple):
-    """What a run wrote of some pixels, all ``(rows, columns)``, with the left image and the truth.
-
-    Attributes
-    ----------
-    disparity, lower, upper
-        float32 pixels, NaN for none.
-    confidence
-        float32, 0 to 1, NaN for none.
-    validity
-        uint16 flags.
-    image
-        Grey values of the left image, floats, NaN where there is no data.
-    truth
-        True disparity in pixels, floats, NaN where it is not known.
-    """
-
-    disparity: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    confidence: np.ndarray
-    validity: np.ndarray
-    image: np.ndarray
-    truth: np.ndarray
-
-    def low(self, config: Config) -> np.ndarray:
-        """Pixels of low confidence (paper eq. 12 and 13); the bands must be of whole rows.
-
-        Where the run did not regularise, by the default settings of regularisation.
-        """
-        settings = config.regularization or Regularization()
-        return np.asarray(low_confidence(self.confidence, settings.threshold, settings.kernel))
 
 
 @dataclass(frozen=True)
@@ -110,10 +76,12 @@ class Run:
         """Rows and columns of the results."""
         return self.region.height, self.region.width
 
-    def read_bands(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
-        """Disparity, lower, upper and confidence ``(4, rows, columns)``, and validity, of a window of the results."""
+    def read_bands(self, window: Window) -> Bands:
+        """What the run wrote of a window of the results."""
         with self.unchanged():
-            return read_layers(self.out / "intervals.tif", window), read_layers(self.out / "validity.tif", window)[0]
+            return Bands(
+                *read_layers(self.out / "intervals.tif", window), *read_layers(self.out / "validity.tif", window)
+            )
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -170,10 +138,9 @@ class Results(Run):
 
     def read(self, window: Window) -> Bands:
         """Everything of the pixels of a window of the results."""
-        (disparity, lower, upper, confidence), validity = self.read_bands(window)
         image = Layer(self.left, self.region.row, self.region.column).read(window)
-        truth = self.truth.read(window) if self.truth else np.full(validity.shape, np.nan)
-        return Bands(disparity, lower, upper, confidence, validity, image, truth)
+        truth = self.truth.read(window) if self.truth else np.full(image.shape, np.nan)
+        return self.read_bands(window)._replace(truth=truth, image=image)
 
     def read_pixel(self, row: int, column: int) -> Bands:
         """Everything of one pixel, as arrays of no dimension."""
@@ -188,10 +155,17 @@ class Results(Run):
     def read_small(self, shape: tuple[int, int]) -> Bands:
         """All of the results but the truth, as ``shape`` pixels: the bands picked, the left image averaged."""
         with self.unchanged():
-            disparity, lower, upper, confidence = read_small_layers(self.out / "intervals.tif", shape)
-            validity = read_small_layers(self.out / "validity.tif", shape)[0]
-        image = read_small_image(self.left, self.region, shape)
-        return Bands(disparity, lower, upper, confidence, validity, image, np.full(shape, np.nan))
+            layers = (read_small_layers(self.out / name, shape) for name in ("intervals.tif", "validity.tif"))
+            bands = Bands(*(layer for of_file in layers for layer in of_file))
+        return bands._replace(image=read_small_image(self.left, self.region, shape))
+
+    def low(self, bands: Bands) -> np.ndarray:
+        """Pixels of low confidence (paper eq. 12 and 13) of whole rows.
+
+        Where the run did not regularise, by the default settings of regularisation.
+        """
+        settings = self.config.regularization or Regularization()
+        return np.asarray(low_confidence(bands.confidence, settings.threshold, settings.kernel))
 
     def read_small_left(self, window: Window, shape: tuple[int, int]) -> np.ndarray:
         """The left image under a window of the results, as ``shape`` pixels."""

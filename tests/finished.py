@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from sat_intervals.config import load_config
-from sat_intervals.products import FLAGS, INVALID, OCCLUSION
+from sat_intervals.products import FLAGS, INVALID, OCCLUSION, Bands
 from sat_intervals.raster import RUN_FILES, OutputWriter, north_up, write_layer
 from sat_intervals.run.statistics import Tally
 from sat_intervals.show.legend import PIXEL_CLASSES
@@ -38,7 +38,7 @@ def write_run(folder, bands, validity, truth=None, image=None):
 def _report(inputs, bands, validity):
     height, width = validity.shape
     tally = Tally(MAXIMUM - MINIMUM + 1)
-    tally.add(bands, validity)
+    tally.add(Bands(*bands, validity))
     described = {"height": height, "width": width, "band": 1, "nodata": "0.0", "mask": None, "dtype": "uint16"}
     config = load_config({"disparity": {"minimum": MINIMUM, "maximum": MAXIMUM}})
     return {

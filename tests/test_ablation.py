@@ -19,12 +19,12 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate import ablation
 from sat_intervals.evaluate.ablation import ablate_pair
-from sat_intervals.evaluate.disparity import EvaluatedRows, criteria_of, evaluate
+from sat_intervals.evaluate.disparity import criteria_of, evaluate
 from sat_intervals.evaluate.paper import METHODS, SceneMetrics, table_2
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.match import memory
 from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
-from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
+from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY, Bands
 
 some = settings(max_examples=60, derandomize=True, deadline=None)
 X = IMPOSSIBLE_COST
@@ -122,7 +122,7 @@ def judged(scene, config):
     left, right = (np.ma.masked_equal(image, 0) for image in (scene.left, scene.right))
     bands = match_arrays(left, right, config)
     names = ("disparity", "lower", "upper", "confidence", "validity")
-    rows = EvaluatedRows(*(bands[name].values for name in names), scene.truth.astype(np.float64))
+    rows = Bands(*(bands[name].values for name in names), scene.truth.astype(np.float64))
     return evaluate(lambda: [rows], criteria_of(config))["all"]
 
 
@@ -148,7 +148,7 @@ def test_ablate_pair__matches_once(folder, monkeypatch):
     calls = []
     matched = ablation.cost_volume
     monkeypatch.setattr(ablation, "cost_volume", lambda *arguments: calls.append(1) or matched(*arguments))
-    monkeypatch.setattr(ablation, "match_patch", None)
+    monkeypatch.setattr(ablation, "match_right", None)
     ablate_pair(*find_pairs([folder]))
     assert len(calls) == 1
 

@@ -19,10 +19,11 @@ from sat_intervals.cli import main
 from sat_intervals.config.pairs import find_pairs, group_beside
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.disparity import EvaluatedRows, evaluate, evaluate_run
+from sat_intervals.evaluate.disparity import evaluate, evaluate_run
 from sat_intervals.evaluate.metrics import Criteria
 from sat_intervals.evaluate.paper import SceneMetrics, table_1
-from sat_intervals.products import INVALID, OCCLUSION
+from sat_intervals.match.postprocess import cut_rows
+from sat_intervals.products import INVALID, OCCLUSION, Bands
 from sat_intervals.tiling import Window
 
 some = settings(max_examples=150, derandomize=True, deadline=None)
@@ -47,13 +48,13 @@ def same(found, expected, **tolerance):
 
 def rows_of(scene):
     flags = np.where(scene.valid, 0, OCCLUSION).astype(np.uint16)
-    return EvaluatedRows(scene.disparity, scene.lower, scene.upper, scene.confidence, flags, scene.truth)
+    return Bands(scene.disparity, scene.lower, scene.upper, scene.confidence, flags, scene.truth)
 
 
 def cut_into(rows, heights):
     """The rows in strips, lastly what the heights leave."""
     edges = [0, *np.cumsum(heights).clip(max=rows.truth.shape[0]), rows.truth.shape[0]]
-    return [EvaluatedRows(*(band[a:b] for band in rows)) for a, b in pairwise(edges) if b > a]
+    return [cut_rows(rows, a, b) for a, b in pairwise(edges) if b > a]
 
 
 @st.composite

@@ -16,8 +16,8 @@ from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays
 from sat_intervals.cli import main
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.in_memory import _reader
-from sat_intervals.match.matching_cost import Area, cost_areas
+from sat_intervals.match.in_memory import _view
+from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import Network, load_network, weights_file
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
@@ -135,6 +135,11 @@ def test_network__no_network_is_refused(tmp_path):
 
 
 # ---- Costs and penalties -----------------------------------------------------------------------------------
+def costs_of(left, right, areas, config, statistics):
+    views = tuple(map(_view, (left, right), view_windows(areas, config)))
+    return cost_areas(views, areas, config, statistics)
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_compare__costs_equal_reference(network_file, weights, mirrored):
     # Three strips of rows at most; pixels of no data are filled, and windows that meet them are impossible.
@@ -142,11 +147,11 @@ def test_compare__costs_equal_reference(network_file, weights, mirrored):
     config = settings(-6, 3, network_file, sgm=None)
     statistics = PairStatistics(ImageStatistics(490.0, 75.0), ImageStatistics(510.0, 85.0))
     area = Area.mirror(Window(5, 2, 140, 30), config) if mirrored else Area.of(Window(5, 2, 140, 30), config)
-    (found,) = cost_areas(_reader(left), _reader(right), [area], config, statistics)
+    (found,) = costs_of(left, right, [area], config, statistics)
     volume = cost_volume(found.costs, kernel_settings(config))
 
     def features(image, statistics, window):
-        pixels, state = _reader(image)(window.grown(5, 5))
+        _, pixels, state = _view(image, window.grown(5, 5))
         pixels = np.where(state == 0, (pixels - statistics.mean) / statistics.deviation, 0)
         return slow_features(weights, pixels), reference.window_state(state, 11)
 
@@ -171,7 +176,7 @@ def test_compare__penalties_follow_both_images(network_file):
     config = settings(-2, 2, network_file, sgm={"p1": 0.5, "p2": 4, "q1": 2, "q2": 5, "v": 2, "d": 1.1, "span": 40})
     statistics = PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 90.0))
     whole = Window(0, 0, *left.shape)
-    (found,) = cost_areas(_reader(left), _reader(right), [Area.of(whole, config)], config, statistics)
+    (found,) = costs_of(left, right, [Area.of(whole, config)], config, statistics)
     cost = found.costs.left[:, :, :5].astype(int)
     states = found.costs.left_state, found.costs.right_state
     cost[~reference.possible(*states)] = IMPOSSIBLE_COST
@@ -196,11 +201,9 @@ def test_compare__a_right_area_is_a_left_one_of_swapped_images(network_file, gra
     )
     window = Window(3, -4, 20, 30)
     both = [Area.of(Window(3, 1, 20, 25), config), Area.mirror(window, config)]
-    _, found = cost_areas(_reader(left), _reader(right), both, config, statistics)
-    images = _reader(right), _reader(left)
-    (expected,) = cost_areas(
-        *images, [Area.of(window, swapped)], swapped, PairStatistics(statistics.right, statistics.left)
-    )
+    _, found = costs_of(left, right, both, config, statistics)
+    swapped_statistics = PairStatistics(statistics.right, statistics.left)
+    (expected,) = costs_of(right, left, [Area.of(window, swapped)], swapped, swapped_statistics)
     for one, other in zip(found.costs[2:], expected.costs[2:], strict=True):
         np.testing.assert_array_equal(one, other)
     volumes = (cost_volume(one.costs, kernel_settings(swapped), one.gradients) for one in (found, expected))

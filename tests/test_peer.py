@@ -23,10 +23,10 @@ from sat_intervals import load_config, match_arrays
 from sat_intervals.config import Config
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.in_memory import _reader
-from sat_intervals.match.matching_cost import Area, cost_areas
+from sat_intervals.match.in_memory import _moments, _view
+from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import load_network, weights_file
-from sat_intervals.match.normalization import PairStatistics, measure
+from sat_intervals.match.normalization import PairStatistics, statistics_of
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
 from sat_intervals.tiling import Window
@@ -269,7 +269,7 @@ def test_features__have_the_cosines_of_pandora(pandora, shared_data, tmp_path, k
     weights = trained_network(shared_data, tmp_path / "mb.onnx") if kind == "fp32" else None
     theirs = -mccnn_peer(pandora, folder, (minimum, maximum), weights)[0]
     network = load_network(weights_file(weights and str(weights)))
-    statistics = [measure(_reader(np.ma.asarray(image)), *image.shape) for image in images]
+    statistics = [statistics_of(_moments(np.ma.asarray(image))) for image in images]
     left, right = (
         network(((image - statistics.mean) / statistics.deviation).astype(np.float32))
         for image, statistics in zip(images, statistics, strict=True)
@@ -288,10 +288,11 @@ def test_cost_volume__has_the_winners_of_pandora_with_its_penalties_for_mccnn(pa
     costs, theirs = mccnn_peer(pandora, folder, (minimum, maximum), optimized=True)
     search = {"disparity": {"minimum": minimum, "maximum": maximum}}
     config = load_config(search | {"cost": {"method": "mccnn"}, "sgm": REFERENCE_PENALTIES})
-    readers = [_reader(np.ma.asarray(image.astype(np.float32))) for image in images]
-    statistics = PairStatistics(*(measure(read, *images[0].shape) for read in readers))
-    whole = Window(0, 0, *images[0].shape)
-    (found,) = cost_areas(*readers, [Area.of(whole, config)], config, statistics)
+    images = [np.ma.asarray(image.astype(np.float32)) for image in images]
+    statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
+    area = Area.of(Window(0, 0, *images[0].shape), config)
+    views = tuple(map(_view, images, view_windows([area], config)))
+    (found,) = cost_areas(views, [area], config, statistics)
     volume = cost_volume(found.costs, kernel_settings(config), found.gradients)
     interior = ((volume != IMPOSSIBLE_COST) & np.isfinite(costs)).all(axis=2)
     assert (volume.argmin(axis=2) + minimum == theirs)[interior].mean() >= 0.99

@@ -21,7 +21,8 @@ from sat_intervals.raster import open_image, read_window
 from sat_intervals.results import open_run
 from sat_intervals.run import pair as run
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.job import is_complete, prepare
+from sat_intervals.run.job import prepare
+from sat_intervals.run.output import is_complete
 from sat_intervals.run.tile import match_tile
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import digest

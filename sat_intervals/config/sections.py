@@ -70,6 +70,25 @@ class Disparity(Section):
         """Number of candidates of a pixel."""
         return self.maximum - self.minimum + 1
 
+    def check_images(self, left: str, left_columns: int, right: str, right_columns: int) -> None:
+        """Hold that images, ``left`` and ``right`` in messages, can be searched over this range.
+
+        Raises
+        ------
+        ConfigError
+            No pixel of the left has a candidate in the right, or there are more candidates than columns.
+        """
+        search = f"disparities {self.minimum} to {self.maximum}"
+        if left_columns - 1 + self.maximum < 0 or self.minimum > right_columns - 1:
+            raise ConfigError(
+                f"{search} lead every pixel of {left}, {left_columns} columns, out of {right}, {right_columns}: check "
+                "their sign, x_right = x_left + disparity"
+            )
+        if self.count > right_columns:
+            raise ConfigError(
+                f"{search} are {self.count}, more than the {right_columns} columns of {right}: search fewer"
+            )
+
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         if self.minimum > self.maximum:

@@ -1,6 +1,6 @@
 """What each part of the method is worth: the paper's ablation, in one matching pass a pair (paper, table 2)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from functools import partial
 from typing import Any
@@ -10,19 +10,19 @@ import numpy as np
 from sat_intervals.config import Config, Interval, Mccnn, load_config
 from sat_intervals.config.pairs import Pair
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.disparity import EvaluatedRows, criteria_of, evaluate
+from sat_intervals.evaluate.disparity import criteria_of, evaluate
 from sat_intervals.evaluate.paper import METHODS
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import Area, Reader, cost_areas
+from sat_intervals.match.matching_cost import Area, View, Views, cost_areas, view_windows
 from sat_intervals.match.memory import PROCESS_BYTES, check_memory, volume_bytes
-from sat_intervals.match.normalization import PairStatistics, measure
-from sat_intervals.match.patch import kernel_settings, match_patch
-from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
-from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY
+from sat_intervals.match.normalization import PairStatistics, blocks, moments, statistics_of
+from sat_intervals.match.patch import kernel_settings, match_right, patch_areas
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, cut_rows, postprocess_strips
+from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY, Bands
 from sat_intervals.raster import Image, check_pair, open_image, read_window
-from sat_intervals.tiling import Window, facing
+from sat_intervals.tiling import Window
 
 # The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).
 _BASELINE = 1, 10
@@ -59,7 +59,8 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     if config.regularization is None:
         raise SatIntervalsError("regularization is null: the ablation compares with and without it, leave it on")
     left, right, truth = (open_image(path) for path in (pair.left, pair.right, pair.truth))
-    check_pair(left, right, pair.minimum, pair.maximum)
+    check_pair(left, right)
+    config.disparity.check_images(left.path, left.width, right.path, right.width)
     if (truth.height, truth.width) != (left.height, left.width):
         raise SatIntervalsError(
             f"{truth.path} has {truth.height} x {truth.width} pixels, {left.path} {left.height} x {left.width}: "
@@ -67,8 +68,10 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
         )
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
-    readers = partial(read_window, left), partial(read_window, right)
-    methods, scale = _all_methods(*readers, whole, config, _statistics(*readers, left, right, config))
+    areas = patch_areas(whole, whole, config)
+    windows = zip((left, right), view_windows(areas, config), strict=True)
+    left_view, right_view = (View(window, *read_window(image, window)) for image, window in windows)
+    methods, scale = _all_methods((left_view, right_view), areas, whole, config, _statistics((left, right), config))
     report: dict[str, Any] = {"cost": config.cost.method}
     criteria = criteria_of(config, tolerance)
     for method in METHODS:
@@ -77,13 +80,15 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     return report
 
 
-def _statistics(
-    left: Reader, right: Reader, left_image: Image, right_image: Image, config: Config
-) -> PairStatistics | None:
+def _statistics(images: Sequence[Image], config: Config) -> PairStatistics | None:
     if not isinstance(config.cost, Mccnn):
         return None
-    views = (left, left_image), (right, right_image)
-    return PairStatistics(*(measure(read, image.height, image.width) for read, image in views))
+    return PairStatistics(
+        *(
+            statistics_of(moments(*read_window(image, block)) for block in blocks(image.height, image.width))
+            for image in images
+        )
+    )
 
 
 def _check_memory(whole: Window, config: Config) -> None:
@@ -96,22 +101,24 @@ def _check_memory(whole: Window, config: Config) -> None:
 
 
 def _all_methods(
-    left: Reader, right: Reader, whole: Window, config: Config, statistics: PairStatistics | None
+    views: Views, areas: Sequence[Area], whole: Window, config: Config, statistics: PairStatistics | None
 ) -> tuple[dict[str, RawRows], ConfidenceScale]:
     """Raw products of every one of METHODS, and what their confidence is relative to."""
-    search = config.disparity
-    volume = _volume(left, right, whole, config, statistics)
+    search, settings = config.disparity, kernel_settings(config)
+    area, *of_right = areas
+    (cost,) = cost_areas(views, [area], config, statistics)
+    volume = cost_volume(cost.costs, settings, cost.gradients)
     refine = config.refinement is not None
-    weights = np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights
-    winner, disparity, ambiguity = read_winners(volume, search.minimum, weights, refine)
+    winner, disparity, ambiguity = read_winners(volume, search.minimum, settings.weights, refine)
     bounds = {"baseline": read_baseline(volume, search.minimum, *_BASELINE)}
     for method in METHODS[1:]:
         level = config.model_copy(update={"interval": Interval(alpha=Decimal(method.split()[0]))}).cut_level
         bounds[method] = read_alpha_cuts(volume, search.minimum, level, refine)
     seen = np.asarray(read_right_winners(volume, search.minimum))
-    del volume  # before the right view has one of its own
-    if config.cross_check and config.cross_check.method == "accurate":
-        seen = _right_winners(left, right, whole, config, statistics)
+    del volume, cost  # before the right view has its own
+    if of_right:
+        (cost,) = cost_areas(views, of_right, config, statistics)
+        seen = match_right(cost, of_right[0], whole, settings).winner
     histogram = ambiguity_histogram(ambiguity, winner != NO_DISPARITY, config.largest_ambiguity)
     assert config.ambiguity is not None  # regularisation needs it
     validity = np.where(winner == NO_DISPARITY, NO_CANDIDATE, 0).astype(np.uint16)
@@ -132,36 +139,13 @@ def _settled(rows: RawRows, method: str, config: Config) -> tuple[RawRows, Confi
     return rows, config
 
 
-def _evaluated(rows: RawRows, config: Config, scale: ConfidenceScale, truth: Image) -> Iterator[EvaluatedRows]:
+def _evaluated(rows: RawRows, config: Config, scale: ConfidenceScale, truth: Image) -> Iterator[Bands]:
     """Final bands and truth, strip by strip: whole they would take as much as the volume."""
     height, width = rows.winner.shape
     step = max(1, _STRIP_PIXELS // width)
     row = 0
-    for final in postprocess_strips((rows.cut(first, first + step) for first in range(0, height, step)), scale, config):
+    strips = (cut_rows(rows, first, first + step) for first in range(0, height, step))
+    for final in postprocess_strips(strips, scale, config):
         pixels, state = read_window(truth, Window(row, 0, final.validity.shape[0], width))
-        true = np.where(state == 0, pixels.astype(np.float64), np.nan)
-        disparity, lower, upper, confidence = final.intervals
-        yield EvaluatedRows(disparity, lower, upper, confidence, final.validity, true)
+        yield final._replace(truth=np.where(state == 0, pixels.astype(np.float64), np.nan))
         row += final.validity.shape[0]
-
-
-def _volume(
-    left: Reader, right: Reader, whole: Window, config: Config, statistics: PairStatistics | None
-) -> np.ndarray:
-    """Aggregated costs of the whole pair, ``(rows, columns, count)`` uint16."""
-    (cost,) = cost_areas(left, right, [Area.of(whole, config)], config, statistics)
-    return cost_volume(cost.costs, kernel_settings(config), cost.gradients)
-
-
-def _right_winners(
-    left: Reader, right: Reader, whole: Window, config: Config, statistics: PairStatistics | None
-) -> np.ndarray:
-    """The winners of the right view, matched on its own: left and right change places, and disparities their sign."""
-    search = config.disparity
-    mirrored = load_config(
-        config, {"disparity": {"minimum": -search.maximum, "maximum": -search.minimum}, "cross_check": None}
-    )
-    reach = facing(whole, search.minimum, search.maximum)
-    swapped = None if statistics is None else PairStatistics(statistics.right, statistics.left)
-    winner = match_patch(right, left, reach, reach, reach, mirrored, swapped).raw.winner
-    return np.where(winner == NO_DISPARITY, NO_DISPARITY, -winner).astype(np.int16)

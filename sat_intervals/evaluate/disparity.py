@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,41 +12,11 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.metrics import Criteria, Judged, Metrics, bias_histogram
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
-from sat_intervals.products import INVALID
+from sat_intervals.match.postprocess import cut_rows, with_halo
+from sat_intervals.products import Bands
 from sat_intervals.results import Layer, Run, open_run
 
 _JUDGED_PIXELS = 1 << 20  # at a time, 150 bytes each; those read and waiting are 25
-
-
-class EvaluatedRows(NamedTuple):
-    """Full-width rows of what is judged and of the truth, all ``(rows, columns)``.
-
-    Attributes
-    ----------
-    disparity, lower, upper, confidence
-        Floats, as in ``intervals.tif``: NaN for none.
-    validity
-        uint16 flags.
-    truth
-        True disparity, NaN where unknown or not to be judged.
-    """
-
-    disparity: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    confidence: np.ndarray
-    validity: np.ndarray
-    truth: np.ndarray
-
-    @property
-    def known(self) -> np.ndarray:
-        """Pixels with an interval and a truth."""
-        return np.asarray(np.isfinite(self.truth) & np.isfinite(self.lower))
-
-    @property
-    def valid(self) -> np.ndarray:
-        """Pixels that were matched and passed cross-checking."""
-        return np.asarray(self.validity & INVALID == 0)
 
 
 def evaluate_run(
@@ -98,7 +68,7 @@ def evaluate_run(
     mask_layer = None if mask is None else run.layer(mask)
     criteria = criteria_of(config, tolerance)
 
-    def strips() -> Iterator[EvaluatedRows]:
+    def strips() -> Iterator[Bands]:
         return _read_strips(run, truth_layer, mask_layer)
 
     return {
@@ -114,7 +84,7 @@ def criteria_of(config: Config, tolerance: float = 0.0) -> Criteria:
 
 
 def evaluate(
-    strips: Callable[[], Iterable[EvaluatedRows]],
+    strips: Callable[[], Iterable[Bands]],
     criteria: Criteria,
     *,
     remove_bias: bool = False,
@@ -127,7 +97,7 @@ def evaluate(
     bias = _median_bias(strips()) if remove_bias else None
     criteria = replace(criteria, bias=bias or 0.0)
     kept, written = Metrics(criteria), Metrics(criteria)
-    for rows, first, last in _with_halo(strips(), criteria.depth):
+    for rows, first, last in with_halo(strips(), criteria.depth):
         kept.add(_judged(rows, rows.known & rows.valid, first, last, criteria))
         if with_rejected:
             written.add(_judged(rows, rows.known, first, last, criteria))
@@ -139,7 +109,7 @@ def evaluate(
     }
 
 
-def _median_bias(strips: Iterable[EvaluatedRows]) -> float:
+def _median_bias(strips: Iterable[Bands]) -> float:
     """Median of disparity - truth over valid pixels, in pixels; 0 where there are none."""
     histogram = bias_histogram()
     for rows in strips:
@@ -148,7 +118,7 @@ def _median_bias(strips: Iterable[EvaluatedRows]) -> float:
     return histogram.median() or 0.0
 
 
-def _judged(rows: EvaluatedRows, chosen: np.ndarray, first: int, last: int, criteria: Criteria) -> Judged:
+def _judged(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Criteria) -> Judged:
     """The chosen pixels of the rows ``[first, last)``; the rows around them make their low-confidence areas whole."""
     truth = rows.truth.astype(np.float64) + criteria.bias
     low = low_confidence(rows.confidence, criteria.threshold, criteria.kernel)
@@ -156,34 +126,18 @@ def _judged(rows: EvaluatedRows, chosen: np.ndarray, first: int, last: int, crit
     area_error = area_maximum(error, low, criteria.depth)
     inner = slice(first, last)
     chosen = chosen[inner]
-    bands = (truth, rows.disparity, rows.lower, rows.upper, rows.confidence)
-    true, disparity, lower, upper, confidence = (band[inner][chosen].astype(np.float64) for band in bands)
-    return Judged(true, disparity, lower, upper, confidence, low[inner][chosen], area_error[inner][chosen])
+    disparity, lower, upper, confidence = (band[inner][chosen].astype(np.float64) for band in rows[:4])
+    pixels = Bands(disparity, lower, upper, confidence, rows.validity[inner][chosen], truth[inner][chosen])
+    return Judged(pixels, low[inner][chosen], area_error[inner][chosen])
 
 
-def _with_halo(strips: Iterable[EvaluatedRows], margin: int) -> Iterator[tuple[EvaluatedRows, int, int]]:
-    """Rows with ``first`` and ``last``: those between have ``margin`` rows around them, as far as the image goes."""
-    waiting: EvaluatedRows | None = None
-    first = 0
-    for strip in strips:
-        waiting = strip if waiting is None else EvaluatedRows(*map(np.concatenate, zip(waiting, strip, strict=True)))
-        last = waiting.truth.shape[0] - margin
-        if last > first:
-            yield waiting, first, last
-            start = max(0, last - margin)
-            waiting, first = EvaluatedRows(*(band[start:] for band in waiting)), last - start
-    if waiting is not None and waiting.truth.shape[0] > first:
-        yield waiting, first, waiting.truth.shape[0]
-
-
-def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[EvaluatedRows]:
+def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[Bands]:
     """Strips of rows, from the top; files are read by rows of blocks, which are then cut."""
     step = max(1, _JUDGED_PIXELS // run.region.width)
     for window in run.windows():
         true = truth.read(window)
         if mask is not None:
             true[np.nan_to_num(mask.read(window)) == 0] = np.nan
-        (disparity, lower, upper, confidence), validity = run.read_bands(window)
-        rows = EvaluatedRows(disparity, lower, upper, confidence, validity, true)
+        rows = run.read_bands(window)._replace(truth=true)
         for first in range(0, window.height, step):
-            yield EvaluatedRows(*(band[first : first + step] for band in rows))
+            yield cut_rows(rows, first, first + step)

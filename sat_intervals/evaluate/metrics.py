@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sat_intervals.products import Bands
+
 _WIDTH, _RATIO, _BIAS, _CONFIDENCE = 100, 1000, 1000, 1000  # steps a unit
 _LARGEST_RATIO, _LARGEST_BIAS = 100, 1000
 
@@ -43,21 +45,15 @@ class Judged(NamedTuple):
 
     Attributes
     ----------
-    truth, disparity, lower, upper
-        Pixels of disparity.
-    confidence
-        0 to 1; NaN where the run has none.
+    bands
+        float64 but for the flags.
     low
         Whether the pixel is of low confidence (paper eq. 13).
     area_error
         The largest ``|truth - disparity|`` over the judged pixels of its low-confidence area; NaN if not low.
     """
 
-    truth: np.ndarray
-    disparity: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    confidence: np.ndarray
+    bands: Bands
     low: np.ndarray
     area_error: np.ndarray
 
@@ -161,16 +157,16 @@ class Metrics:
 
     def add(self, judged: Judged) -> None:
         """Take judged pixels into account."""
-        truth, lower, upper, low = judged.truth, judged.lower, judged.upper, judged.low
-        criteria = self._criteria
+        disparity, lower, upper, confidence, _, truth, _ = judged.bands
+        low, criteria = judged.low, self._criteria
         inside = (lower - criteria.tolerance <= truth) & (truth <= upper + criteria.tolerance)
         width = upper - lower
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
             self._areas[name].add(inside[chosen], width[chosen])
         wide = low & (width > 0)
         self._ratios.add(judged.area_error[wide] / width[wide])
-        self._deciles.add(judged.confidence, inside, width)
-        error = np.abs(judged.disparity - truth)
+        self._deciles.add(confidence, inside, width)
+        error = np.abs(disparity - truth)
         self._wrong["bad1"] += int((error > 1).sum())
         self._wrong["bad3"] += int((error > 3).sum())
         self._wrong["truth_outside_range"] += int(((truth < criteria.minimum) | (truth > criteria.maximum)).sum())

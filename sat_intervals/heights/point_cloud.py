@@ -125,7 +125,7 @@ class PointCloud:
                     bands[_POINT[name]][known]
                     for name in ("longitude", "latitude", "height", "height_lower", "height_upper")
                 )
-                (_, _, _, confidence), _ = self.run.read_bands(source)
+                confidence = self.run.read_bands(source).confidence
                 x, y = self._projection.place(longitude, latitude)
                 down = self._projection.undulation(longitude, latitude)
                 splat(

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.heights.sensors import Lattice, Points, Sensors
-from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image
 from sat_intervals.results import Run, open_run
@@ -109,8 +108,8 @@ def _strips(run: Run) -> Iterator[tuple[Window, np.ndarray]]:
     """
     height = max(1, _PIXELS // run.region.width)
     for block in run.windows():
-        bands, validity = run.read_bands(block)
-        disparities = np.where(validity & INVALID == 0, bands[:3], np.float32(np.nan))
+        bands = run.read_bands(block)
+        disparities = np.where(bands.valid, bands[:3], np.float32(np.nan))
         for first in range(0, block.height, height):
             part = disparities[:, first : first + height]
             yield Window(block.row + first, 0, part.shape[1], block.width), part

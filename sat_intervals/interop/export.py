@@ -6,13 +6,12 @@ of the left image, since these tools lay them on it; what is outside the region 
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import INVALID, Band
+from sat_intervals.products import LEFT_WINDOW, Band, Bands
 from sat_intervals.raster import File, Georeferencing, OutputWriter
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window, strips
@@ -20,19 +19,8 @@ from sat_intervals.tiling import Window, strips
 # Pixels of a strip.
 _STRIP = 1 << 22
 
-
-class _Pixels(NamedTuple):
-    """Some pixels of a run, all ``(rows, columns)``; the floats NaN where not valid."""
-
-    disparity: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    confidence: np.ndarray
-    valid: np.ndarray
-
-
-Raster = tuple[File, Callable[[_Pixels], np.ndarray]]
-"""A file, and its bands from those of a run; NaN becomes the file's no-data value, or 0 where it has none."""
+Raster = tuple[File, Callable[[Bands], np.ndarray]]
+"""A file, and its bands from those of a run; NaN, not valid, becomes the file's no-data value, or 0 without one."""
 
 
 def _file(name: str, *bands: str, dtype: str = "float32", nodata: float | None = None, driver: str = "COG") -> File:
@@ -131,16 +119,16 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     return [folder / file.name for file in files]
 
 
-def _read(run: Run, window: Window) -> _Pixels:
-    """The pixels of a window of the left image."""
+def _read(run: Run, window: Window) -> Bands:
+    """The pixels of a window of the left image: outside the run's region none is valid."""
     pixels = np.full((4, window.height, window.width), np.nan, np.float32)
     inside = window.clipped(run.region)
     if inside.height:
-        bands, validity = run.read_bands(inside.relative_to(run.region))
-        valid = (validity & INVALID == 0) & np.isfinite(bands[0])
-        pixels[:, *inside.relative_to(window).slices] = np.where(valid, bands, np.float32(np.nan))
+        bands = run.read_bands(inside.relative_to(run.region))
+        valid = bands.valid & np.isfinite(bands.disparity)
+        pixels[:, *inside.relative_to(window).slices] = np.where(valid, bands[:4], np.float32(np.nan))
     disparity, lower, upper, confidence = pixels
-    return _Pixels(disparity, lower, upper, confidence, np.isfinite(disparity).astype(np.uint8))
+    return Bands(disparity, lower, upper, confidence, np.where(np.isfinite(disparity), 0, LEFT_WINDOW))
 
 
 def _filled(bands: np.ndarray, file: File) -> np.ndarray:

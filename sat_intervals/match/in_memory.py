@@ -1,6 +1,6 @@
 """A pair of arrays in memory, matched as one tile: no files, no store, no scheduler."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,10 +9,10 @@ import xarray as xr
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.match.matching_cost import Reader
+from sat_intervals.match.matching_cost import View
 from sat_intervals.match.memory import check_memory, volume_bytes
-from sat_intervals.match.normalization import PairStatistics, measure
-from sat_intervals.match.patch import match_patch
+from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
+from sat_intervals.match.patch import match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
@@ -43,25 +43,25 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         For arrays that do not fit each other or the search range, and for a volume larger than the memory.
     """
     config = load_config(config)
-    left_pixels, right_pixels = _pixels(left, "left"), _pixels(right, "right")
-    _check_fit(left_pixels, right_pixels, config)
-    left_image, right_image = _image(left_pixels), _image(right_pixels)
-    whole = Window(0, 0, *left_image.shape)
-    readers = _reader(left_image), _reader(right_image)
+    pixels = _pixels(left, "left"), _pixels(right, "right")
+    _check_fit(*pixels, config)
+    images = _image(pixels[0]), _image(pixels[1])
+    whole = Window(0, 0, *images[0].shape)
+    windows = patch_windows(whole, whole, config)
+    views = _view(images[0], windows[0]), _view(images[1], windows[1])
     statistics = None
     if isinstance(config.cost, Mccnn):
-        statistics = PairStatistics(measure(readers[0], *left_image.shape), measure(readers[1], *right_image.shape))
-    patch = match_patch(*readers, whole, whole, whole, config, statistics)
-    raw = patch.raw
-    rows = RawRows(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, patch.right.winner)
+        statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
+    patch = match_patch(views, whole, whole, whole, config, statistics)
+    raw, rows = patch.raw, RawRows.of(patch.raw, patch.right)
     scale = ConfidenceScale(np.nan, np.nan)
     if config.ambiguity:
         histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
         scale = confidence_scale(config.ambiguity, histogram)
     final = postprocess_rows(rows, 0, whole.height, scale, config)
-    labels = left if isinstance(left, xr.DataArray) else xr.DataArray(left_image, dims=("row", "column"))
+    labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
     dataset = xr.Dataset(coords=labels.coords)
-    for band, layer in zip(BANDS, final.intervals, strict=True):
+    for band, layer in zip(BANDS, final[:4], strict=True):
         attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
         dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
     dataset["validity"] = xr.DataArray(final.validity, dims=labels.dims, attrs=flag_attributes())
@@ -101,7 +101,6 @@ def _image(pixels: np.ma.MaskedArray) -> np.ma.MaskedArray:
 
 
 def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
-    search = config.disparity
     if left.shape[0] != right.shape[0]:
         raise SatIntervalsError(
             f"the left array has {left.shape[0]} rows, the right {right.shape[0]}, but rows must correspond: "
@@ -109,31 +108,27 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
         )
     if 0 in left.shape or 0 in right.shape:
         raise SatIntervalsError(f"nothing to match: shapes {left.shape} and {right.shape}")
-    if left.shape[1] - 1 + search.maximum < 0 or search.minimum > right.shape[1] - 1:
-        raise SatIntervalsError(
-            f"disparities {search.minimum} to {search.maximum} lead every pixel of the left array, {left.shape[1]} "
-            f"columns, out of the right, {right.shape[1]}: check their sign, x_right = x_left + disparity"
-        )
+    config.disparity.check_images("the left array", left.shape[1], "the right array", right.shape[1])
     rows, columns = left.shape
     check_memory(
         volume_bytes(rows, columns, config),
-        f"{rows} x {columns} pixels x {search.count} disparities",
+        f"{rows} x {columns} pixels x {config.disparity.count} disparities",
         "write the arrays to files and use match_pair, which works in tiles",
     )
 
 
-def _reader(image: np.ma.MaskedArray) -> Reader:
-    """Read any window of an array as `match_patch` wants it."""
-    whole = Window(0, 0, *image.shape)
-    values, masked = image.filled(0), np.ma.getmaskarray(image)
+def _moments(image: np.ma.MaskedArray) -> Iterator[Moments]:
+    """Of the blocks of an image, in their order."""
+    for block in blocks(*image.shape):
+        yield moments(image.data[block.slices], np.ma.getmaskarray(image)[block.slices])
 
-    def read(window: Window) -> tuple[np.ndarray, np.ndarray]:
-        pixels = np.zeros((window.height, window.width), values.dtype)
-        state = np.full(pixels.shape, NO_DATA, np.uint8)
-        inside = window.clipped(whole)
-        here = inside.relative_to(window).slices
-        pixels[here] = values[inside.slices]
-        state[here] = np.where(masked[inside.slices], NO_DATA, 0)
-        return pixels, state
 
-    return read
+def _view(image: np.ma.MaskedArray, window: Window) -> View:
+    """The image in a window that may go beyond it."""
+    pixels = np.zeros((window.height, window.width), image.dtype)
+    state = np.full(pixels.shape, NO_DATA, np.uint8)
+    inside = window.clipped(Window(0, 0, *image.shape))
+    part, here = image[inside.slices], inside.relative_to(window).slices
+    pixels[here] = part.filled(0)
+    state[here] = np.where(np.ma.getmaskarray(part), NO_DATA, 0)
+    return View(window, pixels, state)

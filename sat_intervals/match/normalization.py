@@ -5,7 +5,7 @@ winners of the reference implementation.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,11 +59,6 @@ def moments(pixels: np.ndarray, state: np.ndarray) -> Moments:
 def blocks(height: int, width: int) -> list[Window]:
     """The blocks of an image, in their order."""
     return [tile.core for tile in Grid(Window(0, 0, height, width), BLOCK)]
-
-
-def measure(read: Callable[[Window], tuple[np.ndarray, np.ndarray]], height: int, width: int) -> ImageStatistics:
-    """Read a whole image block by block and measure it."""
-    return statistics_of(moments(*read(block)) for block in blocks(height, width))
 
 
 def statistics_of(blocks: Iterable[Moments]) -> ImageStatistics:

@@ -1,4 +1,4 @@
-"""One patch of two images to raw products: read, compare, match, and what the neighbours need to know."""
+"""One patch of two images to raw products: the windows it needs, its costs, its match, its right view."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from sat_intervals.config import Config, CosineSgm, Sgm
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match
-from sat_intervals.match.matching_cost import Area, MatchingCost, Reader, cost_areas
+from sat_intervals.match.matching_cost import Area, MatchingCost, Views, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
 from sat_intervals.tiling import Window, facing
@@ -47,9 +47,33 @@ def kernel_settings(config: Config) -> Settings:
     )
 
 
+def patch_areas(core: Window, image: Window, config: Config) -> list[Area]:
+    """The area of a core with its overlap and, for accurate cross-checking, that of the right view.
+
+    ``image``: all left pixels. The overlap goes beyond a region, but not beyond the image.
+    """
+    overlap = config.tiles.overlap
+    areas = [Area.of(core.grown(overlap, overlap).clipped(image), config)]
+    if config.cross_check and config.cross_check.method == "accurate":
+        areas.append(_right_area(core, image, config))
+    return areas
+
+
+def _right_area(core: Window, image: Window, config: Config) -> Area:
+    """The right pixels that a core can reach, with their overlap; they may lie outside the right image."""
+    search, overlap = config.disparity, config.tiles.overlap
+    reach = facing(core, search.minimum, search.maximum)
+    rows = Window(image.row, reach.column - overlap, image.height, reach.width + 2 * overlap)
+    return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
+
+
+def patch_windows(core: Window, image: Window, config: Config) -> tuple[Window, Window]:
+    """The windows of the left and of the right image that matching a core needs; see `patch_areas`."""
+    return view_windows(patch_areas(core, image, config), config)
+
+
 def match_patch(
-    left: Reader,
-    right: Reader,
+    views: Views,
     core: Window,
     region: Window,
     image: Window,
@@ -60,41 +84,34 @@ def match_patch(
 
     Parameters
     ----------
-    left, right
-        The images.
+    views
+        The images in the `patch_windows` of the core.
     core
         The left pixels whose products are kept.
     region
         The left pixels of the whole run.
     image
-        All left pixels: the overlap goes beyond the region, but not beyond the image.
+        All left pixels.
     config
         Settings.
     statistics
         Mean and standard deviation of the whole images, which MC-CNN needs.
     """
     settings = kernel_settings(config)
-    overlap = config.tiles.overlap
     output = core.grown(1, 1).clipped(region)
-    method = config.cross_check.method if config.cross_check else None
-    areas = [Area.of(core.grown(overlap, overlap).clipped(image), config)]
-    if method == "accurate":
-        areas.append(_seen_area(core, image, config))
-    matching_costs = cost_areas(left, right, areas, config, statistics)
-    seen = core if method == "fast" else Window(core.row, core.column, 0, 0)
-    raw, right_view = _matched(matching_costs[0], areas[0], settings, output, seen)
-    inside = output.relative_to(areas[0].base).slices
-    raw.validity[matching_costs[0].state[inside] & MASKED != 0] |= LEFT_MASKED
-    _doubt(raw, matching_costs[0].textureless[inside], config)
-    if method == "accurate":
-        right_view = _match_from_right(matching_costs[1], areas[1], core, settings)
+    area, *of_right = patch_areas(core, image, config)
+    cost, *cost_of_right = cost_areas(views, [area, *of_right], config, statistics)
+    wants_fast = config.cross_check is not None and config.cross_check.method == "fast"
+    seen = core if wants_fast else Window(core.row, core.column, 0, 0)
+    raw, right_view = match(
+        cost.costs, settings, output.relative_to(area.base), seen.relative_to(area.base), cost.gradients
+    )
+    inside = output.relative_to(area.base).slices
+    raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
+    _doubt(raw, cost.textureless[inside], config)
+    if of_right:
+        right_view = match_right(cost_of_right[0], of_right[0], core, settings)
     return Patch(raw, output, right_view)
-
-
-def _matched(cost: MatchingCost, area: Area, settings: Settings, output: Window, core: Window) -> tuple[Raw, RightView]:
-    """Match an area; returns the products of ``output`` and the right view of ``core``."""
-    windows = output.relative_to(area.base), core.relative_to(area.base)
-    return match(cost.costs, settings, *windows, cost.gradients)
 
 
 def _doubt(raw: Raw, textureless: np.ndarray, config: Config) -> None:
@@ -107,18 +124,10 @@ def _doubt(raw: Raw, textureless: np.ndarray, config: Config) -> None:
     raw.ambiguity[doubtful] = config.largest_ambiguity
 
 
-def _seen_area(core: Window, image: Window, config: Config) -> Area:
-    """The right pixels that a core can reach, with their overlap; they may lie outside the right image."""
-    search, overlap = config.disparity, config.tiles.overlap
-    reach = facing(core, search.minimum, search.maximum)
-    rows = Window(image.row, reach.column - overlap, image.height, reach.width + 2 * overlap)
-    return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
-
-
-def _match_from_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:
-    """The right view from a volume of its own: left and right change places, and disparities their sign."""
+def match_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:
+    """The right view of a core from a volume of its own: images change places, and disparities their sign."""
     maximum = settings.minimum + settings.count - 1
     mirrored = settings._replace(minimum=-maximum, cut_level=-1, weights=np.zeros(0, np.uint16), refine=False)
-    reach = facing(core, settings.minimum, maximum)
-    raw, _ = _matched(cost, area, mirrored, reach, reach)
+    reach = facing(core, settings.minimum, maximum).relative_to(area.base)
+    raw, _ = match(cost.costs, mirrored, reach, reach, cost.gradients)
     return RightView(raw.cost, np.where(raw.winner == NO_DISPARITY, NO_DISPARITY, -raw.winner).astype(np.int16))

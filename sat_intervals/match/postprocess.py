@@ -6,7 +6,7 @@ NaN for invalid pixels.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,7 +14,10 @@ from sat_intervals.config import Ambiguity, Config
 from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
-from sat_intervals.products import BANDS, INVALID, NO_DISPARITY, REGULARIZED
+from sat_intervals.kernels.matching import Raw, RightView
+from sat_intervals.products import INVALID, NO_DISPARITY, REGULARIZED, Bands
+
+Rows = TypeVar("Rows", bound=tuple[Any, ...])
 
 
 class RawRows(NamedTuple):
@@ -42,16 +45,10 @@ class RawRows(NamedTuple):
     validity: np.ndarray
     right_winner: np.ndarray
 
-    def cut(self, first: int, last: int) -> "RawRows":
-        """The rows ``[first, last)``."""
-        return RawRows(*(array[first:last] for array in self))
-
-
-class Final(NamedTuple):
-    """Final bands of some rows: ``intervals`` ``(4, rows, columns)`` float32 in the order of BANDS, and validity."""
-
-    intervals: np.ndarray
-    validity: np.ndarray
+    @classmethod
+    def of(cls, raw: Raw, right: RightView) -> "RawRows":
+        """What was matched as one tile."""
+        return cls(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, right.winner)
 
 
 class ConfidenceScale(NamedTuple):
@@ -85,7 +82,7 @@ def _median_radius(config: Config) -> int:
     return config.median.size // 2 if config.median else 0
 
 
-def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> Final:
+def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> Bands:
     """Final bands of the rows ``[first, last)``.
 
     Parameters
@@ -115,15 +112,11 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
         validity[inner][low] |= REGULARIZED
     else:
         lower, upper = lower[inner], upper[inner]
-    disparity, validity = disparity[inner], validity[inner]
-    bands = np.empty((len(BANDS), *disparity.shape), np.float32)
-    bands[0], bands[3] = disparity, confidence[inner]
+    written = (searched if config.products.keep_rejected else kept)[inner]
+    disparity = np.where(written, disparity[inner], np.float32(np.nan))
     # The law of this tool: after medians and quantiles the interval still holds the disparity.
-    np.minimum(lower, disparity, out=bands[1])
-    np.maximum(upper, disparity, out=bands[2])
-    written = searched[inner] if config.products.keep_rejected else kept[inner]
-    np.copyto(bands[:3], np.float32(np.nan), where=~written)
-    return Final(bands, validity)
+    lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
+    return Bands(disparity, lower, upper, confidence[inner], validity[inner])
 
 
 def _bounds(rows: RawRows, config: Config) -> tuple[np.ndarray, np.ndarray]:
@@ -155,21 +148,35 @@ def _regularized(
     return lower, upper, low[first - top : last - top]
 
 
-def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[Final]:
+def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[Bands]:
     """Final bands of a region given strip by strip, from the top; each strip waits for the halo below it."""
-    margin = halo(config)
-    waiting: RawRows | None = None
-    first = 0  # of the waiting rows, those before are halo
+    for rows, first, last in with_halo(strips, halo(config)):
+        yield postprocess_rows(rows, first, last, scale, config)
+
+
+def with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, int]]:
+    """Records of full-width rows, given strip by strip from the top, with the rows around them.
+
+    Yields records with ``first`` and ``last``: the rows between have ``margin`` rows above and below them, as far as
+    the image goes, and every row is between once.
+    """
+    waiting: Rows | None = None
+    first = 0
     for strip in strips:
-        waiting = strip if waiting is None else RawRows(*map(_stacked, waiting, strip))
-        last = waiting.winner.shape[0] - margin
+        waiting = strip if waiting is None else _made(strip, map(np.concatenate, zip(waiting, strip, strict=True)))
+        last = len(waiting[0]) - margin
         if last > first:
-            yield postprocess_rows(waiting, first, last, scale, config)
+            yield waiting, first, last
             start = max(0, last - margin)
-            waiting, first = waiting.cut(start, last + margin), last - start
-    if waiting is not None and waiting.winner.shape[0] > first:
-        yield postprocess_rows(waiting, first, waiting.winner.shape[0], scale, config)
+            waiting, first = cut_rows(waiting, start, last + margin), last - start
+    if waiting is not None and len(waiting[0]) > first:
+        yield waiting, first, len(waiting[0])
 
 
-def _stacked(above: np.ndarray, below: np.ndarray) -> np.ndarray:
-    return np.concatenate([above, below])
+def cut_rows(rows: Rows, first: int, last: int) -> Rows:
+    """The rows ``[first, last)`` of a record."""
+    return _made(rows, (array[first:last] for array in rows))
+
+
+def _made(like: Rows, arrays: Iterable[np.ndarray]) -> Rows:
+    return type(like)(*arrays)

@@ -125,15 +125,15 @@ def open_image(
     return image
 
 
-def check_pair(left: Image, right: Image, minimum: int, maximum: int) -> None:
-    """Hold that rows correspond and that the disparities from ``minimum`` to ``maximum`` pixels can be searched.
+def check_pair(left: Image, right: Image) -> None:
+    """Hold that the rows of two images correspond.
 
     Widths and origins may differ: a disparity counts columns, not ground.
 
     Raises
     ------
     InputError
-        Images that are no epipolar pair, or a search range that does not suit them.
+        Images that are no epipolar pair.
     """
     pair = f"{left.path} and {right.path}"
     if left.height != right.height:
@@ -149,7 +149,6 @@ def check_pair(left: Image, right: Image, minimum: int, maximum: int) -> None:
     if sizes[0] and sizes[1] and not np.allclose(sizes[0], sizes[1], rtol=_SAME_SIZE, atol=0):
         names = "{:.9g} x {:.9g} and {:.9g} x {:.9g}".format(*sizes[0], *sizes[1])
         raise InputError(f"{pair} have different pixel sizes, {names}: resample the pair together")
-    _check_range(left, right, minimum, maximum)
 
 
 @contextmanager
@@ -202,19 +201,6 @@ def _check_mask(image: Image, mask: str) -> None:
                 f"{mask} has {dataset.height} x {dataset.width} pixels, {image.path} {image.height} x {image.width}: "
                 "give a mask of the image's size"
             )
-
-
-def _check_range(left: Image, right: Image, minimum: int, maximum: int) -> None:
-    search = f"disparities {minimum} to {maximum}"
-    if left.width - 1 + maximum < 0 or minimum > right.width - 1:
-        raise InputError(
-            f"{search} lead every pixel of {left.path}, {left.width} columns, out of {right.path}, {right.width}: "
-            "check their sign, x_right = x_left + disparity"
-        )
-    if maximum - minimum + 1 > right.width:
-        raise InputError(
-            f"{search} are {maximum - minimum + 1}, more than the {right.width} columns of {right.path}: search fewer"
-        )
 
 
 def other_files(name: str) -> list[str]:

@@ -19,7 +19,8 @@ from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
-from sat_intervals.run.job import Job, stamps
+from sat_intervals.run.job import Job
+from sat_intervals.run.output import stamps
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
 from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced
@@ -70,8 +71,8 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
             strips = (RawRows(**strip) for strip in store.strips(STRIP_PIXELS // region.width, records))
             row = 0
             for final in _ahead(postprocess_strips(_ahead(strips), scale, config)):
-                writer.write(row, final.intervals, final.validity)
-                tally.add(final.intervals, final.validity)
+                writer.write(row, np.stack(final[:4]), final.validity)
+                tally.add(final)
                 row += final.validity.shape[0]
                 progress("bands", row, region.height)
         with logged_stage(seconds, "files"):

@@ -20,12 +20,15 @@ from distributed import Client
 
 from sat_intervals.config import Cluster, Config, load_config, load_yaml, read_small
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
+from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.results import open_run
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.job import OUTPUTS, Job, changes_since, check_as_published, compile_kernels, is_complete, prepare
+from sat_intervals.run.inputs import changes_since
+from sat_intervals.run.job import Job, fitted_to_jobs, prepare
+from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
 from sat_intervals.run.pair import assembled, check_failures, matched, measure_images
 from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
@@ -224,7 +227,7 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
     if not is_complete(folder):
         return None
     report = open_run(folder).report
-    if changes := changes_since(report, *_images(pair), settings):
+    if changes := changes_since(report, *_images(pair), fitted_to_jobs(settings)):
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )

@@ -11,13 +11,15 @@ from distributed import Client
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
+from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.job import Job, check_as_published, compile_kernels, prepare
+from sat_intervals.run.job import Job, prepare
+from sat_intervals.run.output import check_as_published
 from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_tile, measure_block
 from sat_intervals.store.folder import LocalFolder

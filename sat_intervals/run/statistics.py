@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.products import FLAGS, INVALID, REGULARIZED
+from sat_intervals.products import FLAGS, INVALID, REGULARIZED, Bands
 
 # Widths are counted in steps of a hundredth of a pixel.
 _WIDTH_STEP = 0.01
@@ -20,10 +20,10 @@ class Tally:
         self._widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
         self._whole = round((count - 1) / _WIDTH_STEP)
 
-    def add(self, intervals: np.ndarray, validity: np.ndarray) -> None:
-        """Count some rows: ``intervals`` ``(4, rows, columns)`` in the order of BANDS, and their ``validity``."""
-        self._sums += np.bincount(validity.ravel(), minlength=self._sums.size)
-        width = (intervals[2] - intervals[1])[validity & INVALID == 0]
+    def add(self, bands: Bands) -> None:
+        """Count some rows."""
+        self._sums += np.bincount(bands.validity.ravel(), minlength=self._sums.size)
+        width = (bands.upper - bands.lower)[bands.valid]
         width = np.rint(width[np.isfinite(width)] / np.float32(_WIDTH_STEP)).astype(np.int32)
         self._widths += np.bincount(width, minlength=self._widths.size)
 

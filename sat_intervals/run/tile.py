@@ -1,7 +1,6 @@
 """One tile on a worker: read, match, leave behind what the strips need."""
 
 import logging
-import time
 from typing import Any
 
 import numpy as np
@@ -9,8 +8,9 @@ import numpy as np
 from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.match.matching_cost import View
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
-from sat_intervals.match.patch import Patch, match_patch
+from sat_intervals.match.patch import Patch, match_patch, patch_windows
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
@@ -51,30 +51,20 @@ def _match_tile(job: Job, tile: Tile) -> None:
     job.store.check(job.manifest)
     job.check_inputs()  # so that nothing is matched in vain
     job.store.check_space(tile)
-    seconds: dict[str, float] = {}
-    usable = {"left": 0, "right": 0}
-
-    def reader(image: Image, side: str) -> Any:
-        def read(window: Window) -> tuple[np.ndarray, np.ndarray]:
-            with timed(seconds, "read"):
-                pixels, state = read_window(image, window)
-            usable[side] += int((state == 0).sum())
-            return pixels, state
-
-        return read
-
-    grid, config = job.store.grid, job.config
-    image = Window(0, 0, job.left.height, job.left.width)
     statistics = _checked_statistics(job)
-    started = time.perf_counter()
-    readers = reader(job.left, "left"), reader(job.right, "right")
+    seconds: dict[str, float] = {}
+    whole = Window(0, 0, job.left.height, job.left.width)
+    windows = zip((job.left, job.right), patch_windows(tile.core, whole, job.config), strict=True)
     try:
-        patch = match_patch(*readers, tile.core, grid.region, image, config, statistics)
+        with timed(seconds, "read"):
+            left, right = (View(window, *read_window(image, window)) for image, window in windows)
     finally:  # a file that was replaced by a shorter one cannot be read
         job.check_inputs()
-    seconds["match"] = time.perf_counter() - started - seconds["read"]
+    with timed(seconds, "match"):
+        patch = match_patch((left, right), tile.core, job.store.grid.region, whole, job.config, statistics)
     with timed(seconds, "write"):
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
+    usable = {side: int((view.state == 0).sum()) for side, view in (("left", left), ("right", right))}
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 

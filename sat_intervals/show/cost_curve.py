@@ -1,6 +1,5 @@
 """The cost curve of one pixel, matched again from the images, and how it becomes an interval (paper eq. 5 to 9)."""
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +7,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import Area, cost_areas
+from sat_intervals.match.matching_cost import Area, View, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import FLAGS, IMPOSSIBLE_COST
@@ -62,14 +61,16 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     config = results.config
     overlap = config.tiles.overlap
     pixel = Window(results.region.row + row, results.region.column + column, 1, 1)
-    area = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
+    base = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
+    area = Area.of(base, config)
     settings = kernel_settings(config)
-    readers = partial(read_window, results.left), partial(read_window, results.right)
+    windows = zip((results.left, results.right), view_windows([area], config), strict=True)
+    left, right = (View(window, *read_window(image, window)) for image, window in windows)
     normalization = results.report.get("normalization")
     statistics = PairStatistics.of_report(normalization) if normalization else None
-    (cost,) = cost_areas(*readers, [Area.of(area, config)], config, statistics)
+    (cost,) = cost_areas((left, right), [area], config, statistics)
     volume = cost_volume(cost.costs, settings, cost.gradients)
-    curve = np.ascontiguousarray(volume[pixel.relative_to(area).slices])
+    curve = np.ascontiguousarray(volume[pixel.relative_to(base).slices])
     possible = curve[0, 0] != IMPOSSIBLE_COST
     if not possible.any():
         raise SatIntervalsError(_explain(results, row, column))

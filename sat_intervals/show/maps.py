@@ -12,7 +12,6 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import INVALID
 from sat_intervals.results import Results
 from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.show.legend import PIXEL_CLASSES, SKY, VERMILION, classify
@@ -29,7 +28,7 @@ def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
     width, height = _inches(results.shape, _PANEL if columns > 1 else _LARGE)
     shape = fitting(results.shape, (height, width), dpi)
     bands = results.read_small(shape)
-    valid = bands.validity & INVALID == 0
+    valid = bands.valid
     disparity = np.where(valid, bands.disparity, np.nan)
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
     search = results.config.disparity
@@ -60,9 +59,9 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
     judged, missed = 0, np.zeros(2, np.int64)
     images, kinds = [], []
     for row, bands in results.strips():
-        valid = bands.validity & INVALID == 0
+        valid = bands.valid
         above, below = valid & (bands.truth > bands.upper), valid & (bands.truth < bands.lower)
-        judged += int((valid & np.isfinite(bands.truth) & np.isfinite(bands.lower)).sum())
+        judged += int((valid & bands.known).sum())
         missed += above.sum(), below.sum()
         chosen = np.s_[-row % down :: down, ::across]
         images.append(bands.image[chosen].copy())  # a view would keep all of the strip

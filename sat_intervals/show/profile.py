@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from sat_intervals.products import INVALID
-from sat_intervals.results import Bands, Results
+from sat_intervals.products import INVALID, Bands
+from sat_intervals.results import Results
 from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.show.cost_curve import Curve, read_curve
 from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION
@@ -32,10 +32,10 @@ def draw_profile(
     """
     first, last = results.check_part(row, columns)
     bands = results.read(Window(row, 0, 1, results.region.width))
-    valid = bands.validity & INVALID == 0
+    valid = bands.valid
     lines = [np.where(valid, band, np.nan) for band in (bands.lower, bands.upper, bands.disparity)]
     # A pixel is a step, seen even when its neighbours are not valid.
-    lines += [bands.truth, bands.low(results.config)]
+    lines += [bands.truth, results.low(bands)]
     lower, upper, disparity, truth, low = (np.repeat(line[0, first : last + 1], 2) for line in lines)
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
     has_intervals = results.config.interval is not None

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.results import Bands, Results
+from sat_intervals.products import Bands
+from sat_intervals.results import Results
 from sat_intervals.show.legend import FIRST_INVALID, PIXEL_CLASSES, classify
 
 _PIXELS = 500_000  # on the page, at 5 to 8 bytes each once compressed and written as text

@@ -49,7 +49,7 @@ def _contents(results: Results) -> dict[str, Any]:
     """All that the script of the page shows."""
     counts, pixels = Counts(results.config.disparity.count), Pixels(results)
     for row, bands in results.strips():
-        low = bands.low(results.config)
+        low = results.low(bands)
         counts.add(bands, low)
         pixels.add(row, bands, low)
     truth = results.truth.image.path if results.truth else None

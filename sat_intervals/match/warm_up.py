@@ -1,0 +1,24 @@
+"""Kernels compiled, or read from numba's cache, before the first tile."""
+
+import numpy as np
+
+from sat_intervals.config import Config
+from sat_intervals.match.matching_cost import View
+from sat_intervals.match.normalization import ImageStatistics, PairStatistics
+from sat_intervals.match.patch import match_patch, patch_windows
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
+from sat_intervals.tiling import Window
+
+
+def compile_kernels(config: Config) -> None:
+    """Match a few random pixels, which compiles every kernel that the settings need."""
+    random = np.random.default_rng(0)
+    spot = Window(0, 0, 4, 4)
+    windows = patch_windows(spot, spot, config)
+    images = (random.random((window.height, window.width), np.float32) for window in windows)
+    left, right = (
+        View(window, pixels, np.zeros(pixels.shape, np.uint8)) for window, pixels in zip(windows, images, strict=True)
+    )
+    statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
+    patch = match_patch((left, right), spot, spot, spot, config, statistics)
+    list(postprocess_strips([RawRows.of(patch.raw, patch.right)], ConfidenceScale(0.0, 1.0), config))
