@@ -18,13 +18,14 @@ from click.testing import CliRunner
 
 from sat_intervals.cli import main
 from sat_intervals.config import Cluster, ConfigError, load_config
+from sat_intervals.config.pairs import PairOfBatch, read_batch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import fitted, tile_bytes
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import batch
-from sat_intervals.run.batch import PairOfBatch, match_batch, read_batch
+from sat_intervals.run.batch import match_batch
 from sat_intervals.run.cluster import connected, parse_memory
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair, matched
@@ -325,7 +326,7 @@ def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(ima
     ("name", "text", "problem"),
     [
         ("a.csv", "name,left\nx,l.tif\n", "row 1 lacks right"),
-        ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "2 pairs are called x"),
+        ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "a.csv: 2 pairs or runs are called x"),
         ("a.csv", "name,left,right\nx,l,r,1\n", "more values than columns"),
         ("a.csv", "name,left,right\n../x,l,r\n", "row 1: name '../x' cannot be that of the pair's folder"),
         ("a.csv", "name,left,right\nx,l,r\nlogs,l,r\n", "row 2: name 'logs' cannot be"),

@@ -324,10 +324,10 @@ def test_find_pairs__says_what_is_wrong_with_a_folder(tmp_path, meta, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("left,right,minimum,maximum\n", "no column truth; needed: left, right, truth, minimum, maximum, known: name"),
-        ("left,right,truth,minimum,maximum\n", "pairs.csv has a header but no rows: give a row a pair"),
+        ("left,right,minimum,maximum\na,b,1,2\n", "row 1 lacks truth: needed is a row a pair, with left, right, truth"),
+        ("left,right,truth,minimum,maximum\n", "pairs.csv holds no pairs: needed is a row a pair, with left, right"),
         ("left,right,truth,minimum,maximum,name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
-        ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "line 2: minimum '1', maximum 'x', needed: integers"),
+        ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "row 1: minimum '1', maximum 'x', needed: integers"),
         (
             "left,right,truth,minimum,maximum\na,b,c,1,2\na,d,e,3,4\n",
             "2 pairs or runs are called a: give each its own name",
@@ -445,7 +445,10 @@ def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
         (["PAIR", "PAIR"], "2 pairs or runs are called .*/one: give each its own name"),
         (["PAIR", "--config", "OFF"], "off.yaml: interval is null, but intervals are to be judged: leave it on"),
         (["PAIR", "--config", "nope.yaml"], "nope.yaml"),
-        (["nothere.csv"], "nothere.csv cannot be read: No such file or directory: give a CSV file of pairs$"),
+        (
+            ["nothere.csv"],
+            "nothere.csv cannot be read: No such file or directory: needed is a row a pair",
+        ),
     ],
 )
 def test_command__refuses_before_it_matches(run, pair, tmp_path, arguments, says):

@@ -18,6 +18,7 @@ from click.testing import CliRunner
 from finished import random_bands, write_run
 
 from sat_intervals.cli import main
+from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.interop.export import export
@@ -35,7 +36,7 @@ from sat_intervals.raster import (
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.results import Run, open_results
 from sat_intervals.run import assemble
-from sat_intervals.run.batch import PairOfBatch, match_batch
+from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.tile import match_tile

@@ -14,6 +14,7 @@ from networks import random_weights, slow_features, trained_network, write_netwo
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
 from sat_intervals.cli import main
+from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.in_memory import _reader
@@ -24,7 +25,7 @@ from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.results import open_results
-from sat_intervals.run.batch import PairOfBatch, match_batch
+from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_tile
 from sat_intervals.show.cost_curve import read_curve

@@ -17,14 +17,13 @@ from click.testing import CliRunner
 from sat_intervals import load_config, open_image
 from sat_intervals.cli import main
 from sat_intervals.config import Cluster, ConfigError, Mccnn
-from sat_intervals.config.pairs import find_pairs
+from sat_intervals.config.pairs import find_pairs, read_batch
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.match.mccnn import weights_file
 from sat_intervals.raster import read_place
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_run
 from sat_intervals.run import cluster, submit
-from sat_intervals.run.batch import read_batch
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.submit import Submission, Task
 
