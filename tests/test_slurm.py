@@ -20,7 +20,7 @@ from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.config import Cluster
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
-from sat_intervals.run.cluster import job_script, workers_there
+from sat_intervals.run.batch_system import job_script, workers_there
 
 SCRIPTS = Path(sysconfig.get_path("scripts"))
 ROOT = Path(__file__).parents[1]
@@ -78,7 +78,7 @@ def submitted(
 ):
     """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first.
 
-    ``constants`` are those of `sat_intervals.run.cluster`; where it ends well and ``is_quiet`` it must say nothing.
+    ``constants`` are those of `run.batch_system`; where it ends well and ``is_quiet`` it must say nothing.
     """
     images, settings = pair
     folder.mkdir(exist_ok=True)
@@ -89,8 +89,8 @@ def submitted(
         "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
         "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
     } | (own or {})
-    code = "from sat_intervals import cli; from sat_intervals.run import cluster; "
-    code += f"vars(cluster).update({constants or {}}); cli.main()"
+    code = "from sat_intervals import cli; from sat_intervals.run import batch_system; "
+    code += f"vars(batch_system).update({constants or {}}); cli.main()"
     command = [sys.executable, "-c", code, "match", images / "left.tif", images / "right.tif", folder / "out"]
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
     with (folder / "log").open("w") as log:

@@ -207,7 +207,7 @@ def test_heartbeats__do_not_count_a_time_in_which_this_process_was_stopped(monke
 
 
 def test_connected__refuses_processes_that_cannot_reach_each_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "_LOOPBACK", "192.0.2.77")
+    monkeypatch.setattr(cluster, "LOOPBACK", "192.0.2.77")
     with (
         pytest.raises(SatIntervalsError, match=r"processes cannot reach each other at 192.0.2.77: .*--cluster threads"),
         connected(Cluster(kind="processes", workers=1), tmp_path),
