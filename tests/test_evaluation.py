@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import rasterio
 import reference_evaluation
-from click.testing import CliRunner
+from helpers import invoke, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals import match_pair
-from sat_intervals.cli import main
 from sat_intervals.config.pairs import find_pairs, group_beside
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
@@ -174,20 +173,16 @@ def write(path, pixels, nodata):
         file.write(pixels, 1)
 
 
-def write_pair(folder, seed, group="synthetic"):
+def small_pair(folder, seed, group="synthetic"):
     """A folder of a pair of 70 x 90 pixels, as `find_pairs` takes it."""
     folder.mkdir()
-    scene = make_scene(70, 90, seed=seed)
-    for name, pixels, nodata in (("left", scene.left, 0), ("right", scene.right, 0), ("truth", scene.truth, NAN)):
-        write(folder / f"{name}.tif", pixels, nodata)
-    meta = {"disparity": [scene.minimum, scene.maximum], "group": group}
-    (folder / "meta.json").write_text(json.dumps(meta))
+    write_pair(folder, make_scene(70, 90, seed=seed), group=group)
     return folder
 
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
-    return write_pair(tmp_path_factory.mktemp("pair") / "one", 1)
+    return small_pair(tmp_path_factory.mktemp("pair") / "one", 1)
 
 
 def settings_of(folder, **more):
@@ -355,7 +350,7 @@ def test_find_pairs__of_a_table(tmp_path):
 
 # ---- The command -------------------------------------------------------------------------------------------
 def command(*arguments):
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    result = invoke(*arguments)
     return result.exit_code, result.stdout, result.stderr
 
 
@@ -393,7 +388,7 @@ def test_command__prints_one_run(run, pair):
 
 
 def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
-    other = write_pair(tmp_path / "two", 2)
+    other = small_pair(tmp_path / "two", 2)
     rows = [(pair, "one"), (other, "two")]
     (tmp_path / "pairs.csv").write_text(
         "left,right,truth,minimum,maximum,name,group\n"

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import rasterio
 import reference
-from click.testing import CliRunner
+from helpers import hashes, invoke, write_pair
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
-from sat_intervals.cli import main
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
@@ -23,7 +22,6 @@ from sat_intervals.match.mccnn import Network, load_network, weights_file
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
-from sat_intervals.raster import north_up, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
@@ -279,8 +277,7 @@ def test_match_pair__processes_and_threads_make_the_same_bytes_and_pages(tmp_pat
     for kind in ("threads", "processes"):
         config = settings(-4, 6, tiles={"size": 64, "overlap": 20}, cluster={"kind": kind, "workers": 2})
         match_pair(*images, tmp_path / kind, config)
-    for name in ("intervals.tif", "validity.tif"):
-        assert (tmp_path / "threads" / name).read_bytes() == (tmp_path / "processes" / name).read_bytes()
+    assert hashes(tmp_path / "threads") == hashes(tmp_path / "processes")
     told = invoke("report", tmp_path / "processes")
     assert told.exit_code == 0, told.output
     assert "mccnn" in (tmp_path / "processes" / "report.html").read_text()
@@ -315,10 +312,6 @@ def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, ne
         match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
 
 
-def invoke(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
 def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
     left, right = masked_images(60, 80)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
@@ -342,12 +335,7 @@ def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
 
 
 def test_evaluate__compares_both_costs_in_one_table(tmp_path):
-    scene = make_scene(120, 160)
-    for name, layer in (("left", scene.left), ("right", scene.right), ("truth", scene.truth)):
-        nodata = np.nan if name == "truth" else 0
-        write_layer(tmp_path / f"{name}.tif", layer, nodata, north_up(32631, 0, 0, 0.5))
-    meta = {"disparity": [scene.minimum, scene.maximum], "group": "city"}
-    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    write_pair(tmp_path, make_scene(120, 160), group="city")
     result = invoke("evaluate", "--cost", "census", "--cost", "mccnn", tmp_path)
     assert result.exit_code == 0, result.output
     assert [line.split()[:3] for line in result.stdout.splitlines()[2:4]] == [

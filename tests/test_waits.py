@@ -12,10 +12,9 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from click.testing import CliRunner
+from helpers import invoke
 
 from sat_intervals import load_config, open_image
-from sat_intervals.cli import main
 from sat_intervals.config import Cluster, ConfigError, Mccnn
 from sat_intervals.config.pairs import find_pairs, read_batch
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
@@ -70,7 +69,7 @@ def test_open_image__refuses_a_virtual_raster_of_a_pipe(tmp_path, read):
 
 def test_log_file__does_not_wait_for_who_reads_a_pipe(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    result = CliRunner().invoke(main, ["ablate", str(tmp_path), "--log-file", str(tmp_path / "pipe")])
+    result = invoke("ablate", tmp_path, "--log-file", tmp_path / "pipe")
     assert result.exit_code == 2
     assert "pipe cannot be written: No such device or address: choose another --log-file" in result.stderr
 
@@ -80,7 +79,7 @@ def test_commands__refuse_json_that_is_nested_without_end(tmp_path, name):
     for file in (name, "left.tif", "right.tif", "truth.tif"):
         (tmp_path / file).write_text(100_000 * "[")
     command = {"run.json": "report", "batch.json": "status", "meta.json": "ablate"}[name]
-    result = CliRunner().invoke(main, [command, str(tmp_path)])
+    result = invoke(command, tmp_path)
     assert result.exit_code == 2, result.stderr
     assert name in result.stderr
 
@@ -157,7 +156,7 @@ def test_plan__of_an_endless_image_ends(tmp_path):
         "</VRTRasterBand></VRTDataset>"
     )
     began = time.monotonic()
-    result = CliRunner().invoke(main, ["plan", str(vrt), str(vrt), "--disparity", "0", "4"])
+    result = invoke("plan", vrt, vrt, "--disparity", "0", "4")
     assert result.exit_code in (0, 2), result.output
     assert time.monotonic() - began < 30
 
