@@ -9,12 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
+import reference
 import yaml
 from click.testing import CliRunner, Result
 
 from sat_intervals.cli import main
 from sat_intervals.demo import Scene
+from sat_intervals.kernels.cost import between, census
+from sat_intervals.kernels.matching import Settings, match
+from sat_intervals.products import INVALID
 from sat_intervals.raster import north_up, write_layer
+from sat_intervals.tiling import Window
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
@@ -47,3 +53,30 @@ def wait_until(holds: Callable[[], object], what: str, seconds: float = PATIENCE
 def hashes(out: Path) -> dict[str, str]:
     """SHA-256 of the products of a run."""
     return {name: hashlib.sha256((out / name).read_bytes()).hexdigest() for name in OUTPUTS if name.endswith(".tif")}
+
+
+def codes_of(scene):
+    """Census codes of a scene of `reference`, left and right."""
+    views = (scene.left, scene.left_state), (scene.right, scene.right_state)
+    return [census(patch, state, scene.window) for patch, state in views]
+
+
+def matched(scene, output=None, core=None, **options):
+    """Raw products and right view of a scene of `reference`, of the whole patch by default."""
+    left, right = codes_of(scene)
+    output = output or Window(0, 0, *left.state.shape)
+    return match(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
+
+
+def bands(out):
+    """Disparity, lower, upper and confidence of a run, and its validity."""
+    with rasterio.open(out / "intervals.tif") as intervals, rasterio.open(out / "validity.tif") as validity:
+        return intervals.read(), validity.read(1)
+
+
+def shares_that_differ(one, other):
+    """Of the pixels that are valid in one of two runs: those of another disparity, and those of another interval."""
+    (first, flags), (second, other_flags) = bands(one), bands(other)
+    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
+    differs = (first != second) & ~(np.isnan(first) & np.isnan(second)) & judged
+    return differs[0].sum() / judged.sum(), (differs[1] | differs[2]).sum() / judged.sum()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 import reference
-from helpers import hashes, invoke, write_pair
+from helpers import bands, hashes, invoke, shares_that_differ, write_pair
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
@@ -246,11 +246,6 @@ def write(path, image, nodata=0):
     return path
 
 
-def bands(out):
-    with rasterio.open(out / "intervals.tif") as file, rasterio.open(out / "validity.tif") as flags:
-        return file.read(), flags.read(1)
-
-
 @pytest.mark.parametrize("method", ["fast", "accurate"])
 def test_match_pair__equals_match_arrays_and_keeps_what_decides(tmp_path, network_file, method):
     left, right = (np.ma.masked_array(image.data.astype("uint16"), image.mask) for image in masked_images(70, 90))
@@ -411,8 +406,6 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
     for name, size in (("whole", 1216), ("tiles", 256)):
         match_pair(left, right, tmp_path / name, settings(-13, 33, tiles={"size": size, "overlap": 100}))
-    (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
-    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
-    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
-    assert differs[0].sum() / judged.sum() <= 0.003
-    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.006
+    disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.003
+    assert interval <= 0.006

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import rasterio
-from helpers import OUTPUTS, hashes, write_pair
+from helpers import OUTPUTS, bands, hashes, shares_that_differ, write_pair
 
 from sat_intervals import match_arrays, match_pair
 from sat_intervals.config import Cluster, load_config
@@ -35,11 +35,6 @@ def pair(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pair")
     settings = write_pair(folder, make_scene(300, 420, seed=3))
     return folder / "left.tif", folder / "right.tif", settings
-
-
-def bands(out):
-    with rasterio.open(out / "intervals.tif") as intervals, rasterio.open(out / "validity.tif") as validity:
-        return intervals.read(), validity.read(1)
 
 
 def in_tiles(settings, size, overlap=100, **more):
@@ -83,11 +78,9 @@ def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, t
     left, right, settings = pair
     match_pair(left, right, tmp_path / "whole", in_tiles(settings, 512, **more))
     match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 128, **more))
-    (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
-    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
-    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
-    assert differs[0].sum() / judged.sum() <= 0.002
-    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.005
+    disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.002
+    assert interval <= 0.005
 
 
 def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path):
@@ -347,11 +340,9 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 256))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
-    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
-    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
-    assert differs[0].sum() / judged.sum() <= 0.001
-    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.0025
+        disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.001
+    assert interval <= 0.0025
 
 
 def test_connected__asyncio_is_heard_again_afterwards(tmp_path, caplog):
