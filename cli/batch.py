@@ -28,9 +28,9 @@ def batch(
     fails does not stop the others; OUT/batch.json says how each ended, and the status is 1 if any failed.
     """
     from sat_intervals.cli.console import Console
+    from sat_intervals.config.pairs import REPORT, read_batch
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.batch import match_batch, read_batch
-    from sat_intervals.run.status import REPORT
+    from sat_intervals.run.batch import match_batch
 
     check_not_replaced([pairs, config_file], [out / REPORT])
     rows = read_batch(pairs)

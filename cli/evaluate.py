@@ -92,15 +92,11 @@ def evaluate(
 
     sources = _sources(folders, truth, mask, cost)
     configs = _configs(sources, config_file, preset, accurate, cost)
-    scenes = []
-    for source, config in zip(sources, configs, strict=True):
-        judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
-        if source.pair is None or config is None:
-            report = judge(source.name, source.truth, source.mask)
-        else:
-            click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
-            report = _judge_pair(judge, source, source.pair, config)
-        scenes.append(SceneMetrics(source.name, group or _group(source), report))
+    judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
+    scenes = [
+        SceneMetrics(source.name, group or _group(source), _judged(judge, source, config))
+        for source, config in zip(sources, configs, strict=True)
+    ]
     if as_json:
         say_json(scenes)
     elif len(scenes) == 1:
@@ -186,15 +182,16 @@ def _configs(
     return configs
 
 
-def _judge_pair(
-    judge: Callable[..., dict[str, Any]], source: _Source, pair: "Pair", config: "Config"
-) -> dict[str, Any]:
-    """Match a pair to files, as anyone would, and judge them."""
+def _judged(judge: Callable[..., dict[str, Any]], source: _Source, config: "Config | None") -> dict[str, Any]:
+    """Judge a run; match a pair to files first, as anyone would."""
+    if source.pair is None or config is None:
+        return judge(source.name, source.truth, source.mask)
     from sat_intervals.run.pair import match_pair
 
+    click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
     with TemporaryDirectory(prefix="sat-intervals-") as out:
-        match_pair(pair.left, pair.right, out, config)
-        return judge(out, source.truth or pair.truth, source.mask)
+        match_pair(source.pair.left, source.pair.right, out, config)
+        return judge(out, source.truth or source.pair.truth, source.mask)
 
 
 def _group(source: _Source) -> str:

@@ -60,7 +60,7 @@ def match(
         raise click.UsageError("Missing search range: give --disparity MIN MAX, or a --config with it.")
     config = load_config(config_file, with_range(given, disparity))
     if dry_run:
-        from sat_intervals.run.cluster import job_script
+        from sat_intervals.run.batch_system import job_script
 
         click.echo(job_script(config.cluster, out))
         return

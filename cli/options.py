@@ -1,9 +1,9 @@
 """Options that many commands have, and how names of files are taken."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -17,7 +17,6 @@ COSTS = ("census", "mccnn")
 PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homogeneous", "mccnn")
 
 Command = Callable[..., Any]
-Number = TypeVar("Number", int, float)
 
 
 def named(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
@@ -52,6 +51,40 @@ disparity_option = click.option(
 )
 
 
+_IMAGE_OPTIONS = (
+    click.option("--left-mask", callback=named, metavar="FILE", help="Left pixels to leave out: non-zero = masked."),
+    click.option("--right-mask", callback=named, metavar="FILE", help="Right pixels to leave out."),
+    click.option("--nodata", type=float, metavar="V", help="No-data value of both images, in place of their own."),
+    click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image."),
+    click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image."),
+    click.option("--band", type=int, metavar="N", help="Band to match of both images, needed where they have several."),
+    click.option("--left-band", type=int, metavar="N", help="Band of the left image."),
+    click.option("--right-band", type=int, metavar="N", help="Band of the right image."),
+    click.option(
+        "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
+    ),
+)
+# What they give beside the window.
+_OF_IMAGES = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
+_OF_IMAGES += ("left_mask", "right_mask")
+_SETTINGS_OPTIONS = (
+    click.option(
+        "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
+    ),
+    preset_option,
+    cost_option,
+    click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
+    click.option("--overlap", type=int, help="Pixels read around a core."),
+    click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
+    click.option(
+        "--cluster",
+        metavar="SPEC",
+        help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
+    ),
+    store_option,
+)
+
+
 def image_options(command: Command) -> Command:
     """Options that say how the images of a pair are read; a command gets ``images``, which opens both of them.
 
@@ -59,51 +92,26 @@ def image_options(command: Command) -> Command:
     """
 
     @wraps(command)
-    def with_images(
-        *,
-        left_mask: str | None,
-        right_mask: str | None,
-        nodata: float | None,
-        left_nodata: float | None,
-        right_nodata: float | None,
-        band: int | None,
-        left_band: int | None,
-        right_band: int | None,
-        window: tuple[int, int, int, int] | None,
-        **others: Any,
-    ) -> Any:
+    def with_images(*, window: tuple[int, int, int, int] | None, **given: Any) -> Any:
         from sat_intervals.tiling import Window
 
+        of_images = {name: given.pop(name) for name in _OF_IMAGES}
+
         def images(left: str, right: str) -> "tuple[Image, Image]":
-            from sat_intervals.raster import open_image
+            return _opened(left, "left", of_images), _opened(right, "right", of_images)
 
-            return (
-                open_image(left, band=_either(left_band, band), nodata=_either(left_nodata, nodata), mask=left_mask),
-                open_image(
-                    right, band=_either(right_band, band), nodata=_either(right_nodata, nodata), mask=right_mask
-                ),
-            )
+        return command(images=images, window=Window(*window) if window else None, **given)
 
-        return command(images=images, window=Window(*window) if window else None, **others)
+    return _with(with_images, *_IMAGE_OPTIONS)
 
-    return _with(
-        with_images,
-        click.option(
-            "--left-mask", callback=named, metavar="FILE", help="Left pixels to leave out: non-zero = masked."
-        ),
-        click.option("--right-mask", callback=named, metavar="FILE", help="Right pixels to leave out."),
-        click.option("--nodata", type=float, metavar="V", help="No-data value of both images, in place of their own."),
-        click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image."),
-        click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image."),
-        click.option(
-            "--band", type=int, metavar="N", help="Band to match of both images, needed where they have several."
-        ),
-        click.option("--left-band", type=int, metavar="N", help="Band of the left image."),
-        click.option("--right-band", type=int, metavar="N", help="Band of the right image."),
-        click.option(
-            "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
-        ),
-    )
+
+def _opened(file: str, side: str, given: Mapping[str, Any]) -> "Image":
+    """The image of one side; an option of the side wins over that of both."""
+    from sat_intervals.raster import open_image
+
+    own = {name: given[f"{side}_{name}"] for name in ("band", "nodata")}
+    both = {name: given[name] if value is None else value for name, value in own.items()}
+    return open_image(file, **both, mask=given[f"{side}_mask"])
 
 
 def settings_options(command: Command) -> Command:
@@ -139,23 +147,7 @@ def settings_options(command: Command) -> Command:
         given: dict[str, Any] = {name: section for name, section in set_keys.items() if section}
         return command(given=given | ({"preset": preset} if preset else {}), **others)
 
-    return _with(
-        with_settings,
-        click.option(
-            "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
-        ),
-        preset_option,
-        cost_option,
-        click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
-        click.option("--overlap", type=int, help="Pixels read around a core."),
-        click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
-        click.option(
-            "--cluster",
-            metavar="SPEC",
-            help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
-        ),
-        store_option,
-    )
+    return _with(with_settings, *_SETTINGS_OPTIONS)
 
 
 def run_options(command: Command) -> Command:
@@ -197,7 +189,3 @@ def _with(command: Command, *options: Callable[[Command], Command]) -> Command:
     for option in reversed(options):
         command = option(command)
     return command
-
-
-def _either(first: Number | None, second: Number | None) -> Number | None:
-    return second if first is None else first

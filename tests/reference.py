@@ -574,6 +574,24 @@ def states(draw, shape):
     return state
 
 
+def scene_of(patches, *, window, minimum, count, states=None, p1=8, p2=32, regularized=True):
+    """Two padded patches with their states, by default valid, a window, a search range and penalties."""
+    left, right = patches
+    left_state, right_state = states or [np.zeros(patch.shape, np.uint8) for patch in patches]
+    return SimpleNamespace(
+        left=left,
+        right=right,
+        left_state=left_state,
+        right_state=right_state,
+        window=window,
+        minimum=minimum,
+        count=count,
+        p1=p1,
+        p2=p2,
+        regularized=regularized,
+    )
+
+
 @st.composite
 def scenes(draw, counts=(1, 2, 3, 5, 9, 16, 31, 32, 33), windows=(3, 3, 5, 7), rows=8, columns=20):
     """Two padded patches with their states, a window, a search range and penalties, as a namespace."""
@@ -581,13 +599,11 @@ def scenes(draw, counts=(1, 2, 3, 5, 9, 16, 31, 32, 33), windows=(3, 3, 5, 7), r
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     rows, columns = int(random.integers(1, rows + 1)), int(random.integers(1, columns + 1))
     style = draw(st.sampled_from(["shifted", "shifted", "noise", "flat"]))
-    left, right = patch_pair(random, rows, columns, count, window, style)
+    patches = patch_pair(random, rows, columns, count, window, style)
     p1 = draw(st.integers(0, 40))
-    return SimpleNamespace(
-        left=left,
-        right=right,
-        left_state=draw(states(left.shape)),
-        right_state=draw(states(right.shape)),
+    return scene_of(
+        patches,
+        states=[draw(states(patch.shape)) for patch in patches],
         window=window,
         minimum=draw(st.sampled_from([0, -count + 1, -200, 7])),
         count=count,

@@ -7,12 +7,11 @@ import pytest
 import rasterio
 import reference
 import reference_evaluation
-from click.testing import CliRunner
+from helpers import invoke, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals import match_arrays
-from sat_intervals.cli import main
 from sat_intervals.config import load_config
 from sat_intervals.config.pairs import Pair, find_pairs
 from sat_intervals.demo import make_scene
@@ -106,14 +105,7 @@ def scene():
 def folder(scene, tmp_path_factory):
     """The scene as a folder of a pair."""
     folder = tmp_path_factory.mktemp("pair")
-    for name, nodata in (("left", 0), ("right", 0), ("truth", np.nan)):
-        pixels = getattr(scene, name)
-        profile = {"driver": "GTiff", "height": pixels.shape[0], "width": pixels.shape[1], "count": 1}
-        transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
-        kind = {"dtype": pixels.dtype, "nodata": nodata, "transform": transform}
-        with rasterio.open(folder / f"{name}.tif", "w", **profile, **kind) as file:
-            file.write(pixels, 1)
-    (folder / "meta.json").write_text(json.dumps({"disparity": [scene.minimum, scene.maximum]}))
+    write_pair(folder, scene)
     return folder
 
 
@@ -173,11 +165,11 @@ def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
 
 def test_command__prints_json_and_a_table(folder):
     report = ablate_pair(*find_pairs([folder]))
-    result = CliRunner().invoke(main, ["ablate", str(folder), "--json"])
+    result = invoke("ablate", folder, "--json")
     assert result.exit_code == 0
     assert json.loads(result.stdout) == report
     assert result.stderr == f"matching {folder}\n"
-    label, scenes, _, *figures = CliRunner().invoke(main, ["ablate", str(folder)]).stdout.splitlines()[2].split()
+    label, scenes, _, *figures = invoke("ablate", folder).stdout.splitlines()[2].split()
     assert (label, scenes) == ("all", "1")
     assert figures == [f"{report[name]['accuracy']:.3f}" for name in METHODS]
 

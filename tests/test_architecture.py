@@ -40,6 +40,15 @@ HOMES = {
     "zarr": "store",
 }
 
+# Without docstrings; callbacks of click commands have a parameter an option.
+MOST_FUNCTION_LINES, MOST_MODULE_LINES, MOST_PARAMETERS = 45, 300, 8
+OVER_THE_LIMITS = {
+    "sat_intervals.interop.cars_method.run": "its parameters are those of CARS' method",
+    "sat_intervals.kernels.intervals._count": "state of a loop nest",
+    "sat_intervals.kernels.matching._sweep_up": "state of a loop nest",
+    "sat_intervals.kernels.sgm.advance_pixel": "four paths in one pass over the memory",
+}
+
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 FOLDERS = {"sat_intervals": ROOT / "sat_intervals"} | {
     package: ROOT / folder for package, folder in PYPROJECT["tool"]["setuptools"]["package-dir"].items()
@@ -89,3 +98,30 @@ def test_floors__a_room_imports_only_lower_floors() -> None:
 def test_homes__a_library_is_imported_in_its_home_only() -> None:
     libraries = {(room(module), name.partition(".")[0]) for module, name in imports()}
     assert sorted((a, library) for a, library in libraries if HOMES.get(library, a) != a) == []
+
+
+def test_limits__functions_parameters_and_modules_stay_small() -> None:
+    over = {}
+    for module, file in modules().items():
+        tree = ast.parse(text := file.read_text())
+        documented = {line for node in ast.walk(tree) for line in docstring_lines(node)}
+        if (lines := len(text.splitlines()) - len(documented)) > MOST_MODULE_LINES:
+            over[module] = f"{lines} lines"
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                lines = len(set(range(node.lineno, node.end_lineno + 1)) - documented)
+                given = node.args
+                parameters = [*given.posonlyargs, *given.args, given.vararg, *given.kwonlyargs, given.kwarg]
+                count = 0 if is_callback(node) else len([*filter(None, parameters)])
+                if lines > MOST_FUNCTION_LINES or count > MOST_PARAMETERS:
+                    over[f"{module}.{node.name}"] = f"{lines} lines, {count} parameters"
+    assert {name: over.get(name) for name in over.keys() ^ OVER_THE_LIMITS.keys()} == {}
+
+
+def docstring_lines(node: ast.AST) -> range:
+    has_one = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node)
+    return range(node.body[0].lineno, node.body[0].end_lineno + 1) if has_one else range(0)
+
+
+def is_callback(node: ast.FunctionDef) -> bool:
+    return any(ast.unparse(decorator).startswith("click.command(") for decorator in node.decorator_list)

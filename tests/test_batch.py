@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from click.testing import CliRunner
+from helpers import OUTPUTS, PLACE, hashes, invoke
 
-from sat_intervals.cli import main
 from sat_intervals.config import Cluster, ConfigError, load_config
+from sat_intervals.config.pairs import PairOfBatch, read_batch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import fitted, tile_bytes
-from sat_intervals.raster import north_up, write_layer
+from sat_intervals.raster import write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import batch
-from sat_intervals.run.batch import PairOfBatch, match_batch, read_batch
+from sat_intervals.run.batch import match_batch
 from sat_intervals.run.cluster import connected, parse_memory
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair, matched
@@ -40,7 +40,7 @@ def images(tmp_path_factory):
     for seed in (1, 2):
         scene = make_scene(150, 200, seed=seed)
         for side in ("left", "right"):
-            write_layer(folder / f"{side}{seed}.tif", getattr(scene, side), 0, north_up(32631, 0, 0, 0.5))
+            write_layer(folder / f"{side}{seed}.tif", getattr(scene, side), 0, PLACE)
     return folder
 
 
@@ -53,17 +53,13 @@ def rows(folder, *, broken=False):
     return folder / "pairs.csv"
 
 
-def bytes_of(folder):
-    return [(folder / name).read_bytes() for name in ("intervals.tif", "validity.tif")]
-
-
 def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
     report = match_batch(read_batch(rows(images)), tmp_path / "batch", {"tiles": {"size": 64}})
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "done", "pair2": "done"}
     for seed in (1, 2):
         settings = {"disparity": {"minimum": -18, "maximum": 40}, "sgm": {"p2": 24 + seed}, "tiles": {"size": 64}}
         match_pair(images / f"left{seed}.tif", images / f"right{seed}.tif", tmp_path / f"alone{seed}", settings)
-        assert bytes_of(tmp_path / "batch" / f"pair{seed}") == bytes_of(tmp_path / f"alone{seed}")
+        assert hashes(tmp_path / "batch" / f"pair{seed}") == hashes(tmp_path / f"alone{seed}")
         assert not (tmp_path / "batch" / f"pair{seed}" / "tiles").exists()
 
 
@@ -74,7 +70,7 @@ def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(i
     scratch.mkdir(parents=True)
     (scratch / "run.json").write_text("{}")
     match_batch(pairs, tmp_path, {"tiles": {"size": 64}})
-    assert sorted(file.name for file in (tmp_path / "pair1").iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+    assert sorted(file.name for file in (tmp_path / "pair1").iterdir()) == OUTPUTS
 
 
 def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path):
@@ -90,20 +86,20 @@ def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path):
 
 def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(images, tmp_path):
     arguments = ["batch", str(rows(images, broken=True)), str(tmp_path / "out"), "--tile-size", "64"]
-    first = CliRunner().invoke(main, arguments)
+    first = invoke(*arguments)
     assert first.exit_code == 1
     assert "1 of 3 pairs failed" in first.stderr
     assert "nowhere.tif" in first.stderr
-    told = CliRunner().invoke(main, ["status", str(tmp_path / "out")])
+    told = invoke("status", tmp_path / "out")
     assert told.stdout.startswith(f"{tmp_path / 'out' / 'broken'}: failed: {images / 'nowhere.tif'}")
     written = (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns
     rows(images)
-    second = CliRunner().invoke(main, arguments)
+    second = invoke(*arguments)
     assert second.exit_code == 0
     assert (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns == written
     report = json.loads((tmp_path / "out" / "batch.json").read_text())
     assert {end["state"] for end in report.values()} == {"done before"}
-    told = CliRunner().invoke(main, ["status", str(tmp_path / "out")])
+    told = invoke("status", tmp_path / "out")
     assert told.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
 
 
@@ -122,7 +118,7 @@ def test_match_batch__takes_no_result_of_another_image_for_that_of_a_pair(images
     pairs = read_batch(rows(tmp_path))
     match_batch(pairs, tmp_path / "out")
     scene = make_scene(150, 200, seed=3)
-    write_layer(tmp_path / "left1.tif", scene.left, 0, north_up(32631, 0, 0, 0.5))
+    write_layer(tmp_path / "left1.tif", scene.left, 0, PLACE)
     report = match_batch(pairs, tmp_path / "out")
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done before"}
     assert "inputs.left.sha256 was" in report["pair1"]["error"]
@@ -238,7 +234,7 @@ def test_match_batch__keeps_the_tiles_of_equal_pairs_apart_and_goes_on_where_tho
 def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, monkeypatch):
     pairs = read_batch(rows(images))
     match_batch(pairs, tmp_path)
-    before = bytes_of(tmp_path / "pair1")
+    before = hashes(tmp_path / "pair1")
 
     def fail(*arguments, **named):
         raise RunError("no more disk")
@@ -247,12 +243,12 @@ def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, 
         patch.setattr(batch, "assembled", fail)
         report = match_batch(pairs, tmp_path, {"median": None}, overwrite=True)
     assert {end["state"] for end in report.values()} == {"failed"}
-    assert bytes_of(tmp_path / "pair1") == before
-    told = CliRunner().invoke(main, ["status", str(tmp_path / "pair1")])
+    assert hashes(tmp_path / "pair1") == before
+    told = invoke("status", tmp_path / "pair1")
     assert "1 of 1 tiles done, 0 failed, 0 left; no run is at work" in told.stdout
     report = match_batch(pairs, tmp_path, {"median": None})
     assert {end["state"] for end in report.values()} == {"done"}
-    assert bytes_of(tmp_path / "pair1") != before
+    assert hashes(tmp_path / "pair1") != before
     assert not list(tmp_path.glob("*/tiles"))
 
 
@@ -260,7 +256,7 @@ def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, 
 def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, tmp_path, damage):
     pairs = read_batch(rows(images))
     match_batch(pairs, tmp_path, {"tiles": {"size": 64}}, keep_tiles=True)
-    tiles, before = tmp_path / "pair1" / "tiles", bytes_of(tmp_path / "pair1")
+    tiles, before = tmp_path / "pair1" / "tiles", hashes(tmp_path / "pair1")
     for name in ("pair1", "pair2"):
         (tmp_path / name / "run.json").unlink()
     if damage == "manifest":
@@ -282,7 +278,7 @@ def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, t
     else:  # one tile is matched again
         assert (tiles / "records" / "0_1.json").stat().st_mtime_ns == kept
     assert states == {"pair1": "done", "pair2": "done"}
-    assert bytes_of(tmp_path / "pair1") == before
+    assert hashes(tmp_path / "pair1") == before
 
 
 def test_match_batch__removes_tiles_that_a_death_left_beside_a_result_and_none_that_were_kept(images, tmp_path):
@@ -298,7 +294,7 @@ def test_match_batch__removes_tiles_that_a_death_left_beside_a_result_and_none_t
 def test_status__of_a_batch_goes_on_after_a_pair_without_a_run(images, tmp_path):
     match_batch(read_batch(rows(images)), tmp_path)
     shutil.rmtree(tmp_path / "pair1")
-    result = CliRunner().invoke(main, ["status", str(tmp_path)])
+    result = invoke("status", tmp_path)
     assert result.stdout == f"{tmp_path / 'pair1'}: done\n{tmp_path / 'pair2'}: complete\n"
 
 
@@ -325,7 +321,7 @@ def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(ima
     ("name", "text", "problem"),
     [
         ("a.csv", "name,left\nx,l.tif\n", "row 1 lacks right"),
-        ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "2 pairs are called x"),
+        ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "a.csv: 2 pairs or runs are called x"),
         ("a.csv", "name,left,right\nx,l,r,1\n", "more values than columns"),
         ("a.csv", "name,left,right\n../x,l,r\n", "row 1: name '../x' cannot be that of the pair's folder"),
         ("a.csv", "name,left,right\nx,l,r\nlogs,l,r\n", "row 2: name 'logs' cannot be"),
@@ -408,11 +404,11 @@ def test_plan__keeps_out_of_the_store_of_the_run(images, tmp_path):
 
 def test_plan__prints_what_a_run_will_take(images):
     pair = [str(images / "left1.tif"), str(images / "right1.tif"), "--disparity", "-18", "40"]
-    result = CliRunner().invoke(main, ["plan", *pair, "--memory", "400MB", "--workers", "3"])
+    result = invoke("plan", *pair, "--memory", "400MB", "--workers", "3")
     assert result.exit_code == 0, result.stderr
     assert "expected time, 3 tiles at once" in result.stdout
     assert "smaller than set, to fit" in result.stdout
-    refused = CliRunner().invoke(main, ["plan", *pair, "--memory", "100MB"])
+    refused = invoke("plan", *pair, "--memory", "100MB")
     assert refused.exit_code == 2
     assert "given are 100 MB" in refused.stderr
 
@@ -425,7 +421,7 @@ def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(
     settings = tmp_path / "settings.yaml"
     settings.write_text(yaml.safe_dump({"disparity": {"minimum": -18, "maximum": 40}, "cluster": cluster}))
     arguments = ["plan", str(bands), str(images / "right1.tif"), "--config", str(settings), "--band", "1"]
-    result = CliRunner().invoke(main, [*arguments, "--window", "20", "0", "100", "200", "--tile-size", "512"])
+    result = invoke(*arguments, "--window", "20", "0", "100", "200", "--tile-size", "512")
     assert result.exit_code == 0, result.stderr
     assert "24 tiles at once" in result.stdout
     assert "with 3 tiles at once" in result.stdout
@@ -437,12 +433,12 @@ def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_w
     for side in ("left", "right"):
         image = getattr(scene, side).copy()
         image[90:610, 90:610] = 0
-        write_layer(tmp_path / f"{side}.tif", image, 0, north_up(32631, 0, 0, 0.5))
+        write_layer(tmp_path / f"{side}.tif", image, 0, PLACE)
     config = {"disparity": {"minimum": -18, "maximum": 40}}
     assert plan(tmp_path / "left.tif", tmp_path / "right.tif", config, workers=1).seconds > 0
     huge = {"disparity": {"minimum": -6000, "maximum": 6000}, "tiles": {"size": 4096}}
     wide = np.ones((4096, 13000), np.uint8)
-    write_layer(tmp_path / "wide.tif", wide, 0, north_up(32631, 0, 0, 0.5))
+    write_layer(tmp_path / "wide.tif", wide, 0, PLACE)
     with pytest.raises(SatIntervalsError, match="GB, this process may use"):
         plan(tmp_path / "wide.tif", tmp_path / "wide.tif", huge)
 
@@ -450,13 +446,13 @@ def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_w
 def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     out = tmp_path / "out"
     settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
-    assert CliRunner().invoke(main, ["status", str(out)]).exit_code == 2
+    assert invoke("status", out).exit_code == 2
     match_pair(images / "left1.tif", images / "right1.tif", out, settings, keep_tiles=True)
-    assert CliRunner().invoke(main, ["status", str(out)]).stdout == f"{out}: complete\n"
+    assert invoke("status", out).stdout == f"{out}: complete\n"
     (out / "run.json").unlink()
     (out / "tiles" / "records" / "0_1.json").unlink()
     (out / "tiles" / "records" / "1_1.json").unlink()
     Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
-    result = CliRunner().invoke(main, ["status", str(out)])
+    result = invoke("status", out)
     assert "10 of 12 tiles done, 1 failed, 1 left; no run is at work" in result.stdout
     assert "tile 0_1: no more disk" in result.stdout

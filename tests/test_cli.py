@@ -8,8 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import sysconfig
-import time
 import warnings
 from pathlib import Path
 
@@ -19,7 +17,7 @@ import pytest
 import rasterio
 import xarray as xr
 import yaml
-from click.testing import CliRunner
+from helpers import COMMAND, OUTPUTS, PATIENCE, hashes, invoke, wait_until
 from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
@@ -30,11 +28,8 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
 from sat_intervals.products import BANDS, FLAGS, INVALID
 
-COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
-OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
 HALF_METRE = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
 NOWHERE = {"crs": None, "transform": None}
-PATIENCE = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +95,6 @@ def matching(folder, out, *options, left="left.tif", right="right.tif", config="
     return ["match", folder / left, folder / right, out, "--config", folder / config, *options]
 
 
-def invoke(*arguments):
-    """The command in this process."""
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
 def assert_refused(result, *parts, status=2):
     """One line that says all of this, the status of a user's mistake."""
     assert result.exit_code == status, result.output
@@ -115,10 +105,6 @@ def assert_refused(result, *parts, status=2):
 
 def assert_nothing_final(out):
     assert not out.is_dir() or not {path.name for path in out.iterdir()} & set(OUTPUTS)
-
-
-def bytes_of(out):
-    return [(out / name).read_bytes() for name in ("intervals.tif", "validity.tif")]
 
 
 @pytest.fixture(scope="module")
@@ -253,10 +239,10 @@ def test_match__refuses_an_output_that_cannot_be_written(folder, place, says):
 
 def test_match__refuses_a_folder_that_holds_a_run(folder, done):
     out, _ = done
-    before = bytes_of(out)
+    before = hashes(out)
     result = invoke(*matching(folder, out))
     assert_refused(result, f"{out} already holds a run (intervals.tif, validity.tif, run.json): choose another", "--ov")
-    assert bytes_of(out) == before
+    assert hashes(out) == before
 
 
 def test_match__refuses_tiles_of_which_it_cannot_tell_the_run(folder, tmp_path):
@@ -471,11 +457,8 @@ def ended_by(number, arguments, out, *, together=False):
 
 
 def wait_for_a_tile(process, out):
-    end = time.monotonic() + PATIENCE
-    while not list(out.glob("tiles/records/[0-9]*.json")):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end, "no tile is done"
-        time.sleep(0.001)
+    wait_until(lambda: list(out.glob("tiles/records/[0-9]*.json")) or process.poll() is not None, "a tile")
+    assert process.poll() is None, process.communicate()
 
 
 @pytest.mark.parametrize(
@@ -494,7 +477,7 @@ def test_match__ended_by_a_signal_leaves_tiles_and_the_next_try_goes_on(folder, 
     again = command(*arguments, "--keep-tiles", "--quiet")
     assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert bytes_of(out) == bytes_of(done[0])
+    assert hashes(out) == hashes(done[0])
 
 
 def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, tmp_path):
@@ -551,7 +534,7 @@ def test_match__on_a_disk_that_the_files_fill_fails_and_goes_on_once_there_is_ro
     ballast.unlink()
     again = command(*arguments)
     assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
-    assert bytes_of(out) == bytes_of(done[0])
+    assert hashes(out) == hashes(done[0])
 
 
 # ---- What a run prints ------------------------------------------------------------------------------------------
@@ -694,7 +677,7 @@ def test_match__takes_the_band_asked_for_of_each_image(folder, tmp_path, scene, 
     arguments = matching(folder, tmp_path / "out", left=tmp_path / "left.tif", right="bands.tif")
     result = invoke(*arguments, "--band", 2, "--tile-size", 64, "--overlap", 20)
     assert result.exit_code == 0, result.output
-    assert bytes_of(tmp_path / "out") == bytes_of(done[0])
+    assert hashes(tmp_path / "out") == hashes(done[0])
 
 
 def test_match__leaves_out_what_is_masked(folder, tmp_path):
@@ -778,8 +761,7 @@ def test_match__takes_a_preset_and_what_is_given_beside_it(folder, tmp_path):
     config = {name: settings[name] for name in ("disparity", "cost", "sgm", "tiles")}
     (tmp_path / "spelt.yaml").write_text(json.dumps(config))
     command(*matching(folder, tmp_path / "spelt", "--window", 60, 80, 70, 90, config=tmp_path / "spelt.yaml"))
-    for name in ("intervals.tif", "validity.tif"):
-        assert (tmp_path / "spelt" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert hashes(tmp_path / "spelt") == hashes(tmp_path / "out")
     assert options.PRESETS == PRESETS
 
 
@@ -810,10 +792,10 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     assert int(found[2]) == judged.sum()
     assert float(found[1]) == pytest.approx(100 * holds[judged].mean(), abs=0.051)
     assert float(found[1]) > 80
-    before = bytes_of(out)
+    before = hashes(out)
     assert_refused(invoke(*arguments), f"{out} already holds a run", "--overwrite")
     assert invoke(*arguments, "--overwrite", "--quiet").stdout == ""
-    assert bytes_of(out) == before
+    assert hashes(out) == before
 
 
 def test_demo__goes_on_where_it_was_interrupted(tmp_path):

@@ -5,13 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import reference
+from helpers import matched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sat_intervals.config import Ambiguity
 from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
-from sat_intervals.kernels.cost import Codes, between, census
+from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.matching import Settings, match
 from sat_intervals.match.postprocess import confidence_scale
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA, NO_DISPARITY
@@ -22,14 +23,6 @@ few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 N = np.nan
 X = IMPOSSIBLE_COST
-
-
-def matched(scene, **options):
-    """Raw products of a scene."""
-    left = census(scene.left, scene.left_state, scene.window)
-    right = census(scene.right, scene.right_state, scene.window)
-    parameters = Settings(**reference.settings_of(scene, **options))
-    return match(between(left, right), parameters, Window(0, 0, *left.state.shape))[0]
 
 
 # ---- Ambiguity ---------------------------------------------------------------------------------------------
@@ -54,7 +47,7 @@ def test_match__ambiguity_worked_example():
 @bounded
 @given(scene=reference.scenes())
 def test_match__ambiguity_equals_reference(etas, scene):
-    raw = matched(scene, eta_max=etas[0], eta_step=etas[1])
+    raw = matched(scene, eta_max=etas[0], eta_step=etas[1])[0]
     expected = reference.ambiguity(reference.volume_of(scene), *etas, reference.span_of(scene))
     np.testing.assert_array_equal(raw.ambiguity, expected)
     assert raw.ambiguity.dtype == np.uint32
@@ -66,14 +59,14 @@ def test_match__ambiguity_equals_reference(etas, scene):
 def test_match__ambiguity_equals_reference_at_every_count(count, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=6))
     expected = reference.ambiguity(reference.volume_of(scene), "0.7", "0.01", reference.span_of(scene))
-    np.testing.assert_array_equal(matched(scene).ambiguity, expected)
+    np.testing.assert_array_equal(matched(scene)[0].ambiguity, expected)
 
 
 @few
 @given(scene=reference.scenes())
 def test_match__ambiguity_is_bounded(scene):
     # At least the winner counts for each of the 70 etas, at most the whole range does.
-    raw = matched(scene)
+    raw = matched(scene)[0]
     found = raw.winner != NO_DISPARITY
     assert (raw.ambiguity[~found] == 0).all()
     assert (raw.ambiguity[found] >= 70).all()
@@ -83,7 +76,7 @@ def test_match__ambiguity_is_bounded(scene):
 @few
 @given(scene=reference.scenes())
 def test_match__without_ambiguity(scene):
-    raw, whole = matched(scene, eta_max=None), matched(scene)
+    (raw, _), (whole, _) = matched(scene, eta_max=None), matched(scene)
     assert (raw.ambiguity == 0).all()
     for name in ("winner", "lower", "upper", "disparity", "validity"):
         np.testing.assert_array_equal(getattr(raw, name), getattr(whole, name))

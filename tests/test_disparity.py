@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import reference
+from helpers import codes_of, matched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sat_intervals.kernels.cost import Codes, between, census
+from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.matching import Settings, cost_volume, match
 from sat_intervals.products import (
@@ -33,20 +34,6 @@ few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 N = NO_DISPARITY
 X = IMPOSSIBLE_COST
-
-
-def codes_of(scene):
-    return (
-        census(scene.left, scene.left_state, scene.window),
-        census(scene.right, scene.right_state, scene.window),
-    )
-
-
-def matched(scene, output=None, core=None, **options):
-    """Raw products and right view of a scene, of the whole patch by default."""
-    left, right = codes_of(scene)
-    output = output or Window(0, 0, *left.state.shape)
-    return match(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
 
 
 def bare(left_levels, right_levels, minimum=0, **options):

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import rasterio
 import reference_evaluation
-from click.testing import CliRunner
+from helpers import invoke, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals import match_pair
-from sat_intervals.cli import main
 from sat_intervals.config.pairs import find_pairs, group_beside
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
@@ -175,20 +174,16 @@ def write(path, pixels, nodata):
         file.write(pixels, 1)
 
 
-def write_pair(folder, seed, group="synthetic"):
+def small_pair(folder, seed, group="synthetic"):
     """A folder of a pair of 70 x 90 pixels, as `find_pairs` takes it."""
     folder.mkdir()
-    scene = make_scene(70, 90, seed=seed)
-    for name, pixels, nodata in (("left", scene.left, 0), ("right", scene.right, 0), ("truth", scene.truth, NAN)):
-        write(folder / f"{name}.tif", pixels, nodata)
-    meta = {"disparity": [scene.minimum, scene.maximum], "group": group}
-    (folder / "meta.json").write_text(json.dumps(meta))
+    write_pair(folder, make_scene(70, 90, seed=seed), group=group)
     return folder
 
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
-    return write_pair(tmp_path_factory.mktemp("pair") / "one", 1)
+    return small_pair(tmp_path_factory.mktemp("pair") / "one", 1)
 
 
 def settings_of(folder, **more):
@@ -325,10 +320,10 @@ def test_find_pairs__says_what_is_wrong_with_a_folder(tmp_path, meta, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("left,right,minimum,maximum\n", "no column truth; needed: left, right, truth, minimum, maximum, known: name"),
-        ("left,right,truth,minimum,maximum\n", "pairs.csv has a header but no rows: give a row a pair"),
+        ("left,right,minimum,maximum\na,b,1,2\n", "row 1 lacks truth: needed is a row a pair, with left, right, truth"),
+        ("left,right,truth,minimum,maximum\n", "pairs.csv holds no pairs: needed is a row a pair, with left, right"),
         ("left,right,truth,minimum,maximum,name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
-        ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "line 2: minimum '1', maximum 'x', needed: integers"),
+        ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "row 1: minimum '1', maximum 'x', needed: integers"),
         (
             "left,right,truth,minimum,maximum\na,b,c,1,2\na,d,e,3,4\n",
             "2 pairs or runs are called a: give each its own name",
@@ -356,7 +351,7 @@ def test_find_pairs__of_a_table(tmp_path):
 
 # ---- The command -------------------------------------------------------------------------------------------
 def command(*arguments):
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    result = invoke(*arguments)
     return result.exit_code, result.stdout, result.stderr
 
 
@@ -394,7 +389,7 @@ def test_command__prints_one_run(run, pair):
 
 
 def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
-    other = write_pair(tmp_path / "two", 2)
+    other = small_pair(tmp_path / "two", 2)
     rows = [(pair, "one"), (other, "two")]
     (tmp_path / "pairs.csv").write_text(
         "left,right,truth,minimum,maximum,name,group\n"
@@ -446,7 +441,10 @@ def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
         (["PAIR", "PAIR"], "2 pairs or runs are called .*/one: give each its own name"),
         (["PAIR", "--config", "OFF"], "off.yaml: interval is null, but intervals are to be judged: leave it on"),
         (["PAIR", "--config", "nope.yaml"], "nope.yaml"),
-        (["nothere.csv"], "nothere.csv cannot be read: No such file or directory: give a CSV file of pairs$"),
+        (
+            ["nothere.csv"],
+            "nothere.csv cannot be read: No such file or directory: needed is a row a pair",
+        ),
     ],
 )
 def test_command__refuses_before_it_matches(run, pair, tmp_path, arguments, says):

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from click.testing import CliRunner
 from finished import random_bands, without_intervals, write_run
+from helpers import invoke
 from numpy.testing import assert_array_equal
 
-from sat_intervals.cli import main
 from sat_intervals.products import INVALID
 
 # Epipolar images have no georeferencing.
@@ -28,7 +27,7 @@ def run(tmp_path_factory):
 
 
 def exported(out, form, target):
-    result = CliRunner().invoke(main, ["export", str(out), str(target), "--to", form])
+    result = invoke("export", out, target, "--to", form)
     assert result.exit_code == 0, result.output
     return result.output.splitlines()
 
@@ -64,7 +63,7 @@ def test_export__has_no_file_for_what_a_run_has_not(tmp_path):
 
 
 def test_export__asp_needs_a_prefix(run, tmp_path):
-    result = CliRunner().invoke(main, ["export", str(run[0]), str(tmp_path), "--to", "asp"])
+    result = invoke("export", run[0], tmp_path, "--to", "asp")
     assert result.exit_code == 2
     assert f"is a folder: give a prefix for ASP's file, such as {tmp_path / 'run'}" in result.stderr
 
@@ -120,7 +119,7 @@ def test_export__refuses_what_is_no_run_and_what_it_does_not_know(run, tmp_path)
         ([str(tmp_path), "to", "--to", "cars"], "give the folder of a finished run"),
         ([str(run[0]), str(tmp_path), "--to", "micmac"], "'micmac' is not one of"),
     ):
-        result = CliRunner().invoke(main, ["export", *words])
+        result = invoke("export", *words)
         assert result.exit_code == 2
         assert message in result.stderr
         assert result.stderr.count("\n") == 1

@@ -7,11 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import reference
+from helpers import matched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals.config import load_config
-from sat_intervals.kernels.cost import Codes, between, census
+from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Settings, match
 from sat_intervals.match.in_memory import match_arrays
@@ -28,14 +29,6 @@ COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 ALPHAS = ("0.9", "0.5", "0.98", "1", "0.01", "0.005")
 N = NO_DISPARITY
 X = IMPOSSIBLE_COST
-
-
-def matched(scene, **options):
-    """Raw products of a scene."""
-    left = census(scene.left, scene.left_state, scene.window)
-    right = census(scene.right, scene.right_state, scene.window)
-    parameters = Settings(**reference.settings_of(scene, **options))
-    return match(between(left, right), parameters, Window(0, 0, *left.state.shape))[0]
 
 
 def of_curves(curves, minimum, **options):
@@ -98,7 +91,7 @@ def test_cut_level__says_the_same_as_possibility(alpha, cost_span):
 @bounded
 @given(scene=reference.scenes(), alpha=st.sampled_from(ALPHAS))
 def test_match__interval_equals_reference(refine, scene, alpha):
-    raw = matched(scene, alpha=alpha, refine=refine)
+    raw = matched(scene, alpha=alpha, refine=refine)[0]
     bounds = reference.alpha_cut(reference.volume_of(scene), alpha, reference.span_of(scene), refine)
     for bound, expected in zip((raw.lower, raw.upper), bounds, strict=True):
         np.testing.assert_array_equal(bound, reference.absolute(expected, scene.minimum))
@@ -110,7 +103,7 @@ def test_match__interval_equals_reference(refine, scene, alpha):
 def test_match__interval_equals_reference_at_every_count(count, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=6))
     alpha = data.draw(st.sampled_from(ALPHAS))
-    raw = matched(scene, alpha=alpha)
+    raw = matched(scene, alpha=alpha)[0]
     bounds = reference.alpha_cut(reference.volume_of(scene), alpha, reference.span_of(scene), True)
     for bound, expected in zip((raw.lower, raw.upper), bounds, strict=True):
         np.testing.assert_array_equal(bound, reference.absolute(expected, scene.minimum))
@@ -120,7 +113,7 @@ def test_match__interval_equals_reference_at_every_count(count, data):
 @given(scene=reference.scenes(), refine=st.booleans())
 def test_match__a_smaller_alpha_never_narrows(scene, refine):
     alphas = ["0.99", "0.95", "0.9", "0.7", "0.4", "0.1"]
-    raws = [matched(scene, alpha=alpha, refine=refine) for alpha in alphas]
+    raws = [matched(scene, alpha=alpha, refine=refine)[0] for alpha in alphas]
     for narrow, wide in pairwise(raws):
         # The extension belongs to the least cost, which does not move.
         assert (wide.lower <= narrow.lower).all()
@@ -130,7 +123,7 @@ def test_match__a_smaller_alpha_never_narrows(scene, refine):
 @few
 @given(scene=reference.scenes(), refine=st.booleans(), alpha=st.sampled_from(ALPHAS))
 def test_match__interval_holds_the_disparity(scene, refine, alpha):
-    raw = matched(scene, refine=refine, alpha=alpha)
+    raw = matched(scene, refine=refine, alpha=alpha)[0]
     found = raw.winner != N
     assert (raw.lower[found] <= raw.disparity[found]).all()
     assert (raw.disparity[found] <= raw.upper[found]).all()
@@ -143,7 +136,7 @@ def test_match__interval_holds_the_disparity(scene, refine, alpha):
 @few
 @given(scene=reference.scenes())
 def test_match__without_interval(scene):
-    raw, whole = matched(scene, alpha=None), matched(scene)
+    (raw, _), (whole, _) = matched(scene, alpha=None), matched(scene)
     assert (raw.lower == N).all()
     assert (raw.upper == N).all()
     for name in ("winner", "disparity", "cost", "ambiguity", "validity"):

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import subprocess
-import sysconfig
 import threading
 import zipfile
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -13,11 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-import yaml
-from click.testing import CliRunner
 from finished import random_bands, write_run
+from helpers import COMMAND, PLACE, hashes, invoke, write_pair
 
-from sat_intervals.cli import main
+from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.interop.export import export
@@ -26,7 +24,6 @@ from sat_intervals.raster import (
     Georeferencing,
     OutputError,
     OutputWriter,
-    north_up,
     open_image,
     other_files,
     put_back,
@@ -35,7 +32,7 @@ from sat_intervals.raster import (
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.results import Run, open_results
 from sat_intervals.run import assemble
-from sat_intervals.run.batch import PairOfBatch, match_batch
+from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.tile import match_tile
@@ -45,8 +42,6 @@ from sat_intervals.store.folder import LocalFolder
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
-COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
-PLACE = north_up(32631, 0, 0, 0.5)
 LOCK = ".sat-intervals.lock"
 VRT = """<VRTDataset rasterXSize="180" rasterYSize="150"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
 <SourceFilename relativeToVRT="1">mask.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
@@ -56,20 +51,17 @@ VRT = """<VRTDataset rasterXSize="180" rasterYSize="150"><VRTRasterBand dataType
 def pair(tmp_path):
     """A folder with left.tif, right.tif, mask.tif, mask.vrt of it, and other.tif; and settings of six tiles."""
     scene = make_scene(150, 180, seed=2)
-    for name in ("left", "right"):
-        write_layer(tmp_path / f"{name}.tif", getattr(scene, name), 0, PLACE)
     write_layer(tmp_path / "other.tif", scene.right[::-1].copy(), 0, PLACE)
     write_layer(tmp_path / "mask.tif", np.zeros(scene.left.shape, np.uint8), 0, PLACE)
     (tmp_path / "mask.vrt").write_text(VRT)
-    cluster = {"workers": 1, "retries": 0}
-    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64, "overlap": 20}, "cluster": cluster}
-    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings))
-    return tmp_path, settings
+    tiles, cluster = {"size": 64, "overlap": 20}, {"workers": 1, "retries": 0}
+    disparity = {"minimum": -18, "maximum": 40}
+    return tmp_path, write_pair(tmp_path, scene, disparity=disparity, tiles=tiles, cluster=cluster)
 
 
 def refused(arguments, *parts):
     """Run a command that must end with status 2, and one line."""
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    result = invoke(*arguments)
     assert result.exit_code == 2, result.output
     assert result.stderr.count("\n") == 1
     for part in parts:
@@ -129,8 +121,7 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     images = open_image(folder / "left.tif", mask=mask), open_image(right)
     match_pair(*images, folder / "out", settings)
     match_pair(*images, folder / "once", settings)
-    for file in ("intervals.tif", "validity.tif"):
-        assert (folder / "out" / file).read_bytes() == (folder / "once" / file).read_bytes()
+    assert hashes(folder / "out") == hashes(folder / "once")
 
 
 @pytest.mark.parametrize("kind", ["/vsizip/{}", "/vsizip/{{{}}}"])
@@ -510,7 +501,7 @@ def test_commands__follow_no_note_of_a_received_folder(pair, elsewhere, kind):
     says = f"are said to lie in {noted}", f"give --store {noted.rpartition('/')[0]}"
     refused(command, *says)
     refused(["status", out], *says)
-    result = CliRunner().invoke(main, [*map(str, command), "--overwrite"])
+    result = invoke(*command, "--overwrite")
     assert (result.exit_code, result.stderr.count("\n")) == (0, 1)
     assert f"are said to lie in {noted}: they stay there" in result.stderr
     (out / "tiles").mkdir()
@@ -520,7 +511,7 @@ def test_commands__follow_no_note_of_a_received_folder(pair, elsewhere, kind):
     (out / "run.json").unlink()
     report = match_batch([PairOfBatch("out", *map(str, images))], folder / "batch", settings)
     assert says[0] in report["out"]["error"]
-    assert CliRunner().invoke(main, ["status", str(folder / "batch")]).exit_code == 0
+    assert invoke("status", folder / "batch").exit_code == 0
     assert contents(precious) == before
     assert asked == []
 
@@ -542,7 +533,7 @@ def test_status__looks_into_the_store_that_is_named(pair):
     job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     job.begin()
     refused(["status", folder / "out"], f"said to lie in {job.store.elsewhere}", f"give --store {folder / 'store'}")
-    result = CliRunner().invoke(main, ["status", str(folder / "out"), "--store", str(folder / "store")])
+    result = invoke("status", folder / "out", "--store", folder / "store")
     assert (result.exit_code, "0 of 9 tiles done" in result.output) == (0, True), result.output
 
 
@@ -556,15 +547,15 @@ def fail(*arguments, **options):
 def test_demo__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(tmp_path, monkeypatch):
     out = tmp_path / "out"
     command = ["demo", str(out), "--size", "120", "140", "--quiet"]
-    assert CliRunner().invoke(main, command).exit_code == 0
+    assert invoke(*command).exit_code == 0
     names = ["left.tif", "right.tif", "truth.tif", "intervals.tif", "validity.tif", "run.json"]
     before = {name: (out / name).read_bytes() for name in names}
     with monkeypatch.context() as patch:
         patch.setattr(assemble, "postprocess_strips", fail)
-        assert CliRunner().invoke(main, [*command, "--seed", "1", "--overwrite"]).exit_code == 1
+        assert invoke(*command, "--seed", "1", "--overwrite").exit_code == 1
     assert {name: (out / name).read_bytes() for name in names} == before
     assert sorted(path.name for path in out.iterdir()) == sorted([*names, "tiles"])
-    assert CliRunner().invoke(main, [*command, "--seed", "1"]).exit_code == 0
+    assert invoke(*command, "--seed", "1").exit_code == 0
     assert sorted(path.name for path in out.iterdir()) == sorted(names)
     assert (out / "left.tif").read_bytes() != before["left.tif"]
     assert (
@@ -580,8 +571,8 @@ def test_demo__replaces_links_and_does_not_follow_them(tmp_path):
     (tmp_path / "out" / "left.tif").symlink_to(precious)
     (tmp_path / "out" / "right.tif").hardlink_to(precious)
     command = ["demo", str(tmp_path / "out"), "--size", "120", "140", "--quiet"]
-    assert CliRunner().invoke(main, command).exit_code == 2
-    assert CliRunner().invoke(main, [*command, "--overwrite"]).exit_code == 0
+    assert invoke(*command).exit_code == 2
+    assert invoke(*command, "--overwrite").exit_code == 0
     assert precious.read_text() == "mine"
 
 

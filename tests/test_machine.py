@@ -5,17 +5,16 @@ import re
 import resource
 import subprocess
 import sys
-import sysconfig
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import COMMAND
 
 from sat_intervals import machine
 from sat_intervals.raster import north_up, write_layer
 
-COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 GB = 10**9
 PHYSICAL = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 NO_LIMIT = 9223372036854771712  # what version 1 says of none

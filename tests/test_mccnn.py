@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import rasterio
 import reference
-from click.testing import CliRunner
+from helpers import bands, hashes, invoke, shares_that_differ, write_pair
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
-from sat_intervals.cli import main
+from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.in_memory import _view
@@ -22,9 +22,8 @@ from sat_intervals.match.mccnn import Network, load_network, weights_file
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
-from sat_intervals.raster import north_up, write_layer
 from sat_intervals.results import open_results
-from sat_intervals.run.batch import PairOfBatch, match_batch
+from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_tile
 from sat_intervals.show.cost_curve import read_curve
@@ -250,11 +249,6 @@ def write(path, image, nodata=0):
     return path
 
 
-def bands(out):
-    with rasterio.open(out / "intervals.tif") as file, rasterio.open(out / "validity.tif") as flags:
-        return file.read(), flags.read(1)
-
-
 @pytest.mark.parametrize("method", ["fast", "accurate"])
 def test_match_pair__equals_match_arrays_and_keeps_what_decides(tmp_path, network_file, method):
     left, right = (np.ma.masked_array(image.data.astype("uint16"), image.mask) for image in masked_images(70, 90))
@@ -281,8 +275,7 @@ def test_match_pair__processes_and_threads_make_the_same_bytes_and_pages(tmp_pat
     for kind in ("threads", "processes"):
         config = settings(-4, 6, tiles={"size": 64, "overlap": 20}, cluster={"kind": kind, "workers": 2})
         match_pair(*images, tmp_path / kind, config)
-    for name in ("intervals.tif", "validity.tif"):
-        assert (tmp_path / "threads" / name).read_bytes() == (tmp_path / "processes" / name).read_bytes()
+    assert hashes(tmp_path / "threads") == hashes(tmp_path / "processes")
     told = invoke("report", tmp_path / "processes")
     assert told.exit_code == 0, told.output
     assert "mccnn" in (tmp_path / "processes" / "report.html").read_text()
@@ -317,10 +310,6 @@ def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, ne
         match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
 
 
-def invoke(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
 def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
     left, right = masked_images(60, 80)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
@@ -344,12 +333,7 @@ def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
 
 
 def test_evaluate__compares_both_costs_in_one_table(tmp_path):
-    scene = make_scene(120, 160)
-    for name, layer in (("left", scene.left), ("right", scene.right), ("truth", scene.truth)):
-        nodata = np.nan if name == "truth" else 0
-        write_layer(tmp_path / f"{name}.tif", layer, nodata, north_up(32631, 0, 0, 0.5))
-    meta = {"disparity": [scene.minimum, scene.maximum], "group": "city"}
-    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    write_pair(tmp_path, make_scene(120, 160), group="city")
     result = invoke("evaluate", "--cost", "census", "--cost", "mccnn", tmp_path)
     assert result.exit_code == 0, result.output
     assert [line.split()[:3] for line in result.stdout.splitlines()[2:4]] == [
@@ -425,8 +409,6 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
     for name, size in (("whole", 1216), ("tiles", 256)):
         match_pair(left, right, tmp_path / name, settings(-13, 33, tiles={"size": size, "overlap": 100}))
-    (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
-    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
-    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
-    assert differs[0].sum() / judged.sum() <= 0.003
-    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.006
+    disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.003
+    assert interval <= 0.006

@@ -4,23 +4,20 @@ import logging
 import os
 import resource
 import subprocess
-import sysconfig
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-from click.testing import CliRunner
+from helpers import COMMAND, invoke
 
 from sat_intervals import SatIntervalsError, match_arrays, open_image
-from sat_intervals.cli import app, main
+from sat_intervals.cli import app
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import Projection, read_window
 from sat_intervals.tiling import Window
 
-COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 LOCAL = 'LOCAL_CS["site grid",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
 
 
@@ -58,7 +55,7 @@ def test_main__names_a_limit_of_the_address_space():
 @pytest.mark.parametrize("threads", ["0", "many"])
 def test_main__names_a_variable_that_numba_cannot_start_with(threads, monkeypatch):
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
-    result = CliRunner().invoke(main, ["match", "a", "b", "c", "--disparity", "0", "4"])
+    result = invoke("match", "a", "b", "c", "--disparity", "0", "4")
     assert result.exit_code == 2
     assert f"NUMBA_NUM_THREADS is {threads!r}: set it to a number above 0, or not at all" in result.stderr
 

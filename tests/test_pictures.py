@@ -11,8 +11,8 @@ from operator import getitem
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from finished import FINISHED, PLACE, no_bands, random_bands, without_intervals, write_run
+from helpers import invoke, write_pair
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -20,7 +20,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sat_intervals import match_pair
-from sat_intervals.cli import main
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
@@ -44,10 +43,7 @@ def run(tmp_path_factory):
 
 
 def matched(folder, settings, window=None):
-    scene = make_scene(130, 170, seed=2)
-    for name, layer, nodata in (("left", scene.left, 0), ("right", scene.right, 0), ("truth", scene.truth, np.nan)):
-        write_layer(folder / f"{name}.tif", layer, nodata, PLACE)
-    settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}} | settings
+    settings = write_pair(folder, make_scene(130, 170, seed=2), **settings)
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, window=window)
     return folder / "out"
 
@@ -68,7 +64,7 @@ def share_of(picture, colour):
 
 def test_plot__makes_every_picture_and_names_it(run):
     arguments = ["plot", str(run), "--row", "60", "--columns", "20", "150", "--pixel", "60", "90", "--dpi", "50"]
-    done = CliRunner().invoke(main, arguments)
+    done = invoke(*arguments)
     assert done.exit_code == 0, done.output
     names = ["overview.png", "errors.png", "profile.png", "curve.png"]
     assert done.output.split() == [str(run / name) for name in names]
@@ -81,7 +77,7 @@ def test_plot__makes_every_picture_and_names_it(run):
 
 def test_plot__without_truth_or_options_makes_the_overview_alone(tmp_path):
     out = write_run(tmp_path, *random_bands(40, 50)[:2])
-    done = CliRunner().invoke(main, ["plot", str(out)])
+    done = invoke("plot", out)
     assert done.exit_code == 0, done.output
     assert sorted(path.name for path in out.glob("*.png")) == ["overview.png"]
 
@@ -99,7 +95,7 @@ def test_plot__without_truth_or_options_makes_the_overview_alone(tmp_path):
 )
 def test_plot__says_in_one_line_what_is_wrong(tmp_path, arguments, message):
     out = write_run(tmp_path, *random_bands(40, 50)[:2])
-    done = CliRunner().invoke(main, ["plot", str(out), *arguments])
+    done = invoke("plot", out, *arguments)
     assert done.exit_code == 2
     assert re.fullmatch(f"sat-intervals: .*{message}.*\n", done.output)
     assert list(out.glob("*.png")) == []  # nothing is drawn before
@@ -110,7 +106,7 @@ def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("sat_intervals.show")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    done = CliRunner().invoke(main, ["plot", str(out)])
+    done = invoke("plot", out)
     assert done.exit_code == 2
     assert done.output == "sat-intervals: pictures need matplotlib: pip install 'sat-intervals[plot]'\n"
 
@@ -248,7 +244,7 @@ def words(monkeypatch):
 
 def test_plot__without_intervals_claims_none(tmp_path, words):
     out = without_intervals(tmp_path)
-    done = CliRunner().invoke(main, ["plot", str(out), "--row", "20"])
+    done = invoke("plot", out, "--row", "20")
     assert done.output.split() == [str(out / "overview.png"), str(out / "profile.png")]
     assert {"truth", "disparity"} < set(words)
     assert "interval" not in words
@@ -273,7 +269,7 @@ def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, las
     height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])) / 10
     height[:, 3] = np.nan
     write_surface(out, height, agreement)
-    done = CliRunner().invoke(main, ["plot", str(out), "--dpi", "40"])
+    done = invoke("plot", out, "--dpi", "40")
     assert done.output.split() == [str(out / "overview.png"), str(out / "dsm.png")]
     titles = ["Hillshade, sun in the north-west", "Height", "Interval width", last]
     assert [word for word in words if word in titles][-4:] == titles
@@ -283,7 +279,7 @@ def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, las
 def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tmp_path):
     out = write_run(tmp_path, *random_bands(20, 20)[:2])
     write_surface(out, np.ones((20, 20)), runs="earlier")
-    done = CliRunner().invoke(main, ["plot", str(out), "--dpi", "40"])
+    done = invoke("plot", out, "--dpi", "40")
     assert done.exit_code == 0, done.output
     assert done.stderr == f"{out / 'dsm.tif'} is of an earlier run and not drawn: run sat-intervals dsm again\n"
     assert not (out / "dsm.png").exists()
@@ -412,7 +408,7 @@ def test_commands__refuse_a_report_that_is_none(tmp_path, command, place, value)
     *sections, last = place
     reduce(getitem, sections, report)[last] = value
     (out / "run.json").write_text(json.dumps(report))
-    done = CliRunner().invoke(main, [command, str(out), "--debug"])
+    done = invoke(command, out, "--debug")
     assert done.exit_code == 2
     assert re.match(rf"sat-intervals: {out}/run.json(:| is not the report of a run)", done.output.splitlines()[-1])
 

@@ -11,15 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run
+from helpers import invoke
 from selenium.webdriver import ActionChains, Chrome, ChromeOptions
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.wait import WebDriverWait
 
-from sat_intervals.cli import main
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
@@ -52,13 +51,13 @@ def reported(folder, bands, validity, truth=None):
 
 def test_report__names_the_file_it_wrote(tmp_path):
     out = write_run(tmp_path, *random_bands(40, 50))
-    done = CliRunner().invoke(main, ["report", str(out)])
+    done = invoke("report", out)
     assert done.exit_code == 0, done.output
     assert done.output.split() == [str(out / "report.html")]
 
 
 def test_report__says_in_one_line_what_is_wrong(tmp_path):
-    done = CliRunner().invoke(main, ["report", str(tmp_path)])
+    done = invoke("report", tmp_path)
     assert done.exit_code == 2
     assert "give the folder of a finished run" in done.output
 

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import rasterio
+from helpers import OUTPUTS, bands, hashes, shares_that_differ, write_pair
 
 from sat_intervals import match_arrays, match_pair
 from sat_intervals.config import Cluster, load_config
@@ -33,19 +34,8 @@ from sat_intervals.tiling import Window
 def pair(tmp_path_factory):
     """A procedural pair of 300 x 420 pixels on disk, with its settings."""
     folder = tmp_path_factory.mktemp("pair")
-    scene = make_scene(300, 420, seed=3)
-    for name, image in (("left", scene.left), ("right", scene.right)):
-        profile = {"driver": "GTiff", "height": 300, "width": 420, "count": 1, "dtype": "uint16", "nodata": 0}
-        transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
-        with rasterio.open(folder / f"{name}.tif", "w", crs="EPSG:32631", transform=transform, **profile) as file:
-            file.write(image, 1)
-    settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}}
+    settings = write_pair(folder, make_scene(300, 420, seed=3))
     return folder / "left.tif", folder / "right.tif", settings
-
-
-def bands(out):
-    with rasterio.open(out / "intervals.tif") as intervals, rasterio.open(out / "validity.tif") as validity:
-        return intervals.read(), validity.read(1)
 
 
 def in_tiles(settings, size, overlap=100, **more):
@@ -89,11 +79,9 @@ def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, t
     left, right, settings = pair
     match_pair(left, right, tmp_path / "whole", in_tiles(settings, 512, **more))
     match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 128, **more))
-    (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
-    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
-    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
-    assert differs[0].sum() / judged.sum() <= 0.002
-    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.005
+    disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.002
+    assert interval <= 0.005
 
 
 def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path):
@@ -110,8 +98,7 @@ def test_match_pair__gives_the_same_bytes_whatever_the_workers(pair, tmp_path, k
     settings = in_tiles(settings, 128, overlap=20)
     match_pair(left, right, tmp_path / "one", settings | {"cluster": {"workers": 1}})
     match_pair(left, right, tmp_path / "more", settings | {"cluster": {"kind": kind, "workers": 2}})
-    for name in ("intervals.tif", "validity.tif"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "more" / name).read_bytes()
+    assert hashes(tmp_path / "one") == hashes(tmp_path / "more")
 
 
 def test_match_pair__reports_what_a_small_overlap_left(pair, tmp_path):
@@ -136,7 +123,7 @@ def test_match_pair__writes_a_complete_report(pair, tmp_path):
     assert report["inputs"]["left"]["bytes"] == left.stat().st_size
     assert report["cost_span"] == 448
     assert load_config(report["settings"]) == load_config(settings)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == OUTPUTS
 
 
 def test_match_pair__window_is_the_crop_of_the_whole(pair, tmp_path):
@@ -174,8 +161,7 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
     assert sorted(log.read_text().split()) == sorted(
         [*(f"{row}_{column}" for row, column in np.ndindex(3, 4)), *3 * ["1_2"]]  # tried three times
     )
-    for name in ("intervals.tif", "validity.tif"):
-        assert (tmp_path / "undisturbed" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert hashes(tmp_path / "undisturbed") == hashes(tmp_path / "out")
 
 
 def test_match_pair__never_mixes_runs(pair, tmp_path):
@@ -219,8 +205,7 @@ def test_match_pair__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(p
     with pytest.raises(SatIntervalsError, match="already holds a run"):
         match_pair(left, right, out, new)
     match_pair(left, right, tmp_path / "alone", new)
-    for name in ("intervals.tif", "validity.tif"):
-        assert (out / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+    assert hashes(out) == hashes(tmp_path / "alone")
 
 
 def test_match_pair__ends_where_another_run_of_the_same_removes_the_tiles(pair, tmp_path):
@@ -239,8 +224,7 @@ def test_match_pair__ends_where_another_run_of_the_same_removes_the_tiles(pair, 
     assert not list((tmp_path / "out").glob("*.*"))
     assert not list(store.iterdir())
     match_pair(left, right, tmp_path / "out", settings)
-    for name in ("intervals.tif", "validity.tif"):
-        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "other")
 
 
 def test_match_pair__names_what_differs_from_the_tiles_elsewhere_and_removes_only_its_own(pair, tmp_path):
@@ -306,7 +290,7 @@ def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_p
 def test_match_pair__matches_a_tile_again_of_which_a_part_is_gone(pair, tmp_path, array):
     left, right, settings = pair
     once = match_pair(left, right, tmp_path, in_tiles(settings, 128), keep_tiles=True)
-    expected = [(tmp_path / name).read_bytes() for name in ("intervals.tif", "validity.tif")]
+    expected = hashes(tmp_path)
     (tmp_path / "run.json").unlink()
     gone = tmp_path / "tiles" / "arrays.zarr" / array / "0" / "1"
     shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
@@ -315,7 +299,7 @@ def test_match_pair__matches_a_tile_again_of_which_a_part_is_gone(pair, tmp_path
     (tmp_path / "tiles" / "records" / "1_1.json").unlink()
     kept = (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns
     again = match_pair(left, right, tmp_path, in_tiles(settings, 128), keep_tiles=True)
-    assert [(tmp_path / name).read_bytes() for name in ("intervals.tif", "validity.tif")] == expected
+    assert hashes(tmp_path) == expected
     assert again["overlap_left"] == once["overlap_left"]
     assert (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns == kept
 
@@ -327,9 +311,8 @@ def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path,
     match_pair(left, right, tmp_path / "here", settings)
     store = store if "://" in store else f"file://{tmp_path}/{store}"
     match_pair(left, right, tmp_path / "out", settings | {"cluster": {"store": store}})
-    for name in ("intervals.tif", "validity.tif"):
-        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["intervals.tif", "run.json", "validity.tif"]
+    assert hashes(tmp_path / "here") == hashes(tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == OUTPUTS
     assert not list(tmp_path.glob("elsewhere/*"))
 
 
@@ -358,11 +341,9 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 256))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        (whole, flags), (tiles, other_flags) = bands(tmp_path / "whole"), bands(tmp_path / "tiles")
-    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
-    differs = (whole != tiles) & ~(np.isnan(whole) & np.isnan(tiles)) & judged
-    assert differs[0].sum() / judged.sum() <= 0.001
-    assert (differs[1] | differs[2]).sum() / judged.sum() <= 0.0025
+        disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.001
+    assert interval <= 0.0025
 
 
 def test_connected__asyncio_is_heard_again_afterwards(tmp_path, caplog):

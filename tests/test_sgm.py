@@ -5,10 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import reference
+from helpers import codes_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.kernels.cost import Codes, Costs, between, census
+from sat_intervals.kernels.cost import Codes, Costs, between
 from sat_intervals.kernels.matching import Settings, cost_volume
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.products import IMPOSSIBLE_COST, MASKED, NO_DATA
@@ -21,9 +22,7 @@ X = IMPOSSIBLE_COST
 
 def volume(scene, **changes):
     """The kernel's aggregated costs of a scene."""
-    left = census(scene.left, scene.left_state, scene.window)
-    right = census(scene.right, scene.right_state, scene.window)
-    return cost_volume(between(left, right), Settings(**{**reference.settings_of(scene), **changes}))
+    return cost_volume(between(*codes_of(scene)), Settings(**{**reference.settings_of(scene), **changes}))
 
 
 def bare_codes(levels):
@@ -108,19 +107,9 @@ def test_cost_volume__equals_reference_at_every_count(count, regularized, data):
 @given(data=st.data())
 def test_cost_volume__equals_reference_on_narrow_and_tall_patches(shape, count, data):
     # Diagonals that leave the patch and enter it again, in every proportion of rows to columns.
-    left, right = reference.patch_pair(data.draw(st.integers(0, 2**32 - 1)), *shape, count, 5)
-    scene = SimpleNamespace(
-        left=left,
-        right=right,
-        left_state=data.draw(reference.states(left.shape)),
-        right_state=data.draw(reference.states(right.shape)),
-        window=5,
-        minimum=-3,
-        count=count,
-        p1=8,
-        p2=32,
-        regularized=True,
-    )
+    patches = reference.patch_pair(data.draw(st.integers(0, 2**32 - 1)), *shape, count, 5)
+    states = [data.draw(reference.states(patch.shape)) for patch in patches]
+    scene = reference.scene_of(patches, states=states, window=5, minimum=-3, count=count)
     np.testing.assert_array_equal(volume(scene), reference.volume_of(scene))
 
 
@@ -128,19 +117,8 @@ def test_cost_volume__equals_reference_on_narrow_and_tall_patches(shape, count, 
 def test_cost_volume__equals_reference_around_holes(seed):
     # Holes in the middle of the left image: paths of all directions end before them and restart behind them.
     random = np.random.default_rng(seed)
-    left, right = reference.patch_pair(random, 12, 22, 7, 3, "shifted" if seed % 2 else "noise")
-    scene = SimpleNamespace(
-        left=left,
-        right=right,
-        left_state=np.zeros(left.shape, np.uint8),
-        right_state=np.zeros(right.shape, np.uint8),
-        window=3,
-        minimum=0,
-        count=7,
-        p1=8,
-        p2=32,
-        regularized=True,
-    )
+    patches = reference.patch_pair(random, 12, 22, 7, 3, "shifted" if seed % 2 else "noise")
+    scene = reference.scene_of(patches, window=3, minimum=0, count=7)
     for _ in range(3):
         scene.left_state[random.integers(3, 11), random.integers(3, 20)] = random.integers(1, 4)
         scene.right_state[random.integers(3, 11), random.integers(3, 28)] = random.integers(1, 4)
@@ -213,19 +191,8 @@ def test_cost_volume__without_penalties_is_eight_times_the_cost(scene):
 
 @pytest.mark.parametrize("side", ["left_state", "right_state"])
 def test_cost_volume__all_impossible(side):
-    left, right = reference.patch_pair(0, 3, 4, 7, 5)
-    scene = SimpleNamespace(
-        left=left,
-        right=right,
-        left_state=np.zeros(left.shape, np.uint8),
-        right_state=np.zeros(right.shape, np.uint8),
-        window=5,
-        minimum=0,
-        count=7,
-        p1=8,
-        p2=32,
-        regularized=True,
-    )
+    patches = reference.patch_pair(0, 3, 4, 7, 5)
+    scene = reference.scene_of(patches, window=5, minimum=0, count=7)
     getattr(scene, side)[:] = NO_DATA
     assert (volume(scene) == IMPOSSIBLE_COST).all()
 
@@ -262,9 +229,7 @@ def gradients_of(scene, **rule):
 
 
 def varying_volume(scene, gradients):
-    left = census(scene.left, scene.left_state, scene.window)
-    right = census(scene.right, scene.right_state, scene.window)
-    return cost_volume(between(left, right), Settings(**reference.settings_of(scene)), gradients)
+    return cost_volume(between(*codes_of(scene)), Settings(**reference.settings_of(scene)), gradients)
 
 
 def expected_volume(scene, penalties):
@@ -330,8 +295,7 @@ def test_cost_volume__penalties_without_gradients_are_constant(scene):
 @given(scene=reference.scenes())
 def test_cost_volume__of_stored_costs_equals_that_of_codes(scene):
     # The same Hamming distances, computed beforehand; what stands at impossible candidates is not looked at.
-    left = census(scene.left, scene.left_state, scene.window)
-    right = census(scene.right, scene.right_state, scene.window)
+    left, right = codes_of(scene)
     rows, columns = left.state.shape
     stored = np.full((rows, columns, -(-scene.count // 32) * 32), 255, np.uint8)
     for k in range(scene.count):

@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import sysconfig
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,16 +12,15 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
-import rasterio
 import yaml
+from helpers import COMMAND, hashes, wait_until, write_pair
 
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.config import Cluster
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
-from sat_intervals.run.cluster import job_script, workers_there
+from sat_intervals.run.batch_system import job_script, workers_there
 
-SCRIPTS = Path(sysconfig.get_path("scripts"))
 ROOT = Path(__file__).parents[1]
 
 
@@ -51,16 +49,7 @@ def slurm(tmp_path_factory):
 def pair(tmp_path_factory):
     """A folder with left.tif, right.tif and the run in threads that nothing disturbed; its settings."""
     folder = tmp_path_factory.mktemp("pair")
-    scene = make_scene(400, 500, seed=3)
-    for name, image in (("left", scene.left), ("right", scene.right)):
-        profile = {"driver": "GTiff", "height": 400, "width": 500, "count": 1, "dtype": "uint16", "nodata": 0}
-        transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
-        with rasterio.open(folder / f"{name}.tif", "w", crs="EPSG:32631", transform=transform, **profile) as file:
-            file.write(image, 1)
-    settings = {
-        "disparity": {"minimum": scene.minimum, "maximum": scene.maximum},
-        "tiles": {"size": 64, "overlap": 20},
-    }
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
     match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
     return folder, settings
 
@@ -78,7 +67,7 @@ def submitted(
 ):
     """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first.
 
-    ``constants`` are those of `sat_intervals.run.cluster`; where it ends well and ``is_quiet`` it must say nothing.
+    ``constants`` are those of `run.batch_system`; where it ends well and ``is_quiet`` it must say nothing.
     """
     images, settings = pair
     folder.mkdir(exist_ok=True)
@@ -89,8 +78,8 @@ def submitted(
         "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
         "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
     } | (own or {})
-    code = "from sat_intervals import cli; from sat_intervals.run import cluster; "
-    code += f"vars(cluster).update({constants or {}}); cli.main()"
+    code = "from sat_intervals import cli; from sat_intervals.run import batch_system; "
+    code += f"vars(batch_system).update({constants or {}}); cli.main()"
     command = [sys.executable, "-c", code, "match", images / "left.tif", images / "right.tif", folder / "out"]
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
     with (folder / "log").open("w") as log:
@@ -106,13 +95,6 @@ def submitted(
         process.kill()
         process.wait()
         subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
-
-
-def wait_until(holds, what: str, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, f"{what}: not within {seconds:.0f} s"
-        time.sleep(0.05)
 
 
 def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
@@ -138,8 +120,7 @@ def workers(folder: Path) -> list[psutil.Process]:
 
 
 def assert_complete(pair, out: Path) -> None:
-    for name in ("intervals.tif", "validity.tif"):
-        assert (out / name).read_bytes() == (pair[0] / "undisturbed" / name).read_bytes(), name
+    assert hashes(out) == hashes(pair[0] / "undisturbed")
     assert {path.name for path in out.iterdir()} - {"logs"} == {"intervals.tif", "run.json", "validity.tif"}
 
 
@@ -181,7 +162,7 @@ def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
     pytest.importorskip("dask_jobqueue", reason="needs the extra [cluster]")
     images, settings = pair
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
-    command = [SCRIPTS / "sat-intervals", "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
+    command = [COMMAND, "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
     command += ["--config", tmp_path / "settings.yaml", "--cluster", "slurm", "--dry-run"]
     script = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert {"#SBATCH --cpus-per-task=2", "#SBATCH --mem=3G"} <= set(script)

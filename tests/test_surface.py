@@ -6,8 +6,8 @@ import threading
 import numpy as np
 import pytest
 import rasterio
-from click.testing import CliRunner
 from finished import FINISHED, write_run
+from helpers import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -15,7 +15,6 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.cli import main
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.splat import COUNT, empty_cells, splat
@@ -322,7 +321,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
     ]
     for outs, options, message in cases:
         words = ["dsm", *map(str, outs), "--resolution", "1", *options]
-        result = CliRunner().invoke(main, words)
+        result = invoke(*words)
         assert result.exit_code == 2, result.output
         assert message in result.stderr
         assert result.stderr.count("\n") == 1

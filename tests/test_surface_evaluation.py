@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 import rasterio
-from click.testing import CliRunner
+from helpers import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 
-from sat_intervals.cli import main
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.evaluate.metrics import Histogram
 from sat_intervals.products import SURFACE
@@ -107,17 +106,15 @@ def test_histogram__deviation_is_the_median_distance_from_the_median(values):
     assert histogram.deviation() == pytest.approx(distances[(values.size - 1) // 2], abs=1e-9)
 
 
-def run(*words):
-    return CliRunner().invoke(main, ["evaluate", *map(str, words)])
-
-
 def test_evaluate_command__of_a_surface(tmp_path):
     model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
     reference = write(tmp_path / "reference.tif", [[[1.5, 9]]])
-    result = run("--dsm", model, "--reference", reference)
+    result = invoke("evaluate", "--dsm", model, "--reference", reference)
     assert result.exit_code == 0
     assert result.stdout.splitlines()[2].split() == ["all", "cells", "2", "0.500", "2.000", "-3.750", "4.818"]
-    assert json.loads(run("--dsm", model, "--reference", reference, "--json").stdout)["all"]["count"] == 2
+    assert (
+        json.loads(invoke("evaluate", "--dsm", model, "--reference", reference, "--json").stdout)["all"]["count"] == 2
+    )
 
 
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
@@ -139,7 +136,7 @@ def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
         (["--dsm", model, "--reference", feet], "differ by 500 m or more in the median: check that both are metres"),
         (["--dsm", model, "--reference", feet, "--tolerance", "5"], "--tolerance is for runs and pairs, not for --dsm"),
     ):
-        result = run(*words)
+        result = invoke("evaluate", *words)
         assert result.exit_code == 2, result.output
         assert message in result.stderr
         assert result.stderr.count("\n") == 1

@@ -8,10 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
-import sysconfig
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -21,27 +19,23 @@ import pytest
 import rasterio
 import yaml
 from distributed import Client, LocalCluster
+from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, wait_until, write_pair
 
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
+from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
 from sat_intervals.run.job import prepare
 from sat_intervals.store.folder import LocalFolder
 
-SCRIPTS = Path(sysconfig.get_path("scripts"))
-OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
 TILES = 56
-PATIENCE = 60.0
 
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
     """A folder with left.tif, right.tif, settings.yaml of 7 x 8 tiles, and the run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("pair")
-    scene = make_scene(400, 500, seed=3)
-    disparity = {"minimum": scene.minimum, "maximum": scene.maximum}
-    settings = {"disparity": disparity, "tiles": {"size": 64, "overlap": 20}}
-    write_pair(folder, scene, settings)
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
     match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
     return folder
 
@@ -50,30 +44,9 @@ def pair(tmp_path_factory):
 def uneven(tmp_path_factory):
     """The same of four tiles: one takes 290 MB for its volume of costs, three take 12 MB at most."""
     folder = tmp_path_factory.mktemp("uneven")
-    settings = {"disparity": {"minimum": -260, "maximum": 260}, "tiles": {"size": 512, "overlap": 3}}
-    write_pair(folder, make_scene(528, 528, seed=3), settings)
+    disparity = {"minimum": -260, "maximum": 260}
+    write_pair(folder, make_scene(528, 528, seed=3), disparity=disparity, tiles={"size": 512, "overlap": 3})
     return folder
-
-
-def write_pair(folder, scene, settings):
-    for name, image in (("left", scene.left), ("right", scene.right)):
-        write_image(folder / f"{name}.tif", image)
-    (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
-
-
-def write_image(path, image):
-    height, width = image.shape
-    profile = {"driver": "GTiff", "height": height, "width": width, "count": 1, "dtype": "uint16", "nodata": 0}
-    transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
-    with rasterio.open(path, "w", crs="EPSG:32631", transform=transform, blockysize=16, **profile) as file:
-        file.write(image, 1)
-
-
-def wait_until(holds: Callable[[], object], what: str, seconds: float = PATIENCE) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, f"{what}: not within {seconds:.0f} s"
-        time.sleep(0.002)
 
 
 def done_tiles(out: Path) -> set[str]:
@@ -86,7 +59,7 @@ class Command:
     def __init__(self, pair: Path, out: Path, *options: str, left: Path | None = None) -> None:
         self.out = out
         self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by `started`)
-        command = [SCRIPTS / "sat-intervals", "match", left or pair / "left.tif", pair / "right.tif", out]
+        command = [COMMAND, "match", left or pair / "left.tif", pair / "right.tif", out]
         command += ["--config", pair / "settings.yaml", "--quiet", *options]
         self.process = subprocess.Popen(list(map(str, command)), stdout=self.log, stderr=subprocess.STDOUT)
 
@@ -222,7 +195,7 @@ def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):
 def test_batch__goes_on_after_kill_9_and_does_only_what_is_missing(pair, tmp_path):
     names = ("one", "two", "three")
     (pair / "pairs.json").write_text(json.dumps([{"name": n, "left": "left.tif", "right": "right.tif"} for n in names]))
-    command = [SCRIPTS / "sat-intervals", "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml"]
+    command = [COMMAND, "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml"]
     command += ["--keep-tiles", "--quiet"]
 
     def done() -> dict[Path, int]:
@@ -364,7 +337,7 @@ def test_match__names_the_tiles_of_a_truncated_input_and_refuses_it_mended(pair,
     assert not failed & done
     assert len(failed | done) == TILES
     assert_nothing_final(out)
-    status = subprocess.run([SCRIPTS / "sat-intervals", "status", out], capture_output=True, text=True, check=True)
+    status = subprocess.run([COMMAND, "status", out], capture_output=True, text=True, check=True)
     assert f"{len(done)} of {TILES} tiles done, {len(failed)} failed, 0 left" in status.stdout
 
     left.write_bytes(whole)
@@ -462,7 +435,7 @@ def test_matched__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_pat
     monkeypatch.setattr(run, "match_tile", record_only)
     futures, known = [], []
     image = tmp_path / "wide.tif"
-    write_image(image, np.ones((64 * 20, 64 * 25), np.uint16))
+    write_layer(image, np.ones((64 * 20, 64 * 25), np.uint16), 0, PLACE)
     job = prepare(image, image, tmp_path / "out", yaml.safe_load((pair / "settings.yaml").read_text()))
     with LocalFolder(job.store.home).locked():
         job.begin()

@@ -6,14 +6,13 @@ import os
 import numpy as np
 import pytest
 import rasterio
-from click.testing import CliRunner
 from finished import MAXIMUM, MINIMUM, write_run
+from helpers import invoke, write_pair
 from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
 from sat_intervals import SatIntervalsError, match_pair
-from sat_intervals.cli import main
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
@@ -182,13 +181,7 @@ def matched_scene(tmp_path_factory):
     """A procedural scene, matched and triangulated: the scene and the folder of the run."""
     folder = tmp_path_factory.mktemp("scene")
     scene = make_scene(260, 300, seed=2)
-    for name, image in (("left", scene.left), ("right", scene.right)):
-        kind = {"height": 260, "width": 300, "count": 1, "dtype": "uint16", "nodata": 0}
-        with rasterio.open(folder / f"{name}.tif", "w", driver="GTiff", crs="EPSG:32631",
-                           transform=Affine(0.5, 0, 0, 0, -0.5, 0), **kind) as dataset:  # fmt: skip
-            dataset.write(image, 1)
-    search = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}}
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", search)
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", write_pair(folder, scene))
     triangulate(folder / "out", *cameras(folder, 260, 300))
     return scene, folder / "out"
 
@@ -248,10 +241,6 @@ FILES = ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif")
 OPTIONS = ("--left-model", "--right-model", "--left-grid", "--right-grid")
 
 
-def run(*arguments):
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
-
-
 def given(files):
     return [word for pair in zip(OPTIONS, files, strict=True) for word in pair]
 
@@ -264,7 +253,7 @@ def test_commands__a_real_pair_to_a_surface_like_that_of_a_peer(shared_data, tmp
         ("dsm", out, "--resolution", 1),
     ]
     for step in steps:
-        result = run(*step)
+        result = invoke(*step)
         assert result.exit_code == 0, result.output
     with rasterio.open(folder / "peer_dsm_mean_1m.tif") as peer, rasterio.open(out / "dsm.tif") as ours:
         expected, surface = peer.read(1), np.full(peer.shape, np.nan, np.float32)
@@ -326,7 +315,7 @@ def test_triangulate_command__what_it_cannot_use_gets_one_line(level_run, tmp_pa
         ({3: descending}, "rows of {descending} descend: give a grid whose positions ascend"),
     ]
     for changed, message in cases:
-        result = run("triangulate", out, *given(changed.get(place, file) for place, file in enumerate(files)))
+        result = invoke("triangulate", out, *given(changed.get(place, file) for place, file in enumerate(files)))
         assert result.exit_code == 2, result.output
         assert message.format(descending=descending) in result.output
         assert result.output.count("\n") == 1
@@ -342,11 +331,11 @@ def upside_down(file):
 def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_path):
     out, files = level_run
     shifted = grid(tmp_path / "shifted.tif", 40, 50, offset=1.5)
-    result = run("triangulate", out, *given([*files[:3], shifted]), "--quiet")
+    result = invoke("triangulate", out, *given([*files[:3], shifted]), "--quiet")
     assert result.exit_code == 0, result.output
     assert "warning: lines of sight pass each other by 0." in result.stderr
     assert result.stdout == ""
-    assert run("triangulate", out, *given(files)).stderr == ""
+    assert invoke("triangulate", out, *given(files)).stderr == ""
 
 
 def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path):
@@ -356,7 +345,7 @@ def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_
         positions = file.read()
         positions[:, 2, 2] = np.nan  # of epipolar row and column 0, a node of the lattice
         file.write(positions)
-    result = run("triangulate", out, *given(files))
+    result = invoke("triangulate", out, *given(files))
     assert result.exit_code == 0, result.output
     points = read(out / "points.tif")[BAND["height"]]
     lost = np.isnan(points)
@@ -366,6 +355,6 @@ def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_
 
 def test_triangulate_command__needs_a_run(tmp_path):
     files = cameras(tmp_path, 40, 50)
-    result = run("triangulate", tmp_path, *given(files))
+    result = invoke("triangulate", tmp_path, *given(files))
     assert result.exit_code == 2
     assert "give the folder of a finished run" in result.output

@@ -12,19 +12,17 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from click.testing import CliRunner
+from helpers import invoke
 
 from sat_intervals import load_config, open_image
-from sat_intervals.cli import main
 from sat_intervals.config import Cluster, ConfigError, Mccnn
-from sat_intervals.config.pairs import find_pairs
+from sat_intervals.config.pairs import find_pairs, read_batch
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.match.mccnn import weights_file
 from sat_intervals.raster import read_place
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_run
 from sat_intervals.run import cluster, submit
-from sat_intervals.run.batch import read_batch
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.submit import Submission, Task
 
@@ -71,7 +69,7 @@ def test_open_image__refuses_a_virtual_raster_of_a_pipe(tmp_path, read):
 
 def test_log_file__does_not_wait_for_who_reads_a_pipe(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    result = CliRunner().invoke(main, ["ablate", str(tmp_path), "--log-file", str(tmp_path / "pipe")])
+    result = invoke("ablate", tmp_path, "--log-file", tmp_path / "pipe")
     assert result.exit_code == 2
     assert "pipe cannot be written: No such device or address: choose another --log-file" in result.stderr
 
@@ -81,7 +79,7 @@ def test_commands__refuse_json_that_is_nested_without_end(tmp_path, name):
     for file in (name, "left.tif", "right.tif", "truth.tif"):
         (tmp_path / file).write_text(100_000 * "[")
     command = {"run.json": "report", "batch.json": "status", "meta.json": "ablate"}[name]
-    result = CliRunner().invoke(main, [command, str(tmp_path)])
+    result = invoke(command, tmp_path)
     assert result.exit_code == 2, result.stderr
     assert name in result.stderr
 
@@ -158,7 +156,7 @@ def test_plan__of_an_endless_image_ends(tmp_path):
         "</VRTRasterBand></VRTDataset>"
     )
     began = time.monotonic()
-    result = CliRunner().invoke(main, ["plan", str(vrt), str(vrt), "--disparity", "0", "4"])
+    result = invoke("plan", vrt, vrt, "--disparity", "0", "4")
     assert result.exit_code in (0, 2), result.output
     assert time.monotonic() - began < 30
 
@@ -208,7 +206,7 @@ def test_heartbeats__do_not_count_a_time_in_which_this_process_was_stopped(monke
 
 
 def test_connected__refuses_processes_that_cannot_reach_each_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "_LOOPBACK", "192.0.2.77")
+    monkeypatch.setattr(cluster, "LOOPBACK", "192.0.2.77")
     with (
         pytest.raises(SatIntervalsError, match=r"processes cannot reach each other at 192.0.2.77: .*--cluster threads"),
         connected(Cluster(kind="processes", workers=1), tmp_path),

@@ -2,7 +2,7 @@
 
 from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
-from sat_intervals.config.reading import load_config, load_yaml, read_small
+from sat_intervals.config.reading import load_config
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -34,7 +34,5 @@ __all__ = [
     "Sgm",
     "allowed",
     "load_config",
-    "load_yaml",
     "preset_text",
-    "read_small",
 ]

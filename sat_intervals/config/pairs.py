@@ -1,20 +1,30 @@
-"""Pairs of known truth, as evaluation takes them: folders, or the rows of a CSV file."""
+"""Lists of pairs: those of known truth, which evaluation takes, and those of a batch."""
 
 import csv
+import io
 import json
+import os
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config.reading import read_small
+import yaml
+
+from sat_intervals.config.reading import load_yaml, read_small
 from sat_intervals.errors import SatIntervalsError, check_regular
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
 _COLUMNS = ("left", "right", "truth", "minimum", "maximum")
-_OPTIONAL = ("name", "group")
 NO_GROUP = "all"
+
+# In the folder of a batch: how its pairs ended, and the logs of jobs; no pair is called so.
+REPORT = "batch.json"
+_TAKEN = (REPORT, "logs")
+_IMAGES = ("left", "right", "left_mask", "right_mask")
+# Nodes of a list of pairs in YAML or JSON, which may have thousands of rows.
+_NODES = 200_000
 
 
 @dataclass(frozen=True)
@@ -28,6 +38,18 @@ class Pair:
     truth: Path
     minimum: int
     maximum: int
+
+
+@dataclass(frozen=True)
+class PairOfBatch:
+    """One row of a batch: a name, its images, and the settings that are its own, as nested sections."""
+
+    name: str
+    left: str
+    right: str
+    left_mask: str | None = None
+    right_mask: str | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 def is_pair(path: Path) -> bool:
@@ -57,11 +79,28 @@ def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
     return pairs
 
 
-def check_names(names: Iterable[str]) -> None:
-    """Hold that what is judged can be told apart."""
+def read_batch(file: Path) -> list[PairOfBatch]:
+    """Pairs of a CSV, YAML or JSON file.
+
+    A row has ``name``, ``left`` and ``right``; ``minimum`` and ``maximum``, the search range; ``left_mask`` and
+    ``right_mask``; and any setting under its dotted name, such as ``sgm.p2``. YAML and JSON hold a list of such rows,
+    in which a setting may also be a section. Paths are relative to the file.
+
+    Raises
+    ------
+    SatIntervalsError
+        With file, row and what is wrong there.
+    """
+    pairs = [_of_batch(place, row, file) for place, row in _rows(file, ("name", "left", "right"))]
+    check_names((pair.name for pair in pairs), f"{file}: ")
+    return pairs
+
+
+def check_names(names: Iterable[str], where: str = "") -> None:
+    """Refuse a name that is given twice; ``where`` begins the message."""
     for name, count in Counter(names).items():
         if count > 1:
-            raise SatIntervalsError(f"{count} pairs or runs are called {name}: give each its own name")
+            raise SatIntervalsError(f"{where}{count} pairs or runs are called {name}: give each its own name")
 
 
 def _unnamed(pair: Pair) -> Pair:
@@ -106,32 +145,80 @@ def _of_folder(folder: Path) -> Pair:
 
 
 def _of_table(file: Path) -> list[Pair]:
-    check_regular(file)
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets begin with a mark
-            reader = csv.DictReader(stream)
-            rows, columns = list(reader), reader.fieldnames or []
-    except OSError as error:
-        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: give a CSV file of pairs") from error
-    except (ValueError, csv.Error) as error:
-        raise SatIntervalsError(f"{file} cannot be read: {error}: give a CSV file in UTF-8") from error
-    missing = [column for column in _COLUMNS if column not in columns]
-    if missing:
-        raise SatIntervalsError(
-            f"{file}: no column {', '.join(missing)}; needed: {', '.join(_COLUMNS)}, known: {', '.join(_OPTIONAL)}"
-        )
-    if not rows:
-        raise SatIntervalsError(f"{file} has a header but no rows: give a row a pair")
-    return [_of_row(file, number, row) for number, row in enumerate(rows, start=2)]
+    pairs = []
+    for place, row in _rows(file, _COLUMNS):
+        minimum, maximum = row["minimum"], row["maximum"]
+        try:
+            search = int(minimum), int(maximum)
+        except ValueError as error:
+            raise SatIntervalsError(f"{place}: minimum {minimum!r}, maximum {maximum!r}, needed: integers") from error
+        left, right, truth = (file.parent / row[image] for image in ("left", "right", "truth"))
+        pairs.append(Pair(row.get("name", row["left"]), row.get("group", NO_GROUP), left, right, truth, *search))
+    return pairs
 
 
-def _of_row(file: Path, number: int, row: dict[str, str | None]) -> Pair:
-    left, right, truth, minimum, maximum = (row[column] or "" for column in _COLUMNS)
+def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
+    name = str(row.pop("name"))
+    if "cluster" in (str(key).split(".")[0] for key in row):
+        raise SatIntervalsError(f"{place}: cluster is one for all pairs: give it by --config or --cluster")
+    if name.startswith(".") or os.sep in name or name in _TAKEN or not name.isprintable():
+        raise SatIntervalsError(f"{place}: name {name!r} cannot be that of the pair's folder, take another")
+    images = {key: _beside(file, str(row.pop(key))) for key in _IMAGES if key in row}
+    settings: dict[str, Any] = {}
+    for key, value in row.items():
+        try:
+            _set(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
+        except (ValueError, RecursionError, yaml.YAMLError) as error:
+            raise SatIntervalsError(f"{place}: {key} is {value!r}: {' '.join(str(error).split())}") from error
+    return PairOfBatch(name, settings=settings, **images)
+
+
+def _set(settings: dict[str, Any], key: str, value: Any) -> None:
+    """Set a setting under its dotted name; texts, such as all cells of a CSV, are YAML."""
+    *sections, last = key.split(".")
+    for section in sections:
+        settings = settings.setdefault(section, {})
+        if not isinstance(settings, dict):
+            raise ValueError(f"the row gives {section} as a whole too")
+    if last in settings:
+        raise ValueError(f"the row gives parts of {last} too" if isinstance(settings[last], dict) else "given twice")
+    settings[last] = load_yaml(value) if isinstance(value, str) else value
+
+
+def _beside(file: Path, path: str) -> str:
+    return path if "://" in path or path.startswith("/vsi") else str(file.parent / path)
+
+
+def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
+    """The rows of a CSV, YAML or JSON file without their empty values, each behind its place, file and number."""
+    wanted = f"needed is a row a pair, with {', '.join(needed)}"
     try:
-        search = int(minimum), int(maximum)
-    except ValueError as error:
-        raise SatIntervalsError(
-            f"{file}, line {number}: minimum {minimum!r}, maximum {maximum!r}, needed: integers"
-        ) from error
-    first, second, known = (file.parent / path for path in (left, right, truth))
-    return Pair(row.get("name") or left, row.get("group") or NO_GROUP, first, second, known, *search)
+        check_regular(file)
+        if file.suffix.lower() == ".csv":
+            rows = _rows_of_csv(file.read_text(encoding="utf-8-sig"))  # spreadsheets begin with a mark
+        else:
+            rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
+    except SatIntervalsError:
+        raise
+    except (OSError, ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
+        why = " ".join(str(getattr(error, "strerror", None) or error).split())
+        raise SatIntervalsError(f"{file} cannot be read: {why}: {wanted}") from error
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):
+        raise SatIntervalsError(f"{file} holds no pairs: {wanted}")
+    found = []
+    for number, row in enumerate(rows, start=1):
+        place = f"{file}, row {number}"
+        values = {key: value for key, value in row.items() if value not in ("", None)}
+        if missing := [key for key in needed if key not in values]:
+            raise SatIntervalsError(f"{place} lacks {' and '.join(missing)}: {wanted}")
+        if None in row:
+            raise SatIntervalsError(f"{place} has more values than columns: {row[None]}")
+        found.append((place, values))
+    return found
+
+
+def _rows_of_csv(text: str) -> list[Any]:
+    rows = csv.DictReader(io.StringIO(text, newline=""))
+    if twice := [name for name, count in Counter(rows.fieldnames or ()).items() if count > 1]:
+        raise ValueError(f"column {twice[0]} is there twice")
+    return list(rows)

@@ -21,7 +21,6 @@ from sat_intervals.heights.point_cloud import WINDOW, Cells, Extent, PointCloud
 from sat_intervals.products import POINTS
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
-    Georeferencing,
     OutputWriter,
     Projection,
     is_surface,
@@ -93,23 +92,14 @@ def make_surface(
         Runs without points, a CRS or grid that does not serve, a file that cannot be written.
     """
     path, radius = Path(path), resolution if radius is None else radius
-    for name, value in (("resolution", resolution), ("radius", radius)):
-        if not 0 < value <= _LARGEST:
-            raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, up to {_LARGEST:g}")
-    if radius > _REACH * resolution:
-        raise SatIntervalsError(
-            f"radius is {radius:g} m, {radius / resolution:.0f} cells of {resolution:g} m: choose at most "
-            f"{_REACH * resolution:g} m, or a coarser --resolution"
-        )
+    _check_lengths(resolution, radius)
     if interval not in ("envelope", "mean"):
         raise SatIntervalsError(f"interval is {interval!r}, allowed: envelope or mean")
     _check_target(path)
     runs = _triangulated([Path(out) for out in outs])
     for run in runs:
         run.check_kept([path], [run.out / "points.tif", geoid])
-    middle = _point_near_the_middle(runs)
-    projection = Projection(utm_of(*middle) if crs is None else crs, None if geoid is None else Path(geoid))
-    projection.check(*middle)
+    projection = _projection(runs, crs, None if geoid is None else Path(geoid))
     clouds = []
     for done, run in enumerate(runs):
         progress("extent", done, len(runs))
@@ -121,20 +111,11 @@ def make_surface(
         "RADIUS": f"{radius:g} m",
         "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}",
     }
-    counts = np.zeros(3, np.int64)
-    writer = OutputWriter(
-        path.parent, [surface_file(path.name)], cells.rows, cells.columns, _place(cells, crs=projection.crs), tags
-    )
+    place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
+    writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
     with writer, ThreadPoolExecutor() as threads:
-        for row, strip in _strips(threads, clouds, cells, radius, interval):
-            writer.write(row, strip)
-            agreement = strip[-1]
-            counts += np.isfinite(strip[0]).sum(), np.isfinite(agreement).sum(), (agreement == 0).sum()
-            progress("cells", row + strip.shape[1], cells.rows)
-        progress("files", 0, 1)
-        writer.publish()
-        progress("files", 1, 1)
-    filled, shared, disagreeing = map(int, counts)
+        strips = _strips(threads, clouds, cells, radius, interval)
+        filled, shared, disagreeing = _write(writer, strips, cells.rows, progress)
     return {
         "crs": projection.crs,
         "rows": cells.rows,
@@ -149,6 +130,17 @@ def make_surface(
 def runs_tag(runs: Sequence[Run]) -> str:
     """What a surface says of the runs that it is of."""
     return " ".join(run.report["finished"] for run in runs)
+
+
+def _check_lengths(resolution: float, radius: float) -> None:
+    for name, value in (("resolution", resolution), ("radius", radius)):
+        if not 0 < value <= _LARGEST:
+            raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, up to {_LARGEST:g}")
+    if radius > _REACH * resolution:
+        raise SatIntervalsError(
+            f"radius is {radius:g} m, {radius / resolution:.0f} cells of {resolution:g} m: choose at most "
+            f"{_REACH * resolution:g} m, or a coarser --resolution"
+        )
 
 
 def _check_target(path: Path) -> None:
@@ -171,6 +163,13 @@ def _triangulated(outs: Sequence[Path]) -> list[Run]:
             raise SatIntervalsError(f"{path} is of an earlier run in {out}: triangulate again")
         runs.append(run)
     return runs
+
+
+def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Projection:
+    middle = _point_near_the_middle(runs)
+    projection = Projection(utm_of(*middle) if crs is None else crs, geoid)
+    projection.check(*middle)
+    return projection
 
 
 def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
@@ -199,8 +198,21 @@ def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float) -> Ce
     return cells
 
 
-def _place(cells: Cells, crs: str) -> Georeferencing:
-    return north_up(crs, cells.left, cells.top, cells.resolution)
+def _write(
+    writer: OutputWriter, strips: Iterator[tuple[int, np.ndarray]], rows: int, progress: Progress
+) -> tuple[int, int, int]:
+    """Write and publish strips; how many cells have a height, are of several runs, and are where these disagree."""
+    counts = np.zeros(3, np.int64)
+    for row, strip in strips:
+        writer.write(row, strip)
+        agreement = strip[-1]
+        counts += np.isfinite(strip[0]).sum(), np.isfinite(agreement).sum(), (agreement == 0).sum()
+        progress("cells", row + strip.shape[1], rows)
+    progress("files", 0, 1)
+    writer.publish()
+    progress("files", 1, 1)
+    filled, shared, disagreeing = map(int, counts)
+    return filled, shared, disagreeing
 
 
 def _strips(

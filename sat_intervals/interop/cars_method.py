@@ -111,19 +111,10 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         grids = dense_matching_algo.compute_disparity_grid(
             disp_range_grid.data, left_image_object, right_image_object, used_band, False
         )
-        minimum, maximum = int(np.floor(grids[0].min())), int(np.ceil(grids[1].max()))
-        share = 1.0 if crop_with_range is None else min(1.0, crop_with_range / max(1, maximum - minimum))
-        minimum, maximum = round(share * minimum), round(share * maximum)
-        beyond = (grids[0] < minimum) | (grids[1] > maximum)
+        minimum, maximum, is_cropped = _search_range(grids[0], grids[1], crop_with_range)
         left, right = (_of_band(tile, used_band) for tile in (left_image_object, right_image_object))
-        masked = left[names.EPI_MSK].values != 0
-        if classif_bands_to_mask and names.EPI_CLASSIFICATION in left:
-            classes = left[names.EPI_CLASSIFICATION].sel(band_classif=classif_bands_to_mask)
-            masked |= (classes.values != 0).any(axis=0)
         matched = match_arrays(
-            np.ma.masked_array(_pixels(left, used_band), masked),
-            np.ma.masked_array(_pixels(right, used_band), right[names.EPI_MSK].values != 0),
-            self._config(minimum, maximum),
+            _pixels(left, used_band, classif_bands_to_mask), _pixels(right, used_band), self._config(minimum, maximum)
         )
         result: xr.Dataset = dense_matching_wrappers.create_disp_dataset(
             _as_pandora(matched, left),
@@ -132,7 +123,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
             compute_disparity_masks=compute_disparity_masks,
             disp_min_grid=np.maximum(grids[0], minimum),
             disp_max_grid=np.minimum(grids[1], maximum),
-            cropped_range=beyond if share < 1 else None,
+            cropped_range=(grids[0] < minimum) | (grids[1] > maximum) if is_cropped else None,
             margins_to_keep=margins_to_keep,
             texture_bands=texture_bands,
         )
@@ -141,7 +132,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
             saving_info=saving_info,
             window=cars_dataset.get_window_dataset(left_image_object),
             profile=cars_dataset.get_profile_rasterio(left_image_object),
-            attributes={names.CROPPED_DISPARITY_RANGE: share < 1},
+            attributes={names.CROPPED_DISPARITY_RANGE: is_cropped},
             overlaps=left_overlaps,
         )
         return result
@@ -157,14 +148,25 @@ class _NoLoader:
         return conf
 
 
+def _search_range(lowest: np.ndarray, highest: np.ndarray, most: int | None) -> tuple[int, int, bool]:
+    """The range that holds those of all pixels, and whether it is cropped around nil, to ``most`` disparities."""
+    minimum, maximum = int(np.floor(lowest.min())), int(np.ceil(highest.max()))
+    share = 1.0 if most is None else min(1.0, most / max(1, maximum - minimum))
+    return round(share * minimum), round(share * maximum), share < 1
+
+
 def _of_band(tile: xr.Dataset, band: str) -> xr.Dataset:
     """The tile with the mask of one band."""
     mask = tile[names.EPI_MSK].sel({names.BAND_IM: band}, drop=True)
     return tile.drop_vars(names.EPI_MSK).assign({names.EPI_MSK: mask})
 
 
-def _pixels(tile: xr.Dataset, band: str) -> np.ndarray:
-    return np.asarray(tile[names.EPI_IMAGE].sel({names.BAND_IM: band}).values)
+def _pixels(tile: xr.Dataset, band: str, classes: list[Any] | None = None) -> np.ma.MaskedArray:
+    """The pixels of one band, masked where the tile's mask is, or any of some classes."""
+    masked = tile[names.EPI_MSK].values != 0
+    if classes and names.EPI_CLASSIFICATION in tile:
+        masked |= (tile[names.EPI_CLASSIFICATION].sel(band_classif=classes).values != 0).any(axis=0)
+    return np.ma.masked_array(tile[names.EPI_IMAGE].sel({names.BAND_IM: band}).values, masked)
 
 
 def _as_pandora(matched: xr.Dataset, tile: xr.Dataset) -> xr.Dataset:

@@ -1,25 +1,21 @@
 """Many pairs in one go: one cluster for all, tiles of several pairs in flight, a folder for each."""
 
-import csv
-import io
 import json
 import logging
 import os
 import resource
 import threading
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from distributed import Client
 
-from sat_intervals.config import Cluster, Config, load_config, load_yaml, read_small
-from sat_intervals.errors import RunError, SatIntervalsError, check_regular
+from sat_intervals.config import Cluster, Config, load_config
+from sat_intervals.config.pairs import REPORT, PairOfBatch
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
@@ -30,7 +26,6 @@ from sat_intervals.run.inputs import changes_since
 from sat_intervals.run.job import Job, fitted_to_jobs, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
 from sat_intervals.run.pair import assembled, check_failures, matched, measure_images
-from sat_intervals.run.status import REPORT
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
@@ -38,104 +33,8 @@ from sat_intervals.store.tiles import finished_run, remove_tiles
 
 _LOG = logging.getLogger(__name__)
 
-_IMAGES = ("left", "right", "left_mask", "right_mask")
-# Nodes of a list of pairs in YAML or JSON, which may have thousands of rows.
-_NODES = 200_000
-# Names in the folder of a batch that are not those of pairs.
-_TAKEN = (REPORT, "logs")
 # Completes settings whose search range the pairs bring.
 _ANY_RANGE = {"disparity": {"minimum": 0, "maximum": 0}}
-
-
-@dataclass(frozen=True)
-class PairOfBatch:
-    """One row of a batch: a name, its images, and the settings that are its own, as nested sections."""
-
-    name: str
-    left: str
-    right: str
-    left_mask: str | None = None
-    right_mask: str | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-
-def read_batch(file: Path) -> list[PairOfBatch]:
-    """Pairs of a CSV, YAML or JSON file.
-
-    A row has ``name``, ``left`` and ``right``; ``minimum`` and ``maximum``, the search range; ``left_mask`` and
-    ``right_mask``; and any setting under its dotted name, such as ``sgm.p2``. YAML and JSON hold a list of such rows,
-    in which a setting may also be a section. Paths are relative to the file.
-
-    Raises
-    ------
-    SatIntervalsError
-        With file, row and what is wrong there.
-    """
-    try:
-        check_regular(file)
-        if file.suffix.lower() == ".csv":
-            rows = _rows_of_csv(file.read_text(encoding="utf-8-sig"))
-        else:
-            rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
-    except SatIntervalsError:
-        raise
-    except (OSError, ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
-        raise SatIntervalsError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):
-        raise SatIntervalsError(f"{file} holds no pairs: needed is a row a pair, with name, left and right")
-    pairs = [_pair(row, file, number) for number, row in enumerate(rows, start=1)]
-    for name, count in Counter(pair.name for pair in pairs).items():
-        if count > 1:
-            raise SatIntervalsError(f"{file}: {count} pairs are called {name}: give each its own name")
-    return pairs
-
-
-def _rows_of_csv(text: str) -> list[Any]:
-    rows = csv.DictReader(io.StringIO(text, newline=""))
-    if twice := [name for name, count in Counter(rows.fieldnames or ()).items() if count > 1]:
-        raise ValueError(f"column {twice[0]} is there twice")
-    return list(rows)
-
-
-def _pair(row: Mapping[str, Any], file: Path, number: int) -> PairOfBatch:
-    values = {key: value for key, value in row.items() if value not in ("", None)}
-    missing = [key for key in ("name", "left", "right") if key not in values]
-    name = str(values.pop("name", ""))
-    if missing or None in row:
-        what = f"lacks {' and '.join(missing)}" if missing else f"has more values than columns: {row[None]}"  # type: ignore[index]
-        raise SatIntervalsError(f"{file}, row {number} {what}")
-    if "cluster" in (key.split(".")[0] for key in map(str, values)):
-        raise SatIntervalsError(f"{file}, row {number}: cluster is one for all pairs: give it by --config or --cluster")
-    if name.startswith(".") or os.sep in name or name in _TAKEN or not name.isprintable():
-        raise SatIntervalsError(
-            f"{file}, row {number}: name {name!r} cannot be that of the pair's folder, take another"
-        )
-    images = {key: _path(str(values.pop(key)), file) for key in _IMAGES if key in values}
-    settings: dict[str, Any] = {}
-    for key, value in values.items():
-        try:
-            _set(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
-        except (ValueError, RecursionError, yaml.YAMLError) as error:
-            raise SatIntervalsError(
-                f"{file}, row {number}: {key} is {value!r}: {' '.join(str(error).split())}"
-            ) from error
-    return PairOfBatch(name, settings=settings, **images)
-
-
-def _set(settings: dict[str, Any], key: str, value: Any) -> None:
-    """Set a setting under its dotted name; texts, such as all cells of a CSV, are YAML."""
-    *sections, last = key.split(".")
-    for section in sections:
-        settings = settings.setdefault(section, {})
-        if not isinstance(settings, dict):
-            raise ValueError(f"the row gives {section} as a whole too")
-    if last in settings:
-        raise ValueError(f"the row gives parts of {last} too" if isinstance(settings[last], dict) else "given twice")
-    settings[last] = load_yaml(value) if isinstance(value, str) else value
-
-
-def _path(path: str, file: Path) -> str:
-    return path if "://" in path or path.startswith("/vsi") else str(file.parent / path)
 
 
 def match_batch(
@@ -153,7 +52,7 @@ def match_batch(
     Parameters
     ----------
     pairs
-        See `read_batch`.
+        See `sat_intervals.config.pairs.read_batch`.
     out
         Each pair has the folder of its name here; ``batch.json`` says how each ended.
     config, overrides

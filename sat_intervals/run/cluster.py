@@ -2,39 +2,27 @@
 
 import gc
 import logging
-import os
 import signal
 import socket
 import threading
-import time
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any
 
-import dask
 from dask.utils import parse_bytes
-from distributed import Client, LocalCluster, Status, Worker, WorkerPlugin
+from distributed import Client, LocalCluster, Worker, WorkerPlugin
 from distributed.utils import silence_logging_cmgr
 
 from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
+from sat_intervals.run.batch_system import LOOPBACK, batch_system
 
-# Seconds without any worker of a batch system, after there were some, at which a run ends.
-WORKERS_GONE = 300.0
 # Seconds for worker processes of this machine to start.
 STARTING = 120.0
-# Seconds from one word on the first worker, for which a run waits, to the next.
-_TOLD_EVERY = 60.0
-
-# Batch systems that know projects and no accounts.
-_CHARGE_PROJECTS = "lsf", "sge"
-
-_LOOPBACK = "127.0.0.1"
 _LOOPBACK_PATIENCE = 5.0
 
 _LOG = logging.getLogger(__name__)
@@ -110,7 +98,7 @@ def _client(settings: Cluster, out: Path) -> Iterator[Client]:
             with _undisturbed():
                 stack.close()
     else:
-        with _batch_system(settings, out / "logs") as cluster, Client(cluster) as client:
+        with batch_system(settings, out / "logs") as cluster, Client(cluster) as client:
             # Adapting, even between equal bounds, submits a job again that ended before the run did; scaling does not.
             cluster.adapt(minimum_jobs=settings.jobs, maximum_jobs=settings.maximum_jobs or settings.jobs)
             yield client
@@ -136,9 +124,9 @@ def _local(settings: Cluster) -> LocalCluster:
                 n_workers=workers if processes else 1,
                 threads_per_worker=1 if processes else workers,
                 processes=processes,
-                host=_LOOPBACK if processes else None,
-                dashboard_address=f"{_LOOPBACK}:0",
-                worker_dashboard_address=f"{_LOOPBACK}:0",
+                host=LOOPBACK if processes else None,
+                dashboard_address=f"{LOOPBACK}:0",
+                worker_dashboard_address=f"{LOOPBACK}:0",
                 silence_logs=logging.CRITICAL,
                 **({"death_timeout": STARTING} if processes else {}),
             )
@@ -159,13 +147,13 @@ def _check_loopback() -> None:
     """Hold that processes of this machine can talk to each other: dask would wait for them without end."""
     try:
         with (
-            socket.create_server((_LOOPBACK, 0)) as server,
+            socket.create_server((LOOPBACK, 0)) as server,
             socket.create_connection(server.getsockname(), timeout=_LOOPBACK_PATIENCE),
         ):
             pass
     except OSError as error:
         raise SatIntervalsError(
-            f"processes cannot reach each other at {_LOOPBACK}: {error.strerror or error}: bring up the loopback "
+            f"processes cannot reach each other at {LOOPBACK}: {error.strerror or error}: bring up the loopback "
             "interface, or use --cluster threads"
         ) from error
 
@@ -216,122 +204,3 @@ def tiles_at_once(settings: Cluster) -> int:
     if settings.kind in ("threads", "processes", "address"):
         return settings.workers or usable_cores()
     return (settings.maximum_jobs or settings.jobs) * settings.cores
-
-
-def _batch_system(settings: Cluster, logs: Path) -> Any:
-    """The dask-jobqueue cluster of SLURM, PBS, LSF or SGE; what is not set comes from the user's dask configuration."""
-    try:
-        import dask_jobqueue
-    except ImportError as error:
-        raise SatIntervalsError(
-            f"cluster {settings.kind} needs dask-jobqueue: pip install sat-intervals[cluster]"
-        ) from error
-    base: Any = getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")
-    options = {
-        "queue": settings.queue,
-        "project" if settings.kind in _CHARGE_PROJECTS else "account": settings.account,
-        "cores": settings.cores,
-        "processes": 1,
-        "memory": settings.memory,
-        "walltime": _without_seconds(settings.walltime) if settings.kind == "lsf" else settings.walltime,
-        "job_extra_directives": settings.directives,
-    }
-    if settings.memory is None and dask.config.get(f"jobqueue.{settings.kind}.memory", None) is None:
-        raise SatIntervalsError(
-            f"cluster {settings.kind} needs the memory of a job: set cluster.memory, such as 4GB, or "
-            f"jobqueue.{settings.kind}.memory of dask's configuration"
-        )
-    given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
-    if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
-        given["scheduler_options"] = {"dashboard_address": f"{_LOOPBACK}:0"}
-    own_logs = dask.config.get(f"jobqueue.{settings.kind}.log-directory", None)
-    # Jobs may not see the folder of a run whose tiles lie elsewhere, and their scripts take no spaces.
-    if own_logs is None and settings.store is None and not any(map(str.isspace, str(logs.absolute()))):
-        given["log_directory"] = str(logs.absolute())
-    submitted: set[str] = set()
-    refusals: list[str] = []
-
-    class Job(base.job_cls):  # type: ignore[misc]
-        async def start(self) -> None:
-            try:
-                await super().start()
-            except RuntimeError as error:  # which dask keeps to itself
-                refusals.append(str(error).rpartition("stderr:")[2])
-                self.status = Status.failed  # else it could not be closed
-                raise
-            submitted.add(self.job_id)
-
-        async def close(self) -> None:
-            await super().close()
-            self.status = Status.closed  # dask asserts it of every job that is not garbage by then
-
-    logged = given.get("log_directory") or own_logs or os.getcwd()
-    own = {"job_cls": Job, "submitted": submitted, "refusals": refusals, "logged": logged}
-    own |= {"seen": None, "told": time.monotonic()}  # of `workers_there`: when a worker was, when the wait was told of
-    batch_system = type(base.__name__, (base,), own)
-    try:
-        return batch_system(**given, silence_logs=logging.CRITICAL)
-    except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
-        raise SatIntervalsError(f"cluster {settings.kind}: {' '.join(str(error).split())}") from error
-
-
-def _without_seconds(walltime: str | None) -> str | None:
-    """Hours and minutes, as LSF wants them."""
-    return ":".join(walltime.split(":")[:2]) if walltime else None
-
-
-def job_script(settings: Cluster, out: Path) -> str:
-    """The script of one job of a batch system, as it would be submitted.
-
-    Raises
-    ------
-    SatIntervalsError
-        For a cluster that submits no jobs.
-    """
-    if settings.kind in ("threads", "processes", "address"):
-        raise SatIntervalsError(f"cluster {settings.kind} submits no jobs: name slurm, pbs, lsf or sge")
-    new = [folder for folder in (out / "logs", out) if not folder.exists()]  # dask-jobqueue makes them
-    with _batch_system(settings, out / "logs") as cluster:
-        script = str(cluster.job_script())
-    for folder in new:
-        with suppress(OSError):
-            folder.rmdir()
-    return script
-
-
-def workers_there(client: Client) -> dict[str, int]:
-    """Addresses and cores of the workers that a client has. Called every few seconds, it ends a wait that is in vain.
-
-    For the first worker of a batch system it waits without limit, and says so once a minute.
-
-    Raises
-    ------
-    SatIntervalsError
-        When the batch system took no job.
-    RunError
-        When its last worker has gone, and none has come since for WORKERS_GONE seconds.
-    """
-    cores: dict[str, int] = client.nthreads()
-    cluster: Any = client.cluster
-    if not hasattr(cluster, "refusals"):
-        return cores
-    now = time.monotonic()
-    if cores:
-        cluster.seen = now
-    elif cluster.refusals and not cluster.submitted:
-        raise SatIntervalsError(
-            f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
-        )
-    elif cluster.seen is None and now - cluster.told >= _TOLD_EVERY:
-        cluster.told = now
-        _LOG.warning(
-            "no worker has come yet: jobs wait in the queue of the batch system, or ended before, of which their logs "
-            "in %s tell",
-            cluster.logged,
-        )
-    elif cluster.seen is not None and now - cluster.seen > WORKERS_GONE:
-        raise RunError(
-            f"the last worker has gone and none has come for {WORKERS_GONE:.0f} s: of the jobs their logs in "
-            f"{cluster.logged} tell; the same command goes on from the tiles that are done"
-        )
-    return cores

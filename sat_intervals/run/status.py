@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sat_intervals.config.pairs import REPORT
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.place import ElsewhereError
 from sat_intervals.store.tiles import is_replacing, store_of
 
-__all__ = ["REPORT", "ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
-
-# In the folder of a batch: how its pairs ended.
-REPORT = "batch.json"
+__all__ = ["ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
 from sat_intervals.errors import RunError
-from sat_intervals.run.cluster import workers_there
+from sat_intervals.run.batch_system import workers_there
 
 # Seconds after which the size of a cluster, which may grow and shrink, is asked for again.
 _LOOK_AGAIN = 2.0

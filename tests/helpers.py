@@ -1,0 +1,82 @@
+"""What several test modules do: write a pair, run a command, wait, and compare runs."""
+
+import hashlib
+import json
+import sysconfig
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import reference
+import yaml
+from click.testing import CliRunner, Result
+
+from sat_intervals.cli import main
+from sat_intervals.demo import Scene
+from sat_intervals.kernels.cost import between, census
+from sat_intervals.kernels.matching import Settings, match
+from sat_intervals.products import INVALID
+from sat_intervals.raster import north_up, write_layer
+from sat_intervals.tiling import Window
+
+COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
+OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
+PLACE = north_up(32631, 300_000, 4_800_000, 0.5)
+PATIENCE = 60.0
+
+
+def write_pair(folder: Path, scene: Scene, *, group: str = "all", **sections: Any) -> dict[str, Any]:
+    """Write the images and the truth of a scene, meta.json and settings.yaml: the settings, its range and sections."""
+    for name, nodata in (("left", 0), ("right", 0), ("truth", np.nan)):
+        write_layer(folder / f"{name}.tif", getattr(scene, name), nodata, PLACE)
+    (folder / "meta.json").write_text(json.dumps({"disparity": [scene.minimum, scene.maximum], "group": group}))
+    settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}} | sections
+    (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
+    return settings
+
+
+def invoke(*arguments: object) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def wait_until(holds: Callable[[], object], what: str, seconds: float = PATIENCE) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, f"{what}: not within {seconds:.0f} s"
+        time.sleep(0.002)
+
+
+def hashes(out: Path) -> dict[str, str]:
+    """SHA-256 of the products of a run."""
+    return {name: hashlib.sha256((out / name).read_bytes()).hexdigest() for name in OUTPUTS if name.endswith(".tif")}
+
+
+def codes_of(scene):
+    """Census codes of a scene of `reference`, left and right."""
+    views = (scene.left, scene.left_state), (scene.right, scene.right_state)
+    return [census(patch, state, scene.window) for patch, state in views]
+
+
+def matched(scene, output=None, core=None, **options):
+    """Raw products and right view of a scene of `reference`, of the whole patch by default."""
+    left, right = codes_of(scene)
+    output = output or Window(0, 0, *left.state.shape)
+    return match(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
+
+
+def bands(out):
+    """Disparity, lower, upper and confidence of a run, and its validity."""
+    with rasterio.open(out / "intervals.tif") as intervals, rasterio.open(out / "validity.tif") as validity:
+        return intervals.read(), validity.read(1)
+
+
+def shares_that_differ(one, other):
+    """Of the pixels that are valid in one of two runs: those of another disparity, and those of another interval."""
+    (first, flags), (second, other_flags) = bands(one), bands(other)
+    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
+    differs = (first != second) & ~(np.isnan(first) & np.isnan(second)) & judged
+    return differs[0].sum() / judged.sum(), (differs[1] | differs[2]).sum() / judged.sum()
