@@ -143,7 +143,7 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
         (["--disparity", 9, -4], ["disparity: minimum 9 is above maximum -4, swap them"]),
         (["--disparity", 260, 300], ["disparities 260 to 300 lead every pixel", "left.tif, 260 columns", "their sign"]),
         (["--disparity", -300, -260], ["disparities -300 to -260 lead every pixel", "right.tif, 260"]),
-        (["--disparity", -200, 60], ["disparities -200 to 60 are 261, more than the 260 columns", "search fewer"]),
+        (["--disparity", -200, 60], ["260 columns, fewer than the 261 disparities", "search fewer"]),
         (["--disparity", -99999, 0], ["disparity.minimum is -99999, allowed: integer >= -16000"]),
         (["--disparity", 3, "far"], ["'--disparity': 'far' is not a valid integer", "match --help"]),
         (["--left-mask", "{}/half-mask.tif"], ["half-mask.tif has 100 x 260 pixels", "left.tif 200 x 260", "size"]),

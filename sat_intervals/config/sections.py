@@ -76,17 +76,12 @@ class Disparity(Section):
         Raises
         ------
         ConfigError
-            No pixel of the left has a candidate in the right, or there are more candidates than columns.
+            No pixel of the left has a candidate in the right.
         """
-        search = f"disparities {self.minimum} to {self.maximum}"
         if left_columns - 1 + self.maximum < 0 or self.minimum > right_columns - 1:
             raise ConfigError(
-                f"{search} lead every pixel of {left}, {left_columns} columns, out of {right}, {right_columns}: check "
-                "their sign, x_right = x_left + disparity"
-            )
-        if self.count > right_columns:
-            raise ConfigError(
-                f"{search} are {self.count}, more than the {right_columns} columns of {right}: search fewer"
+                f"disparities {self.minimum} to {self.maximum} lead every pixel of {left}, {left_columns} columns, out "
+                f"of {right}, {right_columns}: check their sign, x_right = x_left + disparity"
             )
 
     @model_validator(mode="after")

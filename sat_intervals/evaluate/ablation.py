@@ -59,7 +59,7 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     if config.regularization is None:
         raise SatIntervalsError("regularization is null: the ablation compares with and without it, leave it on")
     left, right, truth = (open_image(path) for path in (pair.left, pair.right, pair.truth))
-    check_pair(left, right)
+    check_pair(left, right, config.disparity.count)
     config.disparity.check_images(left.path, left.width, right.path, right.width)
     if (truth.height, truth.width) != (left.height, left.width):
         raise SatIntervalsError(

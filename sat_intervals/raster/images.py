@@ -125,15 +125,15 @@ def open_image(
     return image
 
 
-def check_pair(left: Image, right: Image) -> None:
-    """Hold that the rows of two images correspond.
+def check_pair(left: Image, right: Image, count: int) -> None:
+    """Hold that the rows of two images correspond, and that ``count`` disparities can be searched.
 
     Widths and origins may differ: a disparity counts columns, not ground.
 
     Raises
     ------
     InputError
-        Images that are no epipolar pair.
+        Images that are no epipolar pair, or fewer columns than disparities.
     """
     pair = f"{left.path} and {right.path}"
     if left.height != right.height:
@@ -149,6 +149,8 @@ def check_pair(left: Image, right: Image) -> None:
     if sizes[0] and sizes[1] and not np.allclose(sizes[0], sizes[1], rtol=_SAME_SIZE, atol=0):
         names = "{:.9g} x {:.9g} and {:.9g} x {:.9g}".format(*sizes[0], *sizes[1])
         raise InputError(f"{pair} have different pixel sizes, {names}: resample the pair together")
+    if count > right.width:
+        raise InputError(f"{right.path} has {right.width} columns, fewer than the {count} disparities: search fewer")
 
 
 @contextmanager

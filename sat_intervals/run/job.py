@@ -160,7 +160,7 @@ def fitted_to_jobs(config: Config) -> Config:
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
     """Open the images of a pair and check that they can be matched."""
     left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
-    check_pair(left, right)
+    check_pair(left, right, config.disparity.count)
     config.disparity.check_images(left.path, left.width, right.path, right.width)
     if isinstance(config.cost, Mccnn):
         load_network(weights_file(config.cost.weights))
