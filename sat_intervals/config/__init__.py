@@ -2,7 +2,7 @@
 
 from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
-from sat_intervals.config.reading import load_config, load_yaml, read_small
+from sat_intervals.config.reading import LARGEST_TABLE, load_config, load_yaml, read_small
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -17,6 +17,7 @@ from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import allowed
 
 __all__ = [
+    "LARGEST_TABLE",
     "PRESETS",
     "Ambiguity",
     "Census",

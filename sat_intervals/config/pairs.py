@@ -1,6 +1,7 @@
 """Pairs of known truth, as evaluation takes them: folders, or the rows of a CSV file."""
 
 import csv
+import io
 import json
 from collections import Counter
 from collections.abc import Iterable
@@ -8,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config.reading import read_small
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.config.reading import LARGEST_TABLE, read_small
+from sat_intervals.errors import SatIntervalsError
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
 _COLUMNS = ("left", "right", "truth", "minimum", "maximum")
@@ -106,11 +107,12 @@ def _of_folder(folder: Path) -> Pair:
 
 
 def _of_table(file: Path) -> list[Pair]:
-    check_regular(file)
     try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:  # spreadsheets begin with a mark
-            reader = csv.DictReader(stream)
-            rows, columns = list(reader), reader.fieldnames or []
+        text = read_small(file, LARGEST_TABLE).decode("utf-8-sig")  # spreadsheets begin with a mark
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        rows, columns = list(reader), reader.fieldnames or []
+    except SatIntervalsError:
+        raise
     except OSError as error:
         raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: give a CSV file of pairs") from error
     except (ValueError, csv.Error) as error:

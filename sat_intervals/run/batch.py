@@ -18,8 +18,8 @@ from typing import Any
 import yaml
 from distributed import Client
 
-from sat_intervals.config import Cluster, Config, load_config, load_yaml, read_small
-from sat_intervals.errors import RunError, SatIntervalsError, check_regular
+from sat_intervals.config import LARGEST_TABLE, Cluster, Config, load_config, load_yaml, read_small
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
 from sat_intervals.raster.identity import check_not_replaced
@@ -40,6 +40,8 @@ _IMAGES = ("left", "right", "left_mask", "right_mask")
 _NODES = 200_000
 # Names in the folder of a batch that are not those of pairs.
 _TAKEN = (REPORT, "logs")
+# Bytes of the name of a pair: those of a folder are 255 at most, and a store adds a digest.
+_LONGEST_NAME = 200
 # Completes settings whose search range the pairs bring.
 _ANY_RANGE = {"disparity": {"minimum": 0, "maximum": 0}}
 
@@ -69,14 +71,15 @@ def read_batch(file: Path) -> list[PairOfBatch]:
         With file, row and what is wrong there.
     """
     try:
-        check_regular(file)
         if file.suffix.lower() == ".csv":
-            rows = _rows_of_csv(file.read_text(encoding="utf-8-sig"))
+            rows = _rows_of_csv(read_small(file, LARGEST_TABLE).decode("utf-8-sig"))
         else:
             rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
     except SatIntervalsError:
         raise
-    except (OSError, ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
+    except OSError as error:
+        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: give a list of pairs") from error
+    except (ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
         raise SatIntervalsError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):
         raise SatIntervalsError(f"{file} holds no pairs: needed is a row a pair, with name, left and right")
@@ -103,9 +106,11 @@ def _pair(row: Mapping[str, Any], file: Path, number: int) -> PairOfBatch:
         raise SatIntervalsError(f"{file}, row {number} {what}")
     if "cluster" in (key.split(".")[0] for key in map(str, values)):
         raise SatIntervalsError(f"{file}, row {number}: cluster is one for all pairs: give it by --config or --cluster")
-    if name.startswith(".") or os.sep in name or name in _TAKEN or not name.isprintable():
+    is_name = name.isprintable() and len(name.encode()) <= _LONGEST_NAME and os.sep not in name
+    if not is_name or name.startswith(".") or name in _TAKEN:
         raise SatIntervalsError(
-            f"{file}, row {number}: name {name!r} cannot be that of the pair's folder, take another"
+            f"{file}, row {number}: name {name!r} cannot be that of the pair's folder, take another, of "
+            f"{_LONGEST_NAME} bytes at most"
         )
     images = {key: _path(str(values.pop(key)), file) for key in _IMAGES if key in values}
     settings: dict[str, Any] = {}
@@ -188,7 +193,8 @@ def match_batch(
         for number, pair in enumerate(pairs):
             progress("pairs", number, len(pairs))
             try:
-                settings = load_config(config, {**(overrides or {}), **_merged(overrides or {}, pair.settings)})
+                own = {**(overrides or {}), **_merged(overrides or {}, pair.settings)}
+                settings = load_config(config, own, preset_wins=True)
                 before = None if overwrite else _done_before(pair, out, settings)
                 if before is None:
                     jobs[pair.name] = _begun(pair, out, settings, overwrite, stack)
@@ -223,12 +229,13 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
     folder = out / pair.name
     if not is_complete(folder):
         return None
-    report = open_run(folder).report
-    if changes := changes_since(report, *_images(pair), settings):
+    run = open_run(folder)
+    if changes := changes_since(run.report, *_images(pair), settings):
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
-    return {name: report[name] for name in ("counts", "seconds")}
+    run.check_whole()
+    return {name: run.report[name] for name in ("counts", "seconds")}
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job:
