@@ -19,6 +19,7 @@ from sat_intervals.cli.demo import demo
 from sat_intervals.cli.dsm import dsm
 from sat_intervals.cli.evaluate import evaluate
 from sat_intervals.cli.export import export
+from sat_intervals.cli.logs import printable
 from sat_intervals.cli.match import match
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
@@ -30,6 +31,7 @@ from sat_intervals.cli.status import status
 from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
+_ITEM = "\n  "
 # As of a process that SIGPIPE ends.
 READER_GONE = 141
 _NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
@@ -118,7 +120,8 @@ def _explained(error: Exception) -> tuple[int, str]:
 
 
 def _end(status: int, message: str) -> None:
-    click.echo(f"sat-intervals: {message}", err=True)
+    lines = map(printable, message.split(_ITEM))  # of a list, such as of tiles, a line an item
+    click.echo(f"sat-intervals: {_ITEM.join(lines)}", err=True)
     raise click.exceptions.Exit(status)
 
 

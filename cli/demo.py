@@ -44,7 +44,7 @@ def demo(
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
     overwrite = run["overwrite"] or is_replacing(out / "tiles")
     somewhere = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
-    with Console(quiet) as console, put_back(layers, out / "run.json"):
+    with Console(quiet) as console, put_back(layers if overwrite else (), out / "run.json"):
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed)
         config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum)))

@@ -17,7 +17,16 @@ _OF_RUNS = ("intervals.tif", "validity.tif", "run.json", "points.tif", "dsm.tif"
 
 _LOG = logging.getLogger(__name__)
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
-_WARNINGS = logging.Formatter("sat-intervals: %(message)s")
+
+
+def printable(text: str) -> str:
+    """A message as terminals show it in one line, whatever names it holds: line breaks and the like as escapes."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+
+
+class _Warnings(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return f"sat-intervals: {printable(record.getMessage())}"
 
 
 class _Handler(logging.Handler):
@@ -57,7 +66,7 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
         if debug:
             everything.append(_Handler(_LINES))
         else:
-            warnings = _Handler(_WARNINGS)
+            warnings = _Handler(_Warnings())
             warnings.setLevel(logging.WARNING)
             stack.enter_context(_added(warnings, ours))
         # dask gives its logger a handler of its own, and keeps the root's from it, unless the root has some by then

@@ -23,7 +23,7 @@ from sat_intervals.raster import (
     read_small_layers,
     read_window,
 )
-from sat_intervals.raster.identity import check_not_replaced, is_changed
+from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed
 from sat_intervals.tiling import Window, strips
 
 # Pixels of a strip, and bands of the files.
@@ -91,6 +91,18 @@ class Run:
         finally:
             if _which(self.out / "run.json") != self.which:
                 raise RunError(f"the run in {self.out} was replaced while it was read: run the command again")
+
+    def check_whole(self) -> None:
+        """Hold that every byte of the files is what the run published.
+
+        Raises
+        ------
+        SatIntervalsError
+            With the first file that is damaged or was changed.
+        """
+        for name, told in self.report.get("files", {}).items():
+            if name in _BANDS and checksum_of(self.out / name) != told:
+                raise _damaged(self.out / name, "is not what the run published")
 
     def windows(self) -> Iterator[Window]:
         """Full-width windows of the results, from the top."""
@@ -209,6 +221,7 @@ def open_run(out: str | Path) -> Run:
         for side in ("left", "right"):
             _check_input(report["inputs"][side])
         region = Window(**{name: index(report["tiles"]["region"][name]) for name in _REGION})
+        sizes = {name: index(told["bytes"]) for name, told in report.get("files", {}).items()}
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
@@ -216,7 +229,7 @@ def open_run(out: str | Path) -> Run:
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
     for name, bands in _BANDS.items():
-        _check_raster(out / name, bands, region)
+        _check_raster(out / name, bands, region, sizes.get(name))
     return Run(out, report, config, region, which)
 
 
@@ -250,16 +263,24 @@ def _nodata(told: dict[str, Any]) -> float | None:
     return None if told["nodata"] is None else float(told["nodata"])
 
 
-def _check_raster(file: Path, bands: int, region: Window) -> None:
-    """Hold that a raster is there, and what the report of its run tells."""
+def _check_raster(file: Path, bands: int, region: Window, size: int | None) -> None:
+    """Hold that a raster is there, and what the report of its run tells; of other versions it tells no size."""
     if not file.exists():
         raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or run match again")
+    if size not in (None, file.stat().st_size):
+        raise _damaged(file, f"has {file.stat().st_size} bytes, by run.json {size}")
     found, needed = read_shape(file), (bands, region.height, region.width)
     if found != needed:
         raise SatIntervalsError(
             f"{file} has {found[0]} bands of {found[1]} x {found[2]} pixels, by run.json {needed[0]} of {needed[1]} x "
             f"{needed[2]}: run match again with --overwrite"
         )
+
+
+def _damaged(file: Path, how: str) -> SatIntervalsError:
+    return SatIntervalsError(
+        f"{file} {how}; it is damaged or was changed: move {file.parent} away, or match again with --overwrite"
+    )
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:

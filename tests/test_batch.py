@@ -73,12 +73,14 @@ def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(i
     assert sorted(file.name for file in (tmp_path / "pair1").iterdir()) == OUTPUTS
 
 
-def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path):
+@pytest.mark.parametrize("place", ["option", "config"])
+def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path, place):
     lines = ["name,left,right,minimum,maximum,preset", "one,left1.tif,right1.tif,-18,40,"]
     lines += ["two,left2.tif,right2.tif,-18,40,mountain"]
     (images / "presets.csv").write_text("\n".join(lines) + "\n")
-    overrides = {"preset": "satellite", "tiles": {"size": 64, "overlap": 20}}
-    report = match_batch(read_batch(images / "presets.csv"), tmp_path, overrides=overrides)
+    config, overrides = {"tiles": {"size": 64, "overlap": 20}}, {}
+    (overrides if place == "option" else config)["preset"] = "satellite"
+    report = match_batch(read_batch(images / "presets.csv"), tmp_path, config, overrides=overrides)
     assert {name: end["state"] for name, end in report.items()} == {"one": "done", "two": "done"}
     settings = [open_run(tmp_path / name).config for name in ("one", "two")]
     assert [(one.preset, one.sgm.p2) for one in settings] == [("satellite", 128), ("mountain", 464)]

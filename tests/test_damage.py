@@ -10,10 +10,13 @@ from helpers import OUTPUTS, hashes, invoke, write_pair
 from networks import random_weights, write_network
 
 from sat_intervals import match_pair
+from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.results import open_run
 from sat_intervals.run import pair as run
 from sat_intervals.run.assemble import assemble
+from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_tile
 from sat_intervals.store.tiles import DamagedTilesError, Store
@@ -347,3 +350,71 @@ def test_match__takes_an_input_of_a_damaged_manifest_for_unknown(scene, tmp_path
     manifest["inputs"]["left"]["sha256"] = manifest["inputs"]["left"]["sha256"][::-1]
     (tiles / "manifest.json").write_text(json.dumps(manifest))
     assert "it is damaged: --overwrite" in match(scene, tmp_path / "out", status=2)
+
+
+@pytest.mark.parametrize("how", ["half", "bit"])
+@pytest.mark.parametrize("name", ["intervals.tif", "validity.tif"])
+def test_match_batch__takes_no_damaged_result_for_done(scene, tmp_path, name, how):
+    pairs = [PairOfBatch("kept", str(scene / "left.tif"), str(scene / "right.tif"))]
+    shutil.copytree(scene / "kept", tmp_path / "kept")
+    assert match_batch(pairs, tmp_path, scene / "settings.yaml")["kept"]["state"] == "done before"
+    damage(tmp_path / "kept" / name, how)
+    before = (tmp_path / "kept" / name).read_bytes()
+    told = match_batch(pairs, tmp_path, scene / "settings.yaml", keep_tiles=True)["kept"]
+    assert told["state"] == "failed"
+    assert f"{tmp_path}/kept/{name} " in told["error"]
+    assert told["error"].endswith(f"move {tmp_path}/kept away, or match again with --overwrite")
+    assert (tmp_path / "kept" / name).read_bytes() == before
+    match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)
+    assert_same(scene, tmp_path / "kept")
+
+
+def test_match__keeps_the_tiles_of_a_dead_run_of_which_a_bit_flipped(scene, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, status=1)
+    status = (out / "validity.tif").stat()
+    damage(out / "validity.tif", "bit")
+    os.utime(out / "validity.tif", ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert f"{out}/validity.tif is not what the run published" in match(scene, out, status=2)
+    assert list((out / "tiles" / "records").glob("*.json"))
+
+
+@pytest.mark.parametrize("command", ["evaluate OUT", "report OUT", "plot OUT", "export OUT TARGET --to otb"])
+def test_commands__refuse_a_result_of_another_size(scene, tmp_path, command):
+    shutil.copytree(scene / "kept", tmp_path / "OUT")
+    with (tmp_path / "OUT" / "intervals.tif").open("ab") as file:
+        file.write(b"0")  # which GDAL does not see
+    words = [str(tmp_path / word) if word.isupper() else word for word in command.split()]
+    result = invoke(*words)
+    size = (scene / "kept" / "intervals.tif").stat().st_size
+    assert f"{tmp_path}/OUT/intervals.tif has {size + 1} bytes, by run.json {size}; it is damaged" in result.stderr
+    assert result.exit_code == 2
+
+
+def test_open_run__of_a_report_without_sizes_opens(scene, tmp_path):
+    shutil.copytree(scene / "kept", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    del report["files"]
+    (tmp_path / "out" / "run.json").write_text(json.dumps(report))
+    open_run(tmp_path / "out").check_whole()
+
+
+def test_match__keeps_empty_files_in_a_folder_without_signs_of_a_run(scene, tmp_path):
+    mine = [tmp_path / "out" / "tiles" / name for name in ("records/9_9.json", "arrays.zarr/int16/c/0/9/9")]
+    for file in mine:
+        file.parent.mkdir(parents=True)
+        file.touch()
+    match(scene, tmp_path / "out")
+    assert_same(scene, tmp_path / "out")
+    assert [file.stat().st_size for file in mine] == [0, 0]
+
+
+@pytest.mark.parametrize("name", [SHARDS[0], "records/1_0.json"])
+def test_match__names_a_folder_where_a_file_of_a_tile_must_be(scene, tmp_path, name):
+    (tmp_path / "out" / "tiles" / name).mkdir(parents=True)
+    command = ["match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--config", scene / "settings.yaml"]
+    result = invoke(*command, "--quiet")
+    assert result.exit_code == 1
+    assert f"tile 1_0: {tmp_path}/out/tiles/{name}: Is a directory" in result.stderr.splitlines()[1]

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import threading
 import zipfile
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -562,6 +563,33 @@ def test_demo__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(tmp_pat
         identity(str(out / "left.tif"))["sha256"]
         == json.loads((out / "run.json").read_text())["inputs"]["left"]["sha256"]
     )
+
+
+KILLED = """import os, sys
+from sat_intervals.cli import main
+from sat_intervals.run import pair
+pair.match_pair = lambda *arguments, **options: os.kill(os.getpid(), 9)
+main(sys.argv[1:])"""
+
+
+def test_demo__that_was_killed_is_rolled_back_or_replaced_by_the_next(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    command = ["demo", str(out), "--size", "120", "140", "--quiet"]
+    assert invoke(*command).exit_code == 0
+    before = contents(out)
+    killed = [sys.executable, "-c", KILLED, *command, "--seed", "1", "--overwrite"]
+    for _ in range(2):  # of which the second finds what the first left
+        assert subprocess.run(killed, check=False).returncode == -9
+    assert (out / "left.tif").read_bytes() != before[str(out / "left.tif")]
+    assert invoke(*command, "--seed", "2").exit_code == 2  # nothing is replaced unasked
+    with monkeypatch.context() as patch:
+        patch.setattr("sat_intervals.run.pair.match_pair", fail)
+        assert invoke(*command, "--seed", "2", "--overwrite").exit_code == 1
+    assert contents(out) == before
+    assert subprocess.run(killed, check=False).returncode == -9
+    assert invoke(*command, "--seed", "1", "--overwrite").exit_code == 0
+    assert contents(out).keys() == before.keys()
+    assert (out / "left.tif").read_bytes() != before[str(out / "left.tif")]
 
 
 def test_demo__replaces_links_and_does_not_follow_them(tmp_path):

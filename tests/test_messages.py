@@ -5,17 +5,21 @@ import os
 import resource
 import subprocess
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rasterio
 from helpers import COMMAND, invoke
+from rasterio._err import CPLE_OutOfMemoryError
 
-from sat_intervals import SatIntervalsError, match_arrays, open_image
+from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
 from sat_intervals.cli import app
+from sat_intervals.config import reading
+from sat_intervals.config.pairs import read_batch
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import Projection, read_window
+from sat_intervals.raster import RUN_FILES, Georeferencing, OutputWriter, Projection, read_window, write_layer, writer
 from sat_intervals.tiling import Window
 
 LOCAL = 'LOCAL_CS["site grid",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
@@ -115,7 +119,80 @@ def test_main__says_that_stdout_cannot_be_written(argument):
     assert (result.returncode, result.stderr) == (1, message)
 
 
+@pytest.mark.parametrize("error", [CPLE_OutOfMemoryError(3, 2, "no block"), OSError(12, "Cannot allocate memory")])
+def test_output_writer__tells_a_lack_of_memory_from_a_full_disk(tmp_path, monkeypatch, error):
+    def fail(*arguments, **options):
+        raise error
+
+    with OutputWriter(tmp_path, RUN_FILES, 9, 9, Georeferencing(), {}) as files:
+        monkeypatch.setattr(writer, "copy", fail)
+        monkeypatch.setattr(writer.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
+        with pytest.raises(SatIntervalsError, match=r"tif cannot be written: not enough memory \(") as caught:
+            files.build()
+    assert "space" not in str(caught.value)
+
+
+def test_main__tells_of_a_line_break_in_a_path_in_one_line(tmp_path):
+    pages = write(tmp_path / "pa\nges.tif", np.ones((9, 9), np.uint8))
+    write(pages, np.ones((9, 9), np.uint8), APPEND_SUBDATASET="YES")
+    result = invoke("plan", str(pages), "no\n\x1b[2Jne.tif", "--disparity", "0", "4")
+    assert result.exit_code == 2
+    warning, error = result.stderr.splitlines()
+    assert "pa\\nges.tif has 2 pages" in warning
+    assert "no\\n\\x1b[2Jne.tif cannot be read" in error
+
+
+# ---- Settings and lists ------------------------------------------------------------------------------------------
+def test_read_batch__names_what_cannot_be_read_and_names_that_are_too_long(tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"nope.csv cannot be read: No such file or directory: give a list"):
+        read_batch(tmp_path / "nope.csv")
+    (tmp_path / "pairs.csv").write_text(f"name,left,right\n{201 * 'a'},l,r\n")
+    with pytest.raises(SatIntervalsError, match=r"row 1: name 'a+' cannot be .*, take another, of 200 bytes at most$"):
+        read_batch(tmp_path / "pairs.csv")
+
+
+def test_load_config__warns_once_of_penalties_that_are_not_of_the_preset(caplog):
+    satellite = {"preset": "satellite", "disparity": {"minimum": 0, "maximum": 9}}
+    mccnn = {"cost": {"method": "mccnn"}}
+    reading._warn.cache_clear()
+    load_config(satellite)
+    load_config(satellite | {"preset": "satellite-mccnn"}, mccnn)
+    load_config(satellite, mccnn | {"sgm": {"p2": 4, "span": 45}})
+    assert not caplog.records
+    for _ in range(2):
+        load_config(load_config(satellite, mccnn))
+    (record,) = caplog.records
+    assert "preset satellite sets no penalties for cost.method mccnn" in record.getMessage()
+    assert "--preset satellite-mccnn" in record.getMessage()
+
+
+def test_load_config__refuses_a_preset_that_would_change_nothing_of_a_config():
+    config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 9}})
+    with pytest.raises(SatIntervalsError, match="preset 'urban' would change nothing of a Config"):
+        load_config(config, {"preset": "urban"})
+    assert load_config(config, {"preset": "satellite"}) == config
+
+
 # ---- Images ------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("how", ["cut", "source"])
+def test_plan__of_an_image_that_cannot_be_read_speaks_of_no_run(tmp_path, how):
+    image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
+    bad = tmp_path / "bad.vrt"
+    if how == "cut":
+        write_layer(bad, np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8), 0, Georeferencing())
+        os.truncate(bad, bad.stat().st_size - 2000)
+    else:
+        bad.write_text(
+            '<VRTDataset rasterXSize="64" rasterYSize="64"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+            "<SourceFilename>nowhere.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+        )
+    result = invoke("plan", str(bad), str(image), "--disparity", "-2", "2")
+    (line,) = result.stderr.splitlines()
+    assert f"a sample of the pair cannot be matched: {bad} cannot be read at rows 0 to 63" in line
+    assert "--overwrite" not in line
+    assert result.exit_code == 1
+
+
 def test_open_image__refuses_a_colour_table(tmp_path):
     path = write(tmp_path / "palette.tif", np.ones((9, 9), np.uint8))
     with rasterio.open(path, "r+") as file:

@@ -4,10 +4,12 @@ import json
 import logging
 import os
 import signal
+import socket
 import threading
 import time
 from types import SimpleNamespace
 
+import dask
 import numpy as np
 import psutil
 import pytest
@@ -129,6 +131,14 @@ def test_read_small__refuses_a_large_file(tmp_path):
             read(file)
 
 
+@pytest.mark.parametrize("read", [read_batch, lambda file: find_pairs([file])])
+def test_read_small__refuses_a_large_table(tmp_path, read):
+    file = tmp_path / "pairs.csv"
+    file.write_bytes(b"name,left,right\n" + 2_000_000 * b"a,b,c\n")
+    with pytest.raises(SatIntervalsError, match=r"pairs.csv has more than 10 MB: is it the right file\?$"):
+        read(file)
+
+
 def test_read_batch__takes_a_list_of_thousands_of_pairs(tmp_path):
     file = tmp_path / "pairs.json"
     file.write_text(json.dumps([{"name": f"p{i}", "left": "a", "right": "b"} for i in range(3000)]))
@@ -212,6 +222,30 @@ def test_connected__refuses_processes_that_cannot_reach_each_other(tmp_path, mon
         connected(Cluster(kind="processes", workers=1), tmp_path),
     ):
         pass
+
+
+def test_connected__does_not_wait_for_a_host_that_nobody_knows(tmp_path):
+    began = time.monotonic()
+    address = "tcp://nowhere.invalid:1"
+    with (
+        pytest.raises(SatIntervalsError, match=f"no dask scheduler answers at {address}: "),
+        connected(Cluster(kind="address", address=address), tmp_path),
+    ):
+        pass
+    assert time.monotonic() - began < 10
+
+
+def test_connected__says_that_it_waits_for_a_scheduler(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(cluster, "_TOLD_AFTER", 0.1)
+    with socket.socket() as server, dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        server.bind(("127.0.0.1", 0))  # and nobody listens
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            pytest.raises(SatIntervalsError, match="no dask scheduler answers at"),
+            connected(Cluster(kind="address", address=address), tmp_path),
+        ):
+            pass
+    assert f"waiting for the dask scheduler at {address}" in [record.getMessage() for record in caplog.records]
 
 
 def test_connected__ends_when_worker_processes_do_not_start(tmp_path, monkeypatch):

@@ -12,8 +12,8 @@ from typing import Any
 
 import yaml
 
-from sat_intervals.config.reading import load_yaml, read_small
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.config.reading import LARGEST_TABLE, load_yaml, read_small
+from sat_intervals.errors import SatIntervalsError
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
 _COLUMNS = ("left", "right", "truth", "minimum", "maximum")
@@ -22,6 +22,8 @@ NO_GROUP = "all"
 # In the folder of a batch: how its pairs ended, and the logs of jobs; no pair is called so.
 REPORT = "batch.json"
 _TAKEN = (REPORT, "logs")
+# Bytes of the name of a pair: those of a folder are 255 at most, and a store adds a digest.
+_LONGEST_NAME = 200
 _IMAGES = ("left", "right", "left_mask", "right_mask")
 # Nodes of a list of pairs in YAML or JSON, which may have thousands of rows.
 _NODES = 200_000
@@ -161,8 +163,12 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
     name = str(row.pop("name"))
     if "cluster" in (str(key).split(".")[0] for key in row):
         raise SatIntervalsError(f"{place}: cluster is one for all pairs: give it by --config or --cluster")
-    if name.startswith(".") or os.sep in name or name in _TAKEN or not name.isprintable():
-        raise SatIntervalsError(f"{place}: name {name!r} cannot be that of the pair's folder, take another")
+    is_name = name.isprintable() and len(name.encode()) <= _LONGEST_NAME and os.sep not in name
+    if not is_name or name.startswith(".") or name in _TAKEN:
+        raise SatIntervalsError(
+            f"{place}: name {name!r} cannot be that of the pair's folder, take another, of {_LONGEST_NAME} bytes at "
+            "most"
+        )
     images = {key: _beside(file, str(row.pop(key))) for key in _IMAGES if key in row}
     settings: dict[str, Any] = {}
     for key, value in row.items():
@@ -193,9 +199,8 @@ def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]
     """The rows of a CSV, YAML or JSON file without their empty values, each behind its place, file and number."""
     wanted = f"needed is a row a pair, with {', '.join(needed)}"
     try:
-        check_regular(file)
         if file.suffix.lower() == ".csv":
-            rows = _rows_of_csv(file.read_text(encoding="utf-8-sig"))  # spreadsheets begin with a mark
+            rows = _rows_of_csv(read_small(file, LARGEST_TABLE).decode("utf-8-sig"))  # spreadsheets begin with a mark
         else:
             rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
     except SatIntervalsError:

@@ -51,7 +51,7 @@ def without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) 
     chosen = method(overrides)
     if chosen is None:
         return values
-    preset = values.get("preset") or overrides.get("preset")
+    preset = overrides.get("preset") or values.get("preset")
     if chosen == (method(values) or method(_settings(preset)) or "census"):
         return values
     return {key: value for key, value in values.items() if key != "cost" and (key != "sgm" or value is None)}

@@ -1,6 +1,8 @@
 """Settings from YAML files, mappings and the command line."""
 
+import logging
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,18 @@ from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import explained, shown
 from sat_intervals.errors import SatIntervalsError, check_regular
 
-# Bytes of a file of settings or pairs, and nodes of YAML of a file of settings, an alias counted as what it repeats.
-_LARGEST_FILE, _NODES = 10**6, 10_000
+# Bytes of a file of settings or pairs, and of one of pairs in CSV. Nodes of YAML of a file of settings, where an alias
+# counts as what it repeats.
+_LARGEST_FILE, LARGEST_TABLE, _NODES = 10**6, 10**7, 10_000
+
+_LOG = logging.getLogger(__name__)
 
 
 def load_config(
     source: str | Path | Mapping[str, Any] | Config | None = None,
     overrides: Mapping[str, Any] | None = None,
+    *,
+    preset_wins: bool = False,
 ) -> Config:
     """Check settings and complete them with the defaults.
 
@@ -30,6 +37,8 @@ def load_config(
         settings that fill in what is left out.
     overrides
         Sections and keys that win over ``source``, as those of the command line do.
+    preset_wins
+        Whether ``preset`` does too; else two that differ are refused.
 
     Raises
     ------
@@ -46,20 +55,37 @@ def load_config(
             values, file = _read_yaml(Path(source)), f"{source}: "
         case Config():
             values = source.model_dump()
+            if overrides.get("preset") not in (None, source.preset):
+                raise ConfigError(
+                    f"preset {shown(overrides['preset'])} would change nothing of a Config, which has all "
+                    "settings: give it with those that the Config was made from"
+                )
         case Mapping():
             values = source
         case _:
             raise ConfigError(f"settings are {shown(source)}, allowed: a YAML file, a mapping or a Config")
     names = [settings["preset"] for settings in (values, overrides) if settings.get("preset") is not None]
-    if len(set(map(str, names))) > 1:
+    if len(set(map(str, names))) > 1 and not preset_wins:
         raise ConfigError(f"{file}preset is {shown(names[0])}, and {shown(names[1])} is asked for: leave one out")
+    settings = merged(without_other_cost(values, overrides), overrides)
     try:
-        return Config.model_validate(merged(without_other_cost(values, overrides), overrides))
+        config = Config.model_validate(settings)
     except ValidationError as error:
         problems = error.errors(include_url=False)
         if all(_given(overrides, problem["loc"]) for problem in problems):
             file = ""  # not to blame for what the overrides brought
         raise ConfigError(file + "; ".join(map(explained, problems))) from error
+    if "sgm" not in settings and (better := f"{config.preset}-{config.cost.method}") in PRESETS:
+        _warn(
+            f"preset {config.preset} sets no penalties for cost.method {config.cost.method}, whose defaults are taken: "
+            f"--preset {better} has some for such images"
+        )
+    return config
+
+
+@lru_cache  # once for all pairs of a batch
+def _warn(line: str) -> None:
+    _LOG.warning(line)
 
 
 def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
@@ -119,21 +145,21 @@ def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
         loader.dispose()
 
 
-def read_small(file: Path) -> bytes:
-    """Content of a file of settings or pairs.
+def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:
+    """Content of a file of settings or pairs, of ``most`` bytes.
 
     Raises
     ------
     OSError
         For a file that cannot be read.
     SatIntervalsError
-        For one of more than 1 MB, and for what is no regular file.
+        For a larger one, and for what is no regular file.
     """
     check_regular(file)
     with file.open("rb") as stream:
-        content = stream.read(_LARGEST_FILE + 1)
-    if len(content) > _LARGEST_FILE:
-        raise SatIntervalsError(f"{file} has more than {_LARGEST_FILE // 10**6} MB: is it the right file?")
+        content = stream.read(most + 1)
+    if len(content) > most:
+        raise SatIntervalsError(f"{file} has more than {most // 10**6} MB: is it the right file?")
     return content
 
 

@@ -1,5 +1,6 @@
 """What every use of GDAL here needs: an image without georeferencing taken as it is, and errors in one line."""
 
+import errno
 import re
 import threading
 import warnings
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from rasterio import Env
-from rasterio._err import CPLE_BaseError
+from rasterio._err import CPLE_BaseError, CPLE_OutOfMemoryError
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader, DatasetWriter
 
@@ -43,6 +44,14 @@ def reason(error: BaseException) -> str:
     while error.__cause__ is not None:
         error = error.__cause__
     return "GDAL names no cause" if isinstance(error, SystemError) else " ".join(str(error).split())
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an allocation failed, by the first cause of an error."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    is_told = re.search("out of memory|(cannot|unable to|failed to) allocate", str(error), re.IGNORECASE)
+    return isinstance(error, CPLE_OutOfMemoryError) or getattr(error, "errno", None) == errno.ENOMEM or bool(is_told)
 
 
 def _accept_no_georeferencing() -> None:

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -109,6 +110,15 @@ def _sha256(file: str | Path, stamp: str) -> str:
     if _stamp(file) != stamp:
         raise ChangedInputError(f"{file} is being written: run the command again when it is whole")
     return digest
+
+
+def checksum_of(file: Path) -> dict[str, int]:
+    """Bytes and CRC-32 of a local file."""
+    size = crc32 = 0
+    with file.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            size, crc32 = size + len(block), zlib.crc32(block, crc32)
+    return {"bytes": size, "crc32": crc32}
 
 
 def _of_url(url: str) -> dict[str, Any]:

@@ -17,7 +17,11 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
+from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
+
+# A file kept aside: by which report, and its name.
+_ASIDE = ".sat-intervals.{}.{}"
 
 
 def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing:
@@ -43,29 +47,38 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
-    """Keep files aside while the block may replace them; put them back where it fails before ``report`` is new."""
+    """Keep files aside while the block may replace them; put them back where it ends before ``report`` is new.
 
-    def which() -> tuple[int, int] | None:
-        return (report.stat().st_ino, report.stat().st_mtime_ns) if report.exists() else None
+    Where the process is killed, the next block of the same files begins with that.
+    """
+    with LocalFolder(report.parent).locked():
+        _settle(files, report)
+        try:
+            for file in filter(os.path.lexists, files):
+                try:
+                    os.link(file, _aside(file, report), follow_symlinks=False)
+                except OSError:  # a disk without links
+                    with whole_file(_aside(file, report)) as new:
+                        shutil.copy2(file, new, follow_symlinks=False)
+            yield
+        finally:
+            _settle(files, report)
 
-    of_before = which()
-    aside = {file: file.with_name(f".{uuid.uuid4().hex}-{file.name}") for file in files if os.path.lexists(file)}
-    try:
-        for file, before in aside.items():
-            try:
-                os.link(file, before, follow_symlinks=False)
-            except OSError:  # a disk without links
-                shutil.copy2(file, before, follow_symlinks=False)
-        yield
-    except BaseException:
-        for file, before in aside.items():
-            with suppress(FileNotFoundError):
-                if which() == of_before:
-                    os.replace(before, file)
-        raise
-    finally:
-        for before in aside.values():  # also where it is a link to the very file
-            before.unlink(missing_ok=True)
+
+def _settle(files: Sequence[Path], report: Path) -> None:
+    """Put files back that were kept with the report that is there, and delete those kept with one of before."""
+    for file in files:
+        for kept in file.parent.glob(_ASIDE.format("*", file.name)):
+            if kept == _aside(file, report):
+                os.replace(kept, file)
+            kept.unlink(missing_ok=True)  # also where it is a link to the very file
+
+
+def _aside(file: Path, report: Path) -> Path:
+    """Where a file is kept until the report that is there now is replaced."""
+    status = report.stat() if report.exists() else None
+    which = f"{status.st_size:x}-{status.st_mtime_ns:x}" if status else "none"
+    return file.with_name(_ASIDE.format(which, file.name))
 
 
 def write_layer(

@@ -21,6 +21,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.identity import checksum_of
 from sat_intervals.store.folder import LocalFolder
 
 # Folder, beside the files, where they grow until they are whole; named after the first of them, and locked. Files of
@@ -144,12 +145,13 @@ class OutputWriter:
                 self._strips[file.name].write(bands, window=area)
             self._sums[file.name] += _sum(bands)
 
-    def build(self) -> None:
-        """Make the files that `publish` names, and read them back."""
+    def build(self) -> dict[str, dict[str, int]]:
+        """Make the files that `publish` names, and read them back; returns size and CRC-32 of those made, by name."""
+        files = [file for file in self._files if file.name in self._strips]
         with ThreadPoolExecutor() as threads:  # GDAL's own threads compress, but one alone reads and writes a file
-            list(threads.map(self._build, [file for file in self._files if file.name in self._strips]))
+            return {file.name: made for file, made in zip(files, threads.map(self._build, files), strict=True)}
 
-    def _build(self, file: File) -> None:
+    def _build(self, file: File) -> dict[str, int]:
         name, strips, whole = file.name, self._strips[file.name], self._scratch / file.name
         options = _COG | {"NUM_THREADS": self._threads, "PREDICTOR": file.predictor} if file.driver == "COG" else {}
         with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
@@ -160,7 +162,9 @@ class OutputWriter:
             copy(strips.name, str(whole), driver=file.driver, **options)
             _flush(whole)
             self._verify(whole, self._sums[name])
+            made = checksum_of(whole)
         os.unlink(strips.name)
+        return made
 
     def publish(self, report: tuple[str, str] | None = None) -> None:
         """Give the files their names, all of them or none.
@@ -244,6 +248,10 @@ class OutputWriter:
         try:
             yield
         except (*gdal.GDAL_ERRORS, OSError) as error:
+            if gdal.is_out_of_memory(error):
+                raise OutputError(
+                    f"{path} cannot be written: not enough memory ({gdal.reason(error)}): give the process more"
+                ) from error
             raise OutputError(f"{path} cannot be written: {self._reason(error)}: {_WAY_OUT}") from error
 
     def _reason(self, error: Exception) -> str:

@@ -77,13 +77,13 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
                 progress("bands", row, region.height)
         with logged_stage(seconds, "files"):
             progress("files", 0, 1)
-            writer.build()
+            files = writer.build()
             job.check_inputs()
             progress("files", 0, 1)  # so that a run that is to end does so before it publishes
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
-        report = _report(job, normalization, scale, tally, seconds, seams)
+        report = _report(job, normalization, scale, tally, seconds, seams) | {"files": files}
         _warn_of_ambiguity(job, report["counts"])
         if not keep_tiles:
             mark_finished(store.home, job.name)

@@ -90,7 +90,8 @@ def match_batch(
         for number, pair in enumerate(pairs):
             progress("pairs", number, len(pairs))
             try:
-                settings = load_config(config, {**(overrides or {}), **_merged(overrides or {}, pair.settings)})
+                own = {**(overrides or {}), **_merged(overrides or {}, pair.settings)}
+                settings = load_config(config, own, preset_wins=True)
                 before = None if overwrite else _done_before(pair, out, settings)
                 if before is None:
                     jobs[pair.name] = _begun(pair, out, settings, overwrite, stack)
@@ -125,12 +126,13 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
     folder = out / pair.name
     if not is_complete(folder):
         return None
-    report = open_run(folder).report
-    if changes := changes_since(report, *_images(pair), fitted_to_jobs(settings)):
+    run = open_run(folder)
+    if changes := changes_since(run.report, *_images(pair), fitted_to_jobs(settings)):
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
-    return {name: report[name] for name in ("counts", "seconds")}
+    run.check_whole()
+    return {name: run.report[name] for name in ("counts", "seconds")}
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job:

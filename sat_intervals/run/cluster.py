@@ -14,6 +14,7 @@ from pathlib import Path
 
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster, Worker, WorkerPlugin
+from distributed.comm.addressing import resolve_address
 from distributed.utils import silence_logging_cmgr
 
 from sat_intervals.config import Cluster, ConfigError
@@ -23,6 +24,8 @@ from sat_intervals.run.batch_system import LOOPBACK, batch_system
 
 # Seconds for worker processes of this machine to start.
 STARTING = 120.0
+# Seconds without an answer of a scheduler at which a wait is told of.
+_TOLD_AFTER = 3.0
 _LOOPBACK_PATIENCE = 5.0
 
 _LOG = logging.getLogger(__name__)
@@ -88,7 +91,7 @@ def _is_news(record: logging.LogRecord) -> bool:
 @contextmanager
 def _client(settings: Cluster, out: Path) -> Iterator[Client]:
     if settings.kind == "address":
-        with silence_logging_cmgr(logging.CRITICAL), _client_of(settings.address) as client:
+        with silence_logging_cmgr(logging.CRITICAL), _client_of(str(settings.address)) as client:
             yield client
     elif settings.kind in ("threads", "processes"):
         with ExitStack() as stack:
@@ -104,11 +107,18 @@ def _client(settings: Cluster, out: Path) -> Iterator[Client]:
             yield client
 
 
-def _client_of(address: str | None) -> Client:
+def _client_of(address: str) -> Client:
+    told = threading.Timer(_TOLD_AFTER, _LOG.warning, ["waiting for the dask scheduler at %s", address])
+    told.start()
     try:
+        resolve_address(address)  # a host that nobody knows: dask would try it again and again
         return Client(address)
     except (OSError, ValueError) as error:
-        raise SatIntervalsError(f"no dask scheduler answers at {address}: {error}") from error
+        raise SatIntervalsError(
+            f"no dask scheduler answers at {address}: {getattr(error, 'strerror', None) or error}"
+        ) from error
+    finally:
+        told.cancel()
 
 
 def _local(settings: Cluster) -> LocalCluster:

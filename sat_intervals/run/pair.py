@@ -93,11 +93,12 @@ def match_pair(
     with LocalFolder(job.store.home).locked():
         if not overwrite and job.is_finished():
             check_as_published(job.out)
-            report = open_run(job.out).report
+            run = open_run(job.out)
+            run.check_whole()
             job.store.remove()
             remove_scratch(job.out, RUN_FILES)
             _LOG.warning("the run in %s was complete; the tiles that it left are removed now", job.out)
-            return report
+            return run.report
         job.begin(overwrite=overwrite)
         with logged_stage(seconds, "kernels"):
             progress("kernels", 0, 1)
@@ -172,7 +173,7 @@ def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
         raise RunError(
             f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept; mend the cause and run the "
             f"same command again, with --overwrite where an input changed:\n{lines}"
-        )
+        ) from min(failures.items())[1]
 
 
 def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[tuple[Job, dict[str, BaseException]]]:
@@ -202,7 +203,7 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
             raise RunError(
                 f"{error.filename or jobs[i].store.folder}: {error.strerror}: make room and run the same command "
                 "again, it goes on from the tiles that are done"
-            )
+            ) from error
         if error is not None:
             failures[i][tile.name] = error
             jobs[i].store.write_failure(tile.name, reason(error))

@@ -13,6 +13,7 @@ from sat_intervals.raster import Image
 from sat_intervals.run.cluster import tiles_at_once
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.pair import match_pair
+from sat_intervals.run.submit import reason
 from sat_intervals.tiling import Grid, Window
 
 # Side of the window at the centre of the image that is matched to tell the time.
@@ -149,8 +150,8 @@ def _sampled(left: Image, right: Image, out: Path, config: Config, region: Windo
         sample = Window(row, column, height, width)
         try:
             return sample, match_pair(left, right, out, config, window=sample, overwrite=True)["seconds"]
-        except RunError:
-            raise
+        except RunError as error:  # its words are of a run that can be gone on with
+            raise RunError(f"a sample of the pair cannot be matched: {reason(error.__cause__ or error)}") from error
         except SatIntervalsError as error:
             last = error
     raise last

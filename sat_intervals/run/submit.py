@@ -195,4 +195,6 @@ def reason(error: BaseException) -> str:
             f"every worker that matched it died, the last at {error.last_worker.address}, as they do out of memory: "
             "give workers more, or choose smaller tiles"
         )
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename2 or error.filename}: {error.strerror}"
     return " ".join(str(error).split()) or type(error).__name__

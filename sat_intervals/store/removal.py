@@ -35,8 +35,6 @@ def drop(folder: Folder) -> None:
         folder.delete(MANIFEST)
         folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES))
         folder.delete_all([_GROUP], [ARRAYS])
-    else:
-        folder.delete_all([name for name, size in names.items() if size == 0])  # nobody's: left by a power loss
     folder.delete_if_empty()
 
 
