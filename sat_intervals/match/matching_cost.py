@@ -194,13 +194,12 @@ def _correlations(
             of_there = area.facing.relative_to(views[not area.mirrored].window).slices[1]
             base, there = np.ascontiguousarray(base[:, :, of_base]), np.ascontiguousarray(there[:, :, of_there])
             correlate(base, there, costs[rows])
-    nothing = np.zeros((0, 0, 0), np.uint8)
 
     def state_of(side: int, wanted: Window) -> np.ndarray:
         return np.ascontiguousarray(states[side][:, wanted.relative_to(views[side].window).slices[1]])
 
     return [
-        Costs(costs, nothing, state_of(area.mirrored, area.base), state_of(not area.mirrored, area.facing))
+        Costs(costs, None, state_of(area.mirrored, area.base), state_of(not area.mirrored, area.facing))
         for area, costs in zip(areas, made, strict=True)
     ]
 
