@@ -301,6 +301,6 @@ def test_cost_volume__of_stored_costs_equals_that_of_codes(scene):
     for k in range(scene.count):
         differing = left.words ^ right.words[:, :, k : k + columns]
         stored[:, :, k] = np.bitwise_count(differing).sum(axis=0)
-    costs = Costs(stored, np.zeros((0, 0, 0), np.uint8), left.state, right.state)
+    costs = Costs(stored, None, left.state, right.state)
     parameters = Settings(**reference.settings_of(scene))
     np.testing.assert_array_equal(cost_volume(costs, parameters), cost_volume(between(left, right), parameters))

@@ -113,6 +113,7 @@ def _all_methods(
     bounds = {"baseline": read_baseline(volume, search.minimum, *_BASELINE)}
     for method in METHODS[1:]:
         level = config.model_copy(update={"interval": Interval(alpha=Decimal(method.split()[0]))}).cut_level
+        assert level is not None  # there is an interval
         bounds[method] = read_alpha_cuts(volume, search.minimum, level, refine)
     seen = np.asarray(read_right_winners(volume, search.minimum))
     del volume, cost  # before the right view has its own

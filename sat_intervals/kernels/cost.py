@@ -6,8 +6,7 @@ Letters: r row, c column, k disparity index (disparity = minimum + k), w word of
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
+from numba import njit
 
 from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, load_bytes, store
@@ -35,7 +34,8 @@ class Costs(NamedTuple):
     ----------
     left, right
         Words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)`` with whole vectors behind the
-        last column; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` nothing, uint8 as well.
+        last column; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None. Kernels are
+        compiled for either.
     left_state
         ``(rows, columns)`` uint8, 0 = usable window.
     right_state
@@ -43,7 +43,7 @@ class Costs(NamedTuple):
     """
 
     left: np.ndarray
-    right: np.ndarray
+    right: np.ndarray | None
     left_state: np.ndarray
     right_state: np.ndarray
 
@@ -130,45 +130,48 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     return Codes(words, window_state(state, radius))
 
 
-def matching_costs(left, right, r, c, k):
-    """Costs of the left pixel ``(r, c)`` and its candidates ``k .. k + 31``; arguments as in `Costs`.
-
-    For kernels alone, which are compiled for the kind of costs that they are given.
-    """
-    raise NotImplementedError
-
-
-@overload(matching_costs, jit_options={"nogil": True, "forceinline": True})
+@njit(nogil=True, forceinline=True)
 def _matching_costs(left, right, r, c, k):
-    def hamming_costs(left, right, r, c, k):
-        rows, width = right.shape[1:]
-        costs = hamming(right, r * width + c + k, left[0, r, c])
-        for w in range(1, left.shape[0]):
-            costs = add(costs, hamming(right, (w * rows + r) * width + c + k, left[w, r, c]))
-        return costs
-
-    def stored_costs(left, right, r, c, k):
+    """Costs of the left pixel ``(r, c)`` and its candidates ``k .. k + 31``; arguments as in `Costs`."""
+    if right is None:
         return load_bytes(left, (r * left.shape[1] + c) * left.shape[2] + k)
+    rows, width = right.shape[1:]
+    costs = hamming(right, r * width + c + k, left[0, r, c])
+    for w in range(1, left.shape[0]):
+        costs = add(costs, hamming(right, (w * rows + r) * width + c + k, left[w, r, c]))
+    return costs
 
-    return stored_costs if left.dtype == types.uint8 else hamming_costs
 
+class Candidates(NamedTuple):
+    """The candidates of a row of pixels.
 
-@njit(nogil=True, forceinline=True)
-def candidate_costs(left, right, barrier, beyond, r, c, k):
-    """Costs of the candidates ``k .. k + 31``, a constant where the candidate is impossible.
-
-    ``barrier[c + k]`` is the cost of an impossible candidate, or 0, for the row; ``beyond[k]`` keeps lanes behind
-    the search range above every cost.
+    Attributes
+    ----------
+    costs
+        Their costs, possible or not.
+    barrier
+        ``(columns + size,)`` uint16: ``barrier[c + k]`` is the cost of an impossible candidate, or 0.
+    beyond
+        ``(size,)`` uint16: 0, and above every cost in the lanes behind the search range.
     """
-    costs = larger(matching_costs(left, right, r, c, k), load(barrier, c + k))
-    return larger(costs, load(beyond, k))
+
+    costs: Costs
+    barrier: np.ndarray
+    beyond: np.ndarray
 
 
 @njit(nogil=True, forceinline=True)
-def cost_curve(left, right, barrier, beyond, r, c, curve):
+def candidate_costs(candidates, r, c, k):
+    """Costs of the candidates ``k .. k + 31`` of the row's pixel ``c``."""
+    costs = _matching_costs(candidates.costs.left, candidates.costs.right, r, c, k)
+    return larger(larger(costs, load(candidates.barrier, c + k)), load(candidates.beyond, k))
+
+
+@njit(nogil=True, forceinline=True)
+def cost_curve(candidates, r, c, curve):
     """Write the costs of all candidates of a pixel to ``curve``."""
     for k in range(0, curve.size, LANES):
-        store(curve, k, candidate_costs(left, right, barrier, beyond, r, c, k))
+        store(curve, k, candidate_costs(candidates, r, c, k))
 
 
 def padded_to_lanes(count: int) -> int:

@@ -1,125 +1,107 @@
 """A whole aggregated volume read at once: winners, and intervals of any level (method: sections 4 to 6 and 10).
 
 A run never stores its volume and reads every curve while it is in the cache (`matching`); here several methods are
-compared on one volume that fits in memory, ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST where impossible.
+compared on one volume that fits in memory, ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST where impossible. Row by
+row, because what is made on the way takes as much room as the costs it is made from.
 Letters: r row, c column, k disparity index (disparity = minimum + k).
 """
 
-import numpy as np
-from numba import njit
+from collections.abc import Callable
 
-from sat_intervals.kernels.compiled import cached
-from sat_intervals.kernels.confidence import ambiguity
-from sat_intervals.kernels.disparity import vfit
+import numpy as np
+
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 
 
-@njit(nogil=True)
-def _least(curve):
-    """The first index of the lowest cost."""
-    least = 0
-    for k in range(1, curve.size):
-        if curve[k] < curve[least]:
-            least = k
-    return least
-
-
-@cached
-def read_winners(volume, minimum, weights, refine):
+def read_winners(
+    volume: np.ndarray, minimum: int, weights: np.ndarray, refine: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Winner, refined disparity and ambiguity of every curve.
 
     Returns ``(rows, columns)`` int16 disparities, NO_DISPARITY for none, float32 ones in pixels, NaN for none, and
     uint32 ambiguities; ``weights`` is the table of `ambiguity`, ``refine`` whether V-fit is done.
     """
-    rows, columns, count = volume.shape
-    winner = np.full((rows, columns), NO_DISPARITY, np.int16)
-    disparity = np.full((rows, columns), np.float32(np.nan))
-    doubt = np.zeros((rows, columns), np.uint32)
-    for r in range(rows):
-        for c in range(columns):
-            curve = volume[r, c]
-            k = _least(curve)
-            if curve[k] == IMPOSSIBLE_COST:
-                continue
-            shift, _ = vfit(curve, k, count) if refine else (0.0, False)
-            winner[r, c], disparity[r, c] = minimum + k, minimum + k + shift
-            doubt[r, c] = ambiguity(curve, count, curve[k], weights)
+    winner = np.full(volume.shape[:2], NO_DISPARITY, np.int16)
+    disparity = np.full(winner.shape, np.nan, np.float32)
+    doubt = np.zeros(winner.shape, np.uint32)
+    for r, row in enumerate(volume):
+        k = row.argmin(axis=1)
+        lowest = np.take_along_axis(row, k[:, np.newaxis], axis=1)
+        found = lowest[:, 0] != IMPOSSIBLE_COST
+        winner[r, found] = minimum + k[found]
+        disparity[r, found] = (minimum + k + (_vfit(row, k) if refine else 0))[found]
+        if weights.size:
+            above = np.where(row == IMPOSSIBLE_COST, 0, row - lowest)
+            doubt[r, found] = weights.take(above).sum(axis=1, dtype=np.uint32)[found]
     return winner, disparity, doubt
 
 
-@cached
-def read_right_winners(volume, minimum):
+def _vfit(curves: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """Sub-pixel shifts of winners, as `disparity.vfit` has them."""
+    pixels, last = np.arange(k.size), curves.shape[1] - 1
+    before, here, after = (curves[pixels, np.clip(k + step, 0, last)].astype(np.int64) for step in (-1, 0, 1))
+    steepest = np.maximum(before, after)
+    possible = (k > 0) & (k < last) & (steepest != IMPOSSIBLE_COST)
+    return np.divide(before - after, 2 * (steepest - here), out=np.zeros(k.size), where=possible)
+
+
+def read_right_winners(volume: np.ndarray, minimum: int) -> np.ndarray:
     """The right view's winners along the diagonals of the left volume; the largest disparity at ties.
 
     Returns ``(rows, columns + count - 1)`` int16 as `cross_check` takes it.
     """
     rows, columns, count = volume.shape
-    winner = np.full((rows, columns + count - 1), NO_DISPARITY, np.int16)
+    width = columns + count - 1
+    winner = np.full((rows, width), NO_DISPARITY, np.int16)
     for r in range(rows):
-        for x in range(columns + count - 1):
-            lowest = IMPOSSIBLE_COST
-            for k in range(max(0, x - columns + 1), min(count, x + 1)):
-                cost = volume[r, x - k, k]
-                if cost <= lowest and cost != IMPOSSIBLE_COST:
-                    lowest, winner[r, x] = cost, minimum + k
+        # Each line one longer than the right image: read as lines of its width, every one begins a column later.
+        sheared = np.full((count, width + 1), IMPOSSIBLE_COST, np.uint16)
+        sheared[:, :columns] = volume[r].T
+        facing = sheared.ravel()[: count * width].reshape(count, width)[::-1]
+        found = (facing != IMPOSSIBLE_COST).any(axis=0)
+        winner[r, found] = minimum + count - 1 - facing.argmin(axis=0)[found]
     return winner
 
 
-@njit(nogil=True)
-def _extremes(curve, limit):
-    """First and last index whose cost is at most ``limit``, which the lowest cost is."""
-    first, last = 0, curve.size - 1
-    while curve[first] > limit:
-        first += 1
-    while curve[last] > limit:
-        last -= 1
-    return first, last
+def _read_bounds(
+    volume: np.ndarray, minimum: int, limit: Callable[[np.ndarray, np.ndarray], np.ndarray], refine: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """First and last disparity whose cost is at most the limit, made from a row's curves and their lowest costs."""
+    lower = np.full(volume.shape[:2], NO_DISPARITY, np.int16)
+    upper = lower.copy()
+    last = volume.shape[2] - 1
+    for r, row in enumerate(volume):
+        lowest = row.min(axis=1, keepdims=True).astype(np.int64)
+        found = lowest[:, 0] != IMPOSSIBLE_COST
+        inside = row <= np.minimum(limit(row, lowest), IMPOSSIBLE_COST - 1).astype(np.uint16)
+        if refine:
+            winners = row == lowest.astype(np.uint16)
+            inside[:, :-1] |= winners[:, 1:]
+            inside[:, 1:] |= winners[:, :-1]
+        lower[r, found] = (minimum + inside.argmax(axis=1))[found]
+        upper[r, found] = (minimum + last - inside[:, ::-1].argmax(axis=1))[found]
+    return lower, upper
 
 
-@cached
-def read_alpha_cuts(volume, minimum, cut_level, refine):
+def read_alpha_cuts(volume: np.ndarray, minimum: int, cut_level: int, refine: bool) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the alpha-cut of every curve (paper eq. 5 to 9), pushed out for refinement.
 
     Returns ``(lower, upper)``, ``(rows, columns)`` int16 disparities, NO_DISPARITY for none; ``cut_level`` is
     ``floor((1 - alpha) * span)``.
     """
-    rows, columns, count = volume.shape
-    lower = np.full((rows, columns), NO_DISPARITY, np.int16)
-    upper = lower.copy()
-    for r in range(rows):
-        for c in range(columns):
-            curve = volume[r, c]
-            lowest = curve[_least(curve)]
-            if lowest == IMPOSSIBLE_COST:
-                continue
-            first, last = _extremes(curve, min(lowest + cut_level, IMPOSSIBLE_COST - 1))
-            if refine:
-                first -= curve[first] == lowest and first > 0
-                last += curve[last] == lowest and last < count - 1
-            lower[r, c], upper[r, c] = minimum + first, minimum + last
-    return lower, upper
+    return _read_bounds(volume, minimum, lambda curves, lowest: lowest + cut_level, refine)
 
 
-@cached
-def read_baseline(volume, minimum, part, whole):
+def read_baseline(volume: np.ndarray, minimum: int, part: int, whole: int) -> tuple[np.ndarray, np.ndarray]:
     """The paper's baseline (its section 4.1): each curve normalised by its own minimum and maximum.
 
     The bounds are the extreme disparities whose similarity, 1 at the lowest and 0 at the highest possible cost, is at
     least ``1 - part / whole``, integers. Returns as `read_alpha_cuts`, nothing pushed out.
     """
-    rows, columns, count = volume.shape
-    lower = np.full((rows, columns), NO_DISPARITY, np.int16)
-    upper = lower.copy()
-    for r in range(rows):
-        for c in range(columns):
-            curve = volume[r, c]
-            lowest = np.int64(curve[_least(curve)])
-            if lowest == IMPOSSIBLE_COST:
-                continue
-            highest = lowest
-            for k in range(count):
-                if curve[k] != IMPOSSIBLE_COST:
-                    highest = max(highest, np.int64(curve[k]))
-            first, last = _extremes(curve, lowest + (highest - lowest) * part // whole)
-            lower[r, c], upper[r, c] = minimum + first, minimum + last
-    return lower, upper
+
+    def limit(curves: np.ndarray, lowest: np.ndarray) -> np.ndarray:
+        highest = np.where(curves == IMPOSSIBLE_COST, 0, curves).max(axis=1, keepdims=True)
+        limits: np.ndarray = lowest + (highest - lowest) * part // whole
+        return limits
+
+    return _read_bounds(volume, minimum, limit, False)

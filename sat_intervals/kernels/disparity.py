@@ -11,7 +11,7 @@ from sat_intervals.kernels.compiled import cached
 from sat_intervals.products import IMPOSSIBLE_COST, MISMATCH, NO_DISPARITY, OCCLUSION
 
 
-@njit(nogil=True, forceinline=True)
+@njit(nogil=True, forceinline=True, error_model="numpy")
 def vfit(curve, k, count):
     """Sub-pixel shift of the winner ``k`` by V-fit (Haller et al. 2010), within half a pixel.
 

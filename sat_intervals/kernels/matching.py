@@ -14,11 +14,11 @@ from numba import njit
 
 from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.confidence import ambiguity
-from sat_intervals.kernels.cost import Costs, cost_curve, padded_to_lanes
+from sat_intervals.kernels.cost import Candidates, Costs, cost_curve, padded_to_lanes
 from sat_intervals.kernels.disparity import vfit
 from sat_intervals.kernels.intervals import alpha_cut
-from sat_intervals.kernels.penalties import Gradients, fill_row, row_penalties
-from sat_intervals.kernels.sgm import WALL, add_curve, advance_pixel, enter_row, path_slots, restart_all
+from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
+from sat_intervals.kernels.sgm import WALL, Paths, add_curve, advance_pixel, enter_row, path_slots, restart
 from sat_intervals.kernels.vector import (
     LANES,
     choose_smaller,
@@ -117,27 +117,77 @@ class RightView(NamedTuple):
     winner: np.ndarray
 
 
-@njit(nogil=True)
-def _candidates(left_state, right_state, r, count, impossible, barrier, possible):
-    """Fill a row's barrier, the cost of impossible candidates or 0, and each pixel's number of possible candidates."""
-    columns = left_state.shape[1]
-    for x in range(right_state.shape[1]):
-        barrier[x] = impossible if right_state[r, x] else 0
-    usable = 0
-    for x in range(count - 1):
-        usable += right_state[r, x] == 0
-    for c in range(columns):
-        usable += right_state[r, c + count - 1] == 0
-        possible[c] = usable if left_state[r, c] == 0 else 0
-        usable -= right_state[r, c] == 0
+class _Pixels(NamedTuple):
+    """A window, as kernels take it."""
+
+    row: int
+    column: int
+    row_stop: int
+    column_stop: int
 
 
 @njit(nogil=True, forceinline=True)
-def _wall_off(curve, barrier, beyond, c):
+def _holds(pixels, r, c):
+    return pixels.row <= r < pixels.row_stop and pixels.column <= c < pixels.column_stop
+
+
+class _Patch(NamedTuple):
+    """What both sweeps read, and the row, the paths and the curve that they are at.
+
+    Attributes
+    ----------
+    possible
+        ``(columns,)`` int64: how many candidates of each of the row's pixels are possible.
+    curve
+        ``(size,)`` uint16: room for one.
+    """
+
+    candidates: Candidates
+    possible: np.ndarray
+    penalties: Penalties
+    paths: Paths
+    curve: np.ndarray
+
+
+def _prepare(costs: Costs, gradients: Gradients | None, settings: Settings) -> _Patch:
+    columns, size = costs.left_state.shape[1], padded_to_lanes(settings.count)
+    beyond = np.zeros(size, np.uint16)
+    beyond[settings.count :] = WALL
+    slots = 1 + 3 * columns
+    return _Patch(
+        Candidates(costs, np.zeros(columns + size, np.uint16), beyond),
+        np.zeros(columns, np.int64),
+        make_penalties(gradients, settings.p1, settings.p2, columns, size),
+        Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
+        np.zeros(size, np.uint16),
+    )
+
+
+@njit(nogil=True)
+def _enter_row(patch, gradients, settings, r, down):
+    """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it."""
+    (costs, barrier, _), possible, penalties, paths, _ = patch
+    for x in range(costs.right_state.shape[1]):
+        barrier[x] = settings.impossible if costs.right_state[r, x] else 0
+    usable = 0
+    for x in range(settings.count - 1):
+        usable += costs.right_state[r, x] == 0
+    for c in range(possible.size):
+        usable += costs.right_state[r, c + settings.count - 1] == 0
+        possible[c] = usable if costs.left_state[r, c] == 0 else 0
+        usable -= costs.right_state[r, c] == 0
+    falling, rising = -r % possible.size, r % possible.size
+    enter_row(paths, possible.size, falling, rising, down)
+    fill_row(gradients, r, down, penalties.row)
+    return falling, rising
+
+
+@njit(nogil=True, forceinline=True)
+def _wall_off(curve, candidates, c):
     """Put IMPOSSIBLE_COST where a candidate is impossible or beyond the range; returns the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
     for k in range(0, curve.size, LANES):
-        closed = fill_where_nonzero(larger(load(barrier, c + k), load(beyond, k)))
+        closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), load(candidates.beyond, k)))
         costs = larger(load(curve, k), closed)
         store(curve, k, costs)
         lowest = smaller(lowest, costs)
@@ -159,94 +209,53 @@ def _winner(curve, lowest):
 def _interval(curve, lowest, count, cut_level, refine):
     """First and last index of the alpha-cut; refinement moves a winner at a bound by up to half a pixel out of it."""
     first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
-    if refine:
-        if curve[first] == lowest and first > 0:
-            first -= 1
-        if curve[last] == lowest and last < count - 1:
-            last += 1
+    first -= refine & (first > 0) & (curve[first] == lowest)
+    last += refine & (last < count - 1) & (curve[last] == lowest)
     return first, last
 
 
+class _Seen(NamedTuple):
+    """The right pixels that the left pixels of ``core`` see.
+
+    Attributes
+    ----------
+    indices
+        ``(size,)`` uint16: 0, 1, ...
+    cost, best
+        ``(rows, columns + size)`` uint16: the smallest cost yet, and its index.
+    """
+
+    core: _Pixels
+    indices: np.ndarray
+    cost: np.ndarray
+    best: np.ndarray
+
+
 @njit(nogil=True, forceinline=True)
-def _see_from_right(curve, index, cost, best, start):
+def _see_from_right(curve, seen, r, c):
     """Offer a left pixel's candidates to the right pixels it faces.
 
     The sweep up visits the left pixels of a row from right to left, so that ``k`` grows at a right pixel and a tie
     goes to the largest.
     """
+    start = (r - seen.core.row) * seen.cost.shape[1] + c - seen.core.column
     for k in range(0, curve.size, LANES):
-        candidate, known = load(curve, k), load(cost, start + k)
-        store(best, start + k, choose_smaller(candidate, known, load(index, k), load(best, start + k)))
-        store(cost, start + k, smaller(candidate, known))
-
-
-class _Inputs(NamedTuple):
-    """What both sweeps read and write. They unpack it once: counting references would cost more than a pixel."""
-
-    left: np.ndarray
-    right: np.ndarray
-    left_state: np.ndarray
-    right_state: np.ndarray
-    barrier: np.ndarray
-    possible: np.ndarray
-    beyond: np.ndarray
-    paths: np.ndarray
-    lowest: np.ndarray
-    curve: np.ndarray
-
-
-def _prepare(costs: Costs) -> _Inputs:
-    columns = costs.left_state.shape[1]
-    count = costs.right_state.shape[1] - columns + 1
-    size = padded_to_lanes(count)
-    beyond = np.zeros(size, np.uint16)
-    beyond[count:] = WALL
-    slots = 1 + 3 * columns
-    return _Inputs(
-        *costs,
-        barrier=np.zeros(columns + size, np.uint16),
-        possible=np.zeros(columns, np.int64),
-        beyond=beyond,
-        paths=np.zeros((slots, size), np.uint16),
-        lowest=np.zeros(slots, np.uint16),
-        curve=np.zeros(size, np.uint16),
-    )
-
-
-@cached
-def _sweep_down(patch, gradients, settings, row, column, volume):
-    """Store the sums of the downward paths of the wanted pixels, which begin at ``row, column``."""
-    left, right, left_state, right_state, barrier, possible, beyond, paths, lowest, curve = patch
-    count, impossible = settings.count, settings.impossible
-    height, width, size = volume.shape
-    columns = possible.size
-    p1, p2, edges = row_penalties(gradients, settings.p1, settings.p2, columns, size)
-    for r in range(row + height):
-        _candidates(left_state, right_state, r, count, impossible, barrier, possible)
-        falling, rising = -r % columns, r % columns
-        enter_row(paths, lowest, columns, falling, rising, True)
-        fill_row(gradients, r, True, p1, p2, edges)
-        for c in range(columns):
-            slots = path_slots(c, columns, falling, rising)
-            if possible[c] == 0:
-                restart_all(paths, lowest, slots)
-            elif r >= row and column <= c < column + width:
-                offset = ((r - row) * width + c - column) * size
-                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, edges, paths, lowest, slots, volume, offset)
-            else:
-                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, edges, paths, lowest, slots, curve, 0)
+        candidate, known = load(curve, k), load(seen.cost, start + k)
+        best = choose_smaller(candidate, known, load(seen.indices, k), load(seen.best, start + k))
+        store(seen.best, start + k, best)
+        store(seen.cost, start + k, smaller(candidate, known))
 
 
 @njit(nogil=True)
-def _explain(left_state, right_state, r, c, count, possible):
+def _explain(costs, r, c, count, possible):
     """Validity flags of what could be searched at a pixel; the left and the right image are blamed separately."""
     flags = 0
-    if left_state[r, c] != 0:
+    if costs.left_state[r, c] != 0:
         flags |= LEFT_WINDOW
     usable, masked = 0, False
     for x in range(c, c + count):
-        usable += right_state[r, x] == 0
-        masked |= right_state[r, x] & MASKED != 0
+        usable += costs.right_state[r, x] == 0
+        masked |= costs.right_state[r, x] & MASKED != 0
     if usable == 0:
         flags |= RIGHT_MASKED if masked else NO_CANDIDATE
     elif 0 < possible < count:
@@ -254,64 +263,77 @@ def _explain(left_state, right_state, r, c, count, possible):
     return flags
 
 
+@njit(nogil=True, forceinline=True)
+def _read_curve(curve, least, settings):
+    """Winner, refinement and whether it was done, bounds and ambiguity of a finished curve, given its lowest cost."""
+    k = _winner(curve, least)
+    shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
+    lower = upper = NO_DISPARITY
+    if settings.cut_level >= 0:
+        first, last = _interval(curve, least, settings.count, settings.cut_level, settings.refine)
+        lower, upper = settings.minimum + first, settings.minimum + last
+    doubt = ambiguity(curve, settings.count if settings.weights.size else 0, least, settings.weights)
+    return settings.minimum + k, shift, refined, lower, upper, doubt
+
+
 @cached
-def _sweep_up(patch, gradients, settings, row, column, volume, keep, raw, core, index, right_cost, right_best):
-    """Finish the curves of the wanted pixels and read them; ``core`` is what the right view is made of."""
-    left, right, left_state, right_state, barrier, possible, beyond, paths, lowest, curve = patch
-    winner, lower, upper, disparity, cost, doubt, validity = raw
-    minimum, count, impossible, _, _, regularized, cut_level, weights, refine = settings
-    height, width, size = volume.shape
-    columns = possible.size
-    p1, p2, edges = row_penalties(gradients, settings.p1, settings.p2, columns, size)
-    for r in range(left_state.shape[0] - 1, row - 1, -1):
-        _candidates(left_state, right_state, r, count, impossible, barrier, possible)
-        falling, rising = -r % columns, r % columns
-        enter_row(paths, lowest, columns, falling, rising, False)
-        if regularized:
-            fill_row(gradients, r, False, p1, p2, edges)
-        wanted_row = r < row + height
-        seen_row = core[0] <= r < core[0] + core[2]
-        for c in range(columns - 1, -1, -1):
-            slots = path_slots(c, columns, falling, rising)
+def _sweep_down(patch, gradients, settings, output, volume):
+    """Store the sums of the downward paths of the wanted pixels."""
+    candidates, possible, penalties, paths, curve = patch
+    for r in range(output.row_stop):
+        falling, rising = _enter_row(patch, gradients, settings, r, True)
+        for c in range(possible.size):
+            slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
-                restart_all(paths, lowest, slots)
-            elif regularized:
-                advance_pixel(left, right, barrier, beyond, r, c, p1, p2, edges, paths, lowest, slots, curve, 0)
-            if not (wanted_row and column <= c < column + width):
+                restart(paths, slots)
+            elif _holds(output, r, c):
+                offset = ((r - output.row) * volume.shape[1] + c - output.column) * curve.size
+                advance_pixel(candidates, penalties, paths, slots, r, c, volume, offset)
+            else:
+                advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
+
+
+@cached
+def _sweep_up(patch, gradients, settings, output, volume, raw, seen, keep):
+    """Finish the curves of the wanted pixels and read them, for the right view as well."""
+    candidates, possible, penalties, paths, curve = patch
+    winner, lower, upper, disparity, cost, doubt, validity = raw
+    costs = candidates.costs
+    for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
+        falling, rising = _enter_row(patch, gradients, settings, r, False)
+        for c in range(possible.size - 1, -1, -1):
+            slots = path_slots(c, possible.size, falling, rising)
+            if possible[c] == 0:
+                restart(paths, slots)
+            elif settings.regularized:
+                advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
+            if not _holds(output, r, c):
                 continue
-            i, j = r - row, c - column
-            if possible[c] < count:
-                validity[i, j] = _explain(left_state, right_state, r, c, count, possible[c])
+            i, j = r - output.row, c - output.column
+            if possible[c] < settings.count:
+                validity[i, j] = _explain(costs, r, c, settings.count, possible[c])
             if possible[c] == 0:
                 if keep:
                     volume[i, j] = IMPOSSIBLE_COST
                 continue
-            if regularized:
-                add_curve(curve, volume, (i * width + j) * size)
+            if settings.regularized:
+                add_curve(curve, volume, (i * volume.shape[1] + j) * curve.size)
             else:
-                cost_curve(left, right, barrier, beyond, r, c, curve)
-            least = _wall_off(curve, barrier, beyond, c)
-            k = _winner(curve, least)
-            shift, refined = vfit(curve, k, count) if refine else (0.0, False)
-            winner[i, j], cost[i, j] = minimum + k, least
-            disparity[i, j] = minimum + k + shift
+                cost_curve(candidates, r, c, curve)
+            least = _wall_off(curve, candidates, c)
+            winner[i, j], shift, refined, lower[i, j], upper[i, j], doubt[i, j] = _read_curve(curve, least, settings)
+            disparity[i, j], cost[i, j] = winner[i, j] + shift, least
             if not refined:
                 validity[i, j] |= NOT_REFINED
-            if cut_level >= 0:
-                first, last = _interval(curve, least, count, cut_level, refine)
-                lower[i, j], upper[i, j] = minimum + first, minimum + last
-            if weights.size:
-                doubt[i, j] = ambiguity(curve, count, least, weights)
-            if seen_row and core[1] <= c < core[1] + core[3]:
-                start = (r - core[0]) * right_cost.shape[1] + c - core[1]
-                _see_from_right(curve, index, right_cost, right_best, start)
+            if _holds(seen.core, r, c):
+                _see_from_right(curve, seen, r, c)
             if keep:
                 volume[i, j] = curve
 
 
 def _sweep(costs, gradients, settings, output, core, keep):
     """Both sweeps; returns the raw products, the right view and the volume (whole curves only with ``keep``)."""
-    patch = _prepare(costs)
+    patch = _prepare(costs, gradients, settings)
     size = patch.curve.size
     shape = output.height, output.width
     # fresh for each tile: room kept between tiles (4 % faster) would leave a worker of dask paused, above its memory
@@ -325,18 +347,16 @@ def _sweep(costs, gradients, settings, output, core, keep):
         ambiguity=np.zeros(shape, np.uint32),
         validity=np.zeros(shape, np.uint16),
     )
-    right_cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
-    right_best = np.zeros(right_cost.shape, np.uint16)
-    index = np.arange(size, dtype=np.uint16)
+    wanted, cores = (_Pixels(w.row, w.column, w.row_stop, w.column_stop) for w in (output, core))
+    cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
+    seen = _Seen(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
-        _sweep_down(patch, gradients, settings, output.row, output.column, volume)
-        patch.paths[:] = 0
-        patch.lowest[:] = 0
-    bounds = core.row, core.column, core.height, core.width
-    wanted = output.row, output.column
-    _sweep_up(patch, gradients, settings, *wanted, volume, keep, raw, bounds, index, right_cost, right_best)
-    cost = right_cost[:, : core.width + settings.count - 1]
-    winner = right_best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
+        _sweep_down(patch, gradients, settings, wanted, volume)
+        for state in patch.paths:
+            state[:] = 0
+    _sweep_up(patch, gradients, settings, wanted, volume, raw, seen, keep)
+    cost = cost[:, : core.width + settings.count - 1]
+    winner = seen.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
     return raw, RightView(cost, winner), volume
 

@@ -11,8 +11,7 @@ diagonal, 2 along the rising one, 3 along the column.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
+from numba import njit
 
 from sat_intervals.kernels.vector import load, mix, splat
 
@@ -69,6 +68,38 @@ class Gradients(NamedTuple):
     rule: Rule
 
 
+class RowPenalties(NamedTuple):
+    """Penalties of a row of pixels that follow gradients.
+
+    Attributes
+    ----------
+    p1, p2
+        ``(2, 4, columns)`` uint16, by path: without and with an edge in the right image.
+    edges
+        ``(4, columns + size)`` uint16, by path: 65535 where the right pixel ``x`` has an edge.
+    """
+
+    p1: np.ndarray
+    p2: np.ndarray
+    edges: np.ndarray
+
+
+class Penalties(NamedTuple):
+    """P1 and P2: those of the row, or constants where that is None. Kernels are compiled for either."""
+
+    p1: int
+    p2: int
+    row: RowPenalties | None
+
+
+def make_penalties(gradients: Gradients | None, p1: int, p2: int, columns: int, size: int) -> Penalties:
+    """Constant penalties without gradients, else room for those of a row, which `fill_row` fills."""
+    if gradients is None:
+        return Penalties(p1, p2, None)
+    first, second = np.zeros((2, 4, columns), np.uint16), np.zeros((2, 4, columns), np.uint16)
+    return Penalties(p1, p2, RowPenalties(first, second, np.zeros((4, columns + size), np.uint16)))
+
+
 @njit(nogil=True)
 def _step_back(i, down):
     """Where the previous pixel of a path lies: rows and columns to add."""
@@ -89,9 +120,9 @@ def _differences(image, r, row, column, differences):
 
 
 @njit(nogil=True)
-def _fill_edges(gradients, r, down, p1, p2, edges):
+def _fill_edges(gradients, r, down, row_penalties):
     """Penalties of a row by the edges of both images."""
-    left, right, rule = gradients
+    (left, right, rule), (p1, p2, edges) = gradients, row_penalties
     left_gradient, right_gradient = np.empty(left.shape[1], np.float32), np.empty(right.shape[1], np.float32)
     for i in range(4):
         row, column = _step_back(i, down)
@@ -110,9 +141,9 @@ def _fill_edges(gradients, r, down, p1, p2, edges):
 
 
 @njit(nogil=True)
-def _fill_banz(gradients, r, down, p1, p2):
+def _fill_banz(gradients, r, down, row_penalties):
     """Penalties of a row by the gradient of the left image."""
-    left, _, rule = gradients
+    (left, _, rule), (p1, p2, _) = gradients, row_penalties
     gradient = np.empty(left.shape[1], np.float32)
     for i in range(4):
         row, column = _step_back(i, down)
@@ -127,58 +158,22 @@ def _fill_banz(gradients, r, down, p1, p2):
 
 
 @njit(nogil=True)
-def _fill(gradients, r, down, p1, p2, edges):
-    if gradients.rule.kind == EDGES:
-        _fill_edges(gradients, r, down, p1, p2, edges)
-    else:
-        _fill_banz(gradients, r, down, p1, p2)
+def fill_row(gradients, r, down, row):
+    """Set the penalties of a row, for a sweep down or up; without gradients there are none."""
+    if gradients is not None:
+        if gradients.rule.kind == EDGES:
+            _fill_edges(gradients, r, down, row)
+        else:
+            _fill_banz(gradients, r, down, row)
 
 
-def row_penalties(gradients, p1, p2, columns, size):
-    """Make what `fill_row` fills: p1, p2 and the edges of the right image; p1 and p2 themselves without gradients."""
-    raise NotImplementedError
-
-
-@overload(row_penalties, jit_options={"nogil": True})
-def _row_penalties(gradients, p1, p2, columns, size):
-    def constant(gradients, p1, p2, columns, size):
-        return p1, p2, 0
-
-    def varying(gradients, p1, p2, columns, size):
-        first, second = np.zeros((2, 4, columns), np.uint16), np.zeros((2, 4, columns), np.uint16)
-        return first, second, np.zeros((4, columns + size), np.uint16)
-
-    return constant if gradients is types.none else varying
-
-
-def fill_row(gradients, r, down, p1, p2, edges):
-    """Set the penalties of a row, for a sweep down or up: ``(2, 4, columns)`` without and with an edge on the right."""
-    raise NotImplementedError
-
-
-@overload(fill_row, jit_options={"nogil": True})
-def _fill_row(gradients, r, down, p1, p2, edges):
-    def constant(gradients, r, down, p1, p2, edges):
-        pass
-
-    def varying(gradients, r, down, p1, p2, edges):
-        _fill(gradients, r, down, p1, p2, edges)
-
-    return constant if gradients is types.none else varying
-
-
-def penalty(values, edges, i, c, k):
-    """Penalties of the candidates ``k .. k + 31`` of a pixel on a path."""
-    raise NotImplementedError
-
-
-@overload(penalty, jit_options={"nogil": True, "forceinline": True})
-def _penalty(values, edges, i, c, k):
-    def constant(values, edges, i, c, k):
-        return splat(np.uint16(values))
-
-    def varying(values, edges, i, c, k):
-        edge = load(edges, i * edges.shape[1] + c + k)
-        return mix(edge, splat(values[0, i, c]), splat(values[1, i, c]))
-
-    return constant if isinstance(values, types.Integer) else varying
+@njit(nogil=True, forceinline=True)
+def penalties_of(p1, p2, row, i, c, k):
+    """P1 and P2 of the candidates ``k .. k + 31`` of a pixel on a path."""
+    if row is None:
+        return splat(np.uint16(p1)), splat(np.uint16(p2))
+    edge = load(row.edges, i * row.edges.shape[1] + c + k)
+    return (
+        mix(edge, splat(row.p1[0, i, c]), splat(row.p1[1, i, c])),
+        mix(edge, splat(row.p2[0, i, c]), splat(row.p2[1, i, c])),
+    )

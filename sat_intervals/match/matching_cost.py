@@ -199,10 +199,7 @@ def _correlations(views: Views, areas: Sequence[Area], statistics: PairStatistic
         ]
         for area, costs in zip(areas, made, strict=True):
             correlate(*_of_area(area, views, strips, RADIUS), costs[rows])
-    nothing = np.zeros((0, 0, 0), np.uint8)
-    return [
-        Costs(costs, nothing, *_of_area(area, views, states, RADIUS)) for area, costs in zip(areas, made, strict=True)
-    ]
+    return [Costs(costs, None, *_of_area(area, views, states, RADIUS)) for area, costs in zip(areas, made, strict=True)]
 
 
 def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStatistics, network: Network) -> np.ndarray:
