@@ -272,6 +272,7 @@ def _read_curve(curve, least, settings):
     if settings.cut_level >= 0:
         first, last = _interval(curve, least, settings.count, settings.cut_level, settings.refine)
         lower, upper = settings.minimum + first, settings.minimum + last
+    # Of an empty table nothing is counted. In a branch, numba would count references at every pixel: 4 to 7 % slower.
     doubt = ambiguity(curve, settings.count if settings.weights.size else 0, least, settings.weights)
     return settings.minimum + k, shift, refined, lower, upper, doubt
 
