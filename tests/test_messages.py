@@ -229,7 +229,7 @@ def test_read_window__refuses_integers_that_no_float_holds(tmp_path):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_match_arrays__refuses_integers_that_no_float_holds(sign):
     pixels = sign * (2**60 + np.arange(81, dtype=np.int64).reshape(9, 9))
-    with pytest.raises(SatIntervalsError, match="the left array has int64 values that float64 does not hold"):
+    with pytest.raises(SatIntervalsError, match="the left array has int64 values that float64 cannot represent"):
         match_arrays(pixels, pixels, {"disparity": {"minimum": 0, "maximum": 1}})
 
 
