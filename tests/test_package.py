@@ -20,7 +20,7 @@ def test_package__is_imported_without_its_libraries() -> None:
 
 def test_package__public_names_exist() -> None:
     assert set(sat_intervals._HOMES) == set(sat_intervals.__all__) - {"__version__"}
-    assert set(sat_intervals.__all__) <= set(dir(sat_intervals))
+    assert dir(sat_intervals) == sorted(sat_intervals.__all__)
     assert sat_intervals.__version__ == PYPROJECT["project"]["version"]
     for name in sat_intervals._HOMES:
         assert getattr(sat_intervals, name).__name__ == name
