@@ -28,6 +28,19 @@ def test_package__public_names_exist() -> None:
         _ = sat_intervals.match_pairs
 
 
+def test_package__public_names_load_without_extras() -> None:
+    script = """
+import sys
+sys.modules["shareloc"] = sys.modules["matplotlib"] = None
+from sat_intervals import *
+try:
+    triangulate("out", *"abcd")
+except SatIntervalsError as error:
+    print(error)
+"""
+    assert run_python(script) == "triangulation needs shareloc: pip install 'sat-intervals[dsm]'\n"
+
+
 def test_packages__equal_the_folders() -> None:
     shipped = {
         ".".join([package, *file.parent.relative_to(folder).parts])

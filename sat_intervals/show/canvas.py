@@ -66,6 +66,12 @@ def widest(widths: np.ndarray) -> float:
     return (float(np.percentile(known, _WIDEST, method="nearest")) if known.size else 0.0) or 1.0
 
 
+def pointed_ends(values: np.ndarray, low: float, high: float) -> str:
+    """Return matplotlib's ``extend``: a pointed end of a colour bar means values beyond it."""
+    beyond = bool((values < low).any()), bool((values > high).any())
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+
+
 def add_histogram(bar: Colorbar, widths: np.ndarray, end: float, step: float) -> None:
     """Draw the histogram of interval widths, from 0 to ``end``, along the left side of their colour bar.
 

@@ -11,7 +11,18 @@ from matplotlib.ticker import MaxNLocator
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import is_surface, read_place, read_small_layers
-from sat_intervals.show.canvas import DPI, INK, NOTHING, add_histogram, fitting, limits, page, say_empty, widest
+from sat_intervals.show.canvas import (
+    DPI,
+    INK,
+    NOTHING,
+    add_histogram,
+    fitting,
+    limits,
+    page,
+    pointed_ends,
+    say_empty,
+    widest,
+)
 
 _LONGEST = 5.5  # inches of the longer side of a map
 _STRETCHED = 5.0  # largest ratio of the sides of a map
@@ -56,14 +67,14 @@ def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
     caption = f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}"
     with page(path, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
         panels = figure.subplots(2, 2).ravel()
-        _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west", ""), "gray", PowerNorm(1, 0, 1))
-        _draw(panels[1], extent, height, ("Height", "m"), "viridis", PowerNorm(1, *limits(height, (0, 1))))
+        _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west", ""), "gray", (0, 1))
+        _draw(panels[1], extent, height, ("Height", "m"), "viridis", limits(height, (0, 1)))
         name = "Interval width", "m, square-root scale"
         end = widest(widths)
-        bar = _draw(panels[2], extent, widths, name, "magma", PowerNorm(0.5, 0, end))
+        bar = _draw(panels[2], extent, widths, name, "magma", (0, end), 0.5)
         assert bar
         add_histogram(bar, widths, end, step=end / 40)
-        _draw(panels[3], extent, last[2], last[:2], "cividis", PowerNorm(1, 0, 1))
+        _draw(panels[3], extent, last[2], last[:2], "cividis", (0, 1))
 
 
 def _relief(height: np.ndarray, across: float, down: float) -> np.ndarray:
@@ -84,11 +95,12 @@ def _draw(
     values: np.ndarray,
     name: tuple[str, str],
     colours: str,
-    norm: PowerNorm,
+    shown: tuple[float, float],
+    power: float = 1.0,
 ) -> Colorbar | None:
     """Draw a layer in map coordinates, titled ``name[0]``; with a colour bar if there is a unit, ``name[1]``."""
     panel.set_facecolor(NOTHING)
-    drawn = panel.imshow(values, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+    drawn = panel.imshow(values, extent=extent, cmap=colours, norm=PowerNorm(power, *shown), interpolation="nearest")
     panel.set_title(name[0])
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_major_locator(MaxNLocator(3))
@@ -100,7 +112,7 @@ def _draw(
     if not name[1]:
         return None
     assert panel.figure is not None
-    bar = panel.figure.colorbar(drawn, ax=panel, shrink=0.9, aspect=25, pad=0.02)
+    bar = panel.figure.colorbar(drawn, ax=panel, extend=pointed_ends(values, *shown), shrink=0.9, aspect=25, pad=0.02)
     bar.set_label(name[1])
     bar.ax.tick_params(labelsize=8)
     return bar

@@ -14,7 +14,18 @@ from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, NOTHING, add_histogram, fitting, limits, page, say_empty, widest
+from sat_intervals.show.canvas import (
+    DPI,
+    INK,
+    NOTHING,
+    add_histogram,
+    fitting,
+    limits,
+    page,
+    pointed_ends,
+    say_empty,
+    widest,
+)
 from sat_intervals.show.legend import PIXEL_CLASSES, SKY, VERMILION, class_counts, classify
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map
@@ -135,15 +146,12 @@ def _draw_map(
 ) -> Colorbar:
     """Draw a layer titled ``name[0]`` with unit ``name[1]``; returns its colour bar.
 
-    A pointed end of the bar means values beyond the range ``shown``. A ``power`` of 1/2 brightens small values.
+    A ``power`` of 1/2 brightens small values.
     """
     drawn = _show(panel, results, values, cmap=colours, norm=PowerNorm(power, *shown))
     panel.set_title(name[0])
-    known = values[np.isfinite(values)]
-    beyond = bool((known < shown[0]).any()), bool((known > shown[1]).any())
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
     assert panel.figure is not None
-    bar = panel.figure.colorbar(drawn, ax=panel, extend=extend, shrink=0.9, aspect=25, pad=0.02)
+    bar = panel.figure.colorbar(drawn, ax=panel, extend=pointed_ends(values, *shown), shrink=0.9, aspect=25, pad=0.02)
     bar.set_label(name[1] if power == 1 else f"{name[1]}, square-root scale")
     bar.ax.tick_params(labelsize=8)
     say_empty(panel, values, "no value")
