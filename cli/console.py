@@ -102,8 +102,8 @@ class Console:
         table.add_column(justify="right")
         pixels = counts["pixels"]
         table.add_row("valid pixels", _share(counts["valid"], pixels))
-        for flag, count in counts["flags"].items():
-            if count and report["validity_bits"][flag]["invalid"]:
+        for flag, count in counts["causes"].items():
+            if count:
                 table.add_row(f"  {flag.replace('_', ' ')}", _share(count, pixels))
         width = counts["median_interval_width"]
         table.add_row("median interval width", "none" if width is None else f"{width:.2f} px")

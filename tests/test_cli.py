@@ -779,7 +779,7 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "left.tif", "right.tif", "truth.tif"])
     last = result.stdout.splitlines()[-1]
     found = re.fullmatch(
-        r"The interval holds the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", last
+        r"The interval contains the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", last
     )
     scene = make_scene(150, 180, seed=4)
     with rasterio.open(out / "truth.tif") as file:

@@ -301,7 +301,7 @@ def test_export__ends_where_another_run_replaces_the_one_it_reads(finished, tmp_
         return read(run, window)
 
     monkeypatch.setattr(Run, "read_bands", and_replace)
-    with pytest.raises(RunError, match="was replaced while it was read: run the command again"):
+    with pytest.raises(RunError, match="was replaced while it was read: rerun the command"):
         export(finished, "otb", tmp_path / "target")
     assert not list((tmp_path / "target").glob("*.tif"))
 

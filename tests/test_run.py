@@ -120,6 +120,7 @@ def test_match_pair__writes_a_complete_report(pair, tmp_path):
     assert counts["valid"] == (validity & INVALID == 0).sum()
     for name, flag in report["validity_bits"].items():
         assert counts["flags"][name] == np.count_nonzero(validity & (1 << flag["bit"]))
+    assert counts["valid"] + sum(counts["causes"].values()) == counts["pixels"]
     assert report["inputs"]["left"]["bytes"] == left.stat().st_size
     assert report["cost_span"] == 448
     assert load_config(report["settings"]) == load_config(settings)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.products import FLAGS, INVALID, REGULARIZED, Bands
+from sat_intervals.products import FLAGS, INVALID, REGULARIZED, Bands, cause
 
 # Widths are counted in steps of a hundredth of a pixel.
 _WIDTH_STEP = 0.01
@@ -34,6 +34,9 @@ class Tally:
     def report(self) -> dict[str, Any]:
         """Counts of pixels; ``ambiguous``: valid, with the whole search range as interval.
 
+        ``flags`` counts a pixel under each of its flags. ``causes`` counts each invalid pixel once, see
+        `products.cause`: with ``valid`` they sum to ``pixels``.
+
         The median width in pixels, to 0.01, is None where there is no interval.
         """
         upto = np.cumsum(self._widths)
@@ -46,5 +49,6 @@ class Tally:
             "ambiguous": int(self._widths[self._whole]),
             "low_confidence": self._count(valid & (sums & REGULARIZED != 0)),
             "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
+            "causes": {flag.name: self._count(cause(sums) == flag.value) for flag in FLAGS if flag.invalid},
             "median_interval_width": None if median is None else round(median, 2),
         }
