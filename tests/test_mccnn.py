@@ -220,7 +220,7 @@ def test_config__span_is_declared_and_held_to_what_can_be():
         settings(1, 9, sgm={"gradients": "raw", "span": 16})
     with pytest.raises(SatIntervalsError, match=r"sgm\.p2 is 70, allowed: <= 63 with cost\.method mccnn"):
         settings(-9, 0, sgm={"p2": 70, "span": 16})
-    with pytest.raises(SatIntervalsError, match=r"sgm.*: span is missing: the default, 16, .* another p1 and p2: give"):
+    with pytest.raises(SatIntervalsError, match=r"sgm.*: span is missing: its default, 16, .* another p1 and p2: give"):
         settings(-9, 0, sgm={"p1": 2.3, "p2": 42.3, "v": 1.5, "d": 0.08})
     assert settings(-9, 0, sgm={"p1": 0.5, "d": 0.08}) == settings(-9, 0)
     with pytest.raises(SatIntervalsError, match=r"sgm lacks p1 and p2 and span: constant penalties have no defaults"):
