@@ -107,7 +107,7 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
                 swap(folder / name, (folder / ("other.tif" if name == "right.tif" else "masked.tif")).read_bytes())
 
     images = open_image(folder / "left.tif", mask=mask), open_image(right)
-    with pytest.raises(ChangedInputError, match=rf"{name}.* was replaced or changed while the run worked") as error:
+    with pytest.raises(ChangedInputError, match=rf"{name}.* was replaced or changed during the run") as error:
         match_pair(*images, folder / "out", settings, progress=progress)
     assert "\n" not in str(error.value)
     assert isinstance(error.value, RunError)

@@ -212,7 +212,7 @@ def test_open_image__warns_of_further_pages(tmp_path, caplog):
     caplog.set_level(logging.WARNING)
     open_image(path)
     (record,) = caplog.records
-    assert f"{path} has 2 pages: the first is taken; name another as GTIFF_DIR:2:{path}" in record.getMessage()
+    assert f"{path} has 2 pages: the first is used; name another as GTIFF_DIR:2:{path}" in record.getMessage()
     assert open_image(f"GTIFF_DIR:2:{path}").height == 9
 
 

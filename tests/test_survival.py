@@ -405,7 +405,7 @@ def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, sm
         with suppress(OSError):
             ballast.write_bytes(bytes(free))
         assert command.end() == 1, command.output
-        assert "No space left on device: make room and run the same command again" in command.output
+        assert "No space left on device: free disk space and rerun the same command" in command.output
         assert len(command.output.splitlines()) == 1, command.output
     assert_nothing_final(out)
     assert len(done_tiles(out)) >= 5
