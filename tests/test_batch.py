@@ -154,7 +154,7 @@ def test_match_batch__goes_on_with_the_others_where_a_report_cannot_be_read(imag
 def test_match_batch__refuses_a_folder_where_another_batch_is_at_work(images, tmp_path):
     with (
         LocalFolder(tmp_path).locked(),
-        pytest.raises(SatIntervalsError, match="another run is at work in"),
+        pytest.raises(SatIntervalsError, match="another run is active in"),
     ):
         match_batch(read_batch(rows(images)), tmp_path)
 
@@ -214,7 +214,7 @@ def test_match_batch__holds_the_folders_of_its_pairs(images, tmp_path):
     with LocalFolder(tmp_path / "pair1" / "tiles").locked():
         report = match_batch(read_batch(rows(images)), tmp_path)
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
-    assert "another run is at work in" in report["pair1"]["error"]
+    assert "another run is active in" in report["pair1"]["error"]
 
 
 def test_match_batch__keeps_the_tiles_of_equal_pairs_apart_and_goes_on_where_those_of_one_vanish(images, tmp_path):
@@ -328,8 +328,16 @@ def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(ima
         ("a.csv", "name,left,right\n../x,l,r\n", "row 1: name '../x' cannot be a folder's name"),
         ("a.csv", "name,left,right\nx,l,r\nlogs,l,r\n", "row 2: name 'logs' cannot be"),
         ("a.csv", "name,left,right,sgm.p2\nx,l,r,[3\n", r"row 1: sgm.p2 is '\[3': while parsing"),
-        ("a.csv", "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n", "row 1: sgm.p2 is '3': the row also gives sgm as a whole"),
-        ("a.csv", "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n", "row 1: sgm is 'null': the row also gives parts of sgm"),
+        (
+            "a.csv",
+            "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n",
+            "row 1: sgm.p2 is '3': the row also gives sgm as a whole",
+        ),
+        (
+            "a.csv",
+            "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n",
+            "row 1: sgm is 'null': the row also gives parts of sgm",
+        ),
         ("a.csv", "name,left,right,sgm.p2,sgm.p2\nx,l,r,1,2\n", "column sgm.p2 appears twice"),
         ("a.csv", "name,left,right,cluster.kind\nx,l,r,slurm\n", "row 1: all pairs share one cluster"),
         ("a.csv", 'name,left,right\n"x\ny",l,r\n', r"row 1: name 'x\\ny' cannot be"),

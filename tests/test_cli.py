@@ -141,7 +141,10 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
     [
         (["--band", 4], ["left.tif has no image band 4, it has band 1 only"]),
         (["--disparity", 9, -4], ["disparity: minimum 9 is above maximum -4, swap them"]),
-        (["--disparity", 260, 300], ["disparities 260 to 300 move every pixel", "left.tif (260 columns)", "their sign"]),
+        (
+            ["--disparity", 260, 300],
+            ["disparities 260 to 300 move every pixel", "left.tif (260 columns)", "their sign"],
+        ),
         (["--disparity", -300, -260], ["disparities -300 to -260 move every pixel", "right.tif (260"]),
         (["--disparity", -200, 60], ["260 columns, fewer than the 261 disparities", "search fewer"]),
         (["--disparity", -99999, 0], ["disparity.minimum is -99999, allowed: integer >= -16000"]),
@@ -249,7 +252,7 @@ def test_match__refuses_tiles_of_which_it_cannot_tell_the_run(folder, tmp_path):
     (tmp_path / "out" / "tiles").mkdir(parents=True)
     (tmp_path / "out" / "tiles" / "manifest.json").write_text("{")
     result = invoke(*matching(folder, tmp_path / "out"))
-    assert_refused(result, "tiles holds files that no run made, such as manifest.json: move them away")
+    assert_refused(result, "tiles has files that no run made, such as manifest.json: move them away")
 
 
 def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):
@@ -526,8 +529,8 @@ def test_match__on_a_disk_that_the_files_fill_fails_and_goes_on_once_there_is_ro
     full = command(*arguments)
     assert (full.returncode, full.stdout) == (1, "")
     assert re.fullmatch(
-        rf"sat-intervals: {out}/(intervals|validity)\.tif cannot be written: No space left on device.*: free disk space .*; "
-        r"the same command goes on from the tiles, all of which are done",
+        rf"sat-intervals: {out}/(intervals|validity)\.tif cannot be written: No space left on device.*: free disk space "
+        r".*; rerun the same command: it resumes from the tiles, which are all done",
         full.stderr.splitlines()[-1],  # GDAL's TIFF library has a word of its own before that, and no way to stop it
     )
     assert [path.name for path in out.iterdir()] == ["tiles"]

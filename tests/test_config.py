@@ -417,7 +417,9 @@ def test_load_config__unreadable_file_is_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing.yaml"
     assert message(missing) == f"{missing}: No such file or directory"
     preset = tmp_path / "mccnn.yaml"
-    assert message(preset).endswith("mccnn.yaml: No such file or directory (give --preset mccnn for the preset of the package)")
+    assert message(preset).endswith(
+        "mccnn.yaml: No such file or directory (give --preset mccnn for the preset of the package)"
+    )
     assert message(tmp_path) == f"{tmp_path}: Is a directory"
 
 

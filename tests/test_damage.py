@@ -131,7 +131,9 @@ def test_match__ends_where_a_disk_damages_whatever_is_written(scene, tmp_path, m
     settings = yaml.safe_load((scene / "settings.yaml").read_text())
     with monkeypatch.context() as patch:
         patch.setattr(run, "match_tile", and_damage)
-        with pytest.raises(RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: the same command matches them"):
+        with pytest.raises(
+            RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: rerun the same command: it matches them"
+        ):
             match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
     match(scene, tmp_path / "out")
@@ -209,7 +211,7 @@ def test_match__finds_its_tiles_where_the_note_of_their_place_is_damaged(scene, 
     note = tmp_path / "out" / "tiles" / "store.json"
     note.write_text(text, encoding="latin-1")
     said = match(scene, tmp_path / "out", status=2)
-    assert f"{note} cannot be read: give the --store of before to go on, or --overwrite" in said
+    assert f"{note} cannot be read: give the same --store as before to resume, or --overwrite" in said
     records = {file: file.stat().st_mtime_ns for file in (tmp_path / "store").glob("*/records/*")}
     assert len(records) == 6
     match(scene, tmp_path / "out", *store)
@@ -340,7 +342,7 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
 def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
     mine = with_files(tmp_path / "out" / "tiles", [name])
     said = match(scene, tmp_path / "out", *options, status=2)
-    assert f"{tmp_path}/out/tiles holds files that no run made, such as {name}: move them away" in said
+    assert f"{tmp_path}/out/tiles has files that no run made, such as {name}: move them away" in said
     assert_kept(mine)
 
 

@@ -641,7 +641,7 @@ def test_output_writer__of_others_in_a_folder_disturbs_none_and_of_the_same_is_r
 
     bands = np.zeros((6, 20, 30), np.float32)
     with writer("a.tif") as one, writer("b.tif") as other:
-        with pytest.raises(SatIntervalsError, match="another run is at work in"), writer("a.tif"):
+        with pytest.raises(SatIntervalsError, match="another run is active in"), writer("a.tif"):
             pass
         one.write(0, bands)
         one.publish()

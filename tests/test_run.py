@@ -219,7 +219,7 @@ def test_match_pair__ends_where_another_run_of_the_same_removes_the_tiles(pair, 
             match_pair(left, right, tmp_path / "other", settings)
             assert not list(store.iterdir())
 
-    with pytest.raises(RunError, match=rf"^the tiles in {store}/\w{{32}} are gone, .*: run the same command again.*$"):
+    with pytest.raises(RunError, match=rf"^the tiles in {store}/\w{{32}} are gone: .*: rerun the same command.*$"):
         match_pair(left, right, tmp_path / "out", settings, progress=progress)
     assert not list((tmp_path / "out").glob("*.*"))
     assert not list(store.iterdir())

@@ -422,7 +422,7 @@ def test_match__refuses_a_folder_where_another_run_is_at_work(pair, tmp_path):
         first.process.send_signal(signal.SIGSTOP)
         with started(pair, tmp_path / "out", "--overwrite") as second:
             assert second.end() == 2
-            assert "another run is at work in" in second.output
+            assert "another run is active in" in second.output
         first.process.send_signal(signal.SIGCONT)
         assert first.end() == 0, first.output
     assert_complete(pair, tmp_path / "out")

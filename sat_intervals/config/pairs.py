@@ -196,10 +196,10 @@ def _relative_to(file: Path, path: str) -> str:
 
 def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
     """Read the rows of a CSV, YAML or JSON file without empty values; each comes after its place in the file."""
-    wanted = f"needed: one row per pair, with {', '.join(needed)}"
+    wanted = f"give a list of pairs, each with {', '.join(needed)}"
     try:
         if file.suffix.lower() == ".csv":
-            rows = _rows_of_csv(read_small(file, LARGEST_TABLE).decode("utf-8-sig"))  # spreadsheets write a byte order mark
+            rows = _rows_of_csv(read_small(file, LARGEST_TABLE).decode("utf-8-sig"))  # with a byte order mark
         else:
             rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
     except SatIntervalsError:

@@ -38,8 +38,8 @@ _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "ba
 _COG = {"COMPRESS": "DEFLATE", "LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
 # Side in pixels of the smallest overview.
 _OVERVIEW_SIZE = 512
-# GDAL's block cache in bytes; its default is a twentieth of the memory. A larger cache is not faster, even for strips of
-# 60 000 columns, and keeps small images in memory.
+# GDAL's block cache in bytes; the default is a twentieth of the memory. A larger cache is not faster, even for strips
+# of 60 000 columns, and keeps small images in memory.
 _CACHE = 16 << 20
 # Rows and columns of a window that is read back: enough blocks for every thread.
 _READ_BACK = 512, 4096
@@ -169,8 +169,8 @@ class OutputWriter:
     def publish(self, report: tuple[str, str] | None = None) -> None:
         """Rename the files to their final names, all of them or none.
 
-        ``report`` is name and text of a file that marks the others as complete: the old one is removed first and the new
-        one comes last. If a rename fails, the old files are restored.
+        ``report`` is name and text of a file that marks the others as complete: the old one is removed first and the
+        new one comes last. If a rename fails, the old files are restored.
         """
         self.build()
         names = [file.name for file in self._files]
