@@ -225,7 +225,7 @@ def test_match__notices_swapped_arguments(folder, tmp_path):
 @pytest.mark.parametrize(
     ("place", "says"),
     [
-        ("{}/left.tif", "left.tif is no folder: choose another"),
+        ("{}/left.tif", "left.tif is not a folder: choose another"),
         ("{}/left.tif/out", "left.tif/out cannot be written: Not a directory: choose another folder"),
         ("/proc/out", "/proc/out cannot be written: "),
         ("{}/" + 300 * "o", "cannot be written: File name too long: choose another folder"),
@@ -271,13 +271,13 @@ def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "options", "says"),
     [
-        ({"left": "empty.tif"}, [], "all pixels of {0}/empty.tif hold no data or are masked"),
-        ({"right": "empty.tif"}, [], "all pixels of {0}/empty.tif hold no data or are masked"),
-        ({}, ["--left-mask", "{0}/masked.tif"], "all pixels of {0}/left.tif hold no data or are masked"),
-        ({}, ["--disparity", 259, 259], "nowhere do 5 x 5 usable pixels of both face each other"),
+        ({"left": "empty.tif"}, [], "all pixels of {0}/empty.tif are no data or masked"),
+        ({"right": "empty.tif"}, [], "all pixels of {0}/empty.tif are no data or masked"),
+        ({}, ["--left-mask", "{0}/masked.tif"], "all pixels of {0}/left.tif are no data or masked"),
+        ({}, ["--disparity", 259, 259], "nowhere do both images have 5 x 5 usable pixels"),
         ({"left": "pixel.tif", "right": "pixel.tif"}, ["--disparity", 0, 0], "nowhere do 5 x 5 usable pixels"),
         ({"left": "tiny.tif", "right": "tiny.tif"}, ["--disparity", 0, 1], "nowhere do 5 x 5 usable pixels"),
-        ({}, ["--window", 0, 0, 1, 1], "nowhere do 5 x 5 usable pixels of both face each other"),
+        ({}, ["--window", 0, 0, 1, 1], "nowhere do both images have 5 x 5 usable pixels"),
     ],
     ids=["left", "right", "mask", "range", "pixel", "tiny", "window"],
 )
@@ -297,7 +297,9 @@ def test_match__names_the_tiles_that_a_truncated_file_fails(folder, tmp_path, cl
     result = command(*matching(folder, out, *options, left="cut.tif"))
     assert (result.returncode, result.stdout) == (1, "")
     first, *lines = result.stderr.splitlines()
-    assert re.fullmatch(r"sat-intervals: (\d+) of 20 tiles failed, .*run the same command again, with --ov.*:", first)
+    assert re.fullmatch(
+        r"sat-intervals: (\d+) of 20 tiles failed, .*rerun the same command: it resumes; add --ov.*:", first
+    )
     assert int(first.split()[1]) == len(lines)
     failed = {re.fullmatch(r"  tile (\d_\d): (.*)", line)[1] for line in lines}
     kept = {path.stem for path in (out / "tiles" / "records").glob("[0-9]*.json")}
@@ -383,7 +385,7 @@ def test_log_file__keeps_what_debug_shows_and_what_it_held(folder, tmp_path):
     assert len([message for _, message in words if "tile 3_4 failed: " in message]) == 1
     retries = load_config(folder / "settings.yaml").cluster.retries
     tries = [message for _, message in words if message.startswith("tile 3_4 failed; ")]
-    assert tries == [f"tile 3_4 failed; it is tried again, {retries} times at most"] * (1 + retries)
+    assert tries == [f"tile 3_4 failed; it is tried again at most {retries} times"] * (1 + retries)
     assert "Traceback (most recent call last)" in kept
     assert "\nsat_intervals.errors.RunError: " in kept
     command(*arguments)
@@ -473,7 +475,7 @@ def test_match__ended_by_a_signal_leaves_tiles_and_the_next_try_goes_on(folder, 
     returned, _, errors = ended_by(number, arguments, out)
     assert (returned, errors) == (
         status,
-        f"sat-intervals: {word}; the same command goes on from the tiles that are done\n",
+        f"sat-intervals: {word}; rerun the same command: it resumes\n",
     )
     assert [path.name for path in out.iterdir()] == ["tiles"]
     before = {path: path.stat().st_mtime_ns for path in out.glob("tiles/records/[0-9]*.json")}
@@ -489,7 +491,7 @@ def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, t
     arguments = matching(folder, out, "--tile-size", 64, "--cluster", "processes", "--workers", 2)
     returned, _, errors = ended_by(signal.SIGINT, arguments, out, together=True)
     assert returned == 130
-    assert "sat-intervals: interrupted; the same command goes on" in errors
+    assert "sat-intervals: interrupted; rerun the same command" in errors
     assert "Traceback" not in errors
     assert "Ctrl" not in errors
     assert_nothing_final(out)
@@ -529,8 +531,8 @@ def test_match__on_a_disk_that_the_files_fill_fails_and_goes_on_once_there_is_ro
     full = command(*arguments)
     assert (full.returncode, full.stdout) == (1, "")
     assert re.fullmatch(
-        rf"sat-intervals: {out}/(intervals|validity)\.tif cannot be written: No space left on device.*: free disk space "
-        r".*; rerun the same command: it resumes from the tiles, which are all done",
+        rf"sat-intervals: {out}/(intervals|validity)\.tif cannot be written: No space left on device.*: free disk "
+        r"space .*; rerun the same command: it resumes from the tiles, which are all done",
         full.stderr.splitlines()[-1],  # GDAL's TIFF library has a word of its own before that, and no way to stop it
     )
     assert [path.name for path in out.iterdir()] == ["tiles"]

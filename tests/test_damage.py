@@ -261,7 +261,7 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
         match_pair(scene / "left.tif", scene / "right.tif", out, settings)
     assert list(tmp_path.rglob("records/*.json"))
     assert match(scene, out, *store) == (
-        f"sat-intervals: the run in {out} was complete; the tiles that it left are removed now\n"
+        f"sat-intervals: the run in {out} was already complete; its remaining tiles were removed\n"
     )
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
     assert not list(tmp_path.rglob("arrays.zarr"))
@@ -278,7 +278,7 @@ def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tm
         match(scene, out, status=1)
     damage(out / name, how)
     said = match(scene, out, status=2)
-    assert f"{out / name} was changed after the run, whose tiles are still there: delete it" in said
+    assert f"{out / name} was changed after the run, but the tiles still exist: delete it" in said
     assert (out / name).stat().st_size == 0 or how != "empty"
     (out / name).unlink()
     match(scene, out)

@@ -156,9 +156,7 @@ def test_match__shares_a_bucket_with_the_same_run_and_ends_when_that_removes_the
                 worker.resume()
             status, output = ended(first)
     assert status == 1
-    assert re.search(
-        rf"^sat-intervals: the tiles in {store}/\w{{32}} are gone: .*: rerun the same command", output, re.M
-    )
+    assert re.search(rf"^sat-intervals: the tiles in {store}/\w{{32}} are gone: .*: rerun the same", output, re.M)
     assert [path.name for path in out.iterdir()] == ["tiles"]
     assert objects(store) == {}
 

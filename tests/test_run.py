@@ -322,7 +322,7 @@ def test_match_pair__says_which_image_is_empty(pair, tmp_path):
     shutil.copy(left, empty)
     with rasterio.open(empty, "r+") as file:
         file.write(np.zeros(file.shape, "uint16"), 1)
-    with pytest.raises(SatIntervalsError, match=r"empty\.tif hold no data"):
+    with pytest.raises(SatIntervalsError, match=r"empty\.tif are no data"):
         match_pair(left, empty, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
 

@@ -212,9 +212,7 @@ class Regularization(Section):
     """Intervals of low-confidence pixels from quantiles of neighbouring bounds."""
 
     threshold: float = Field(0.6, ge=0, le=1, description="confidence at or below this is low")
-    kernel: Odd = Field(
-        5, ge=1, le=101, description="width along the row of the minimum filter on confidence, in pixels"
-    )
+    kernel: Odd = Field(5, ge=1, le=101, description="length in pixels of the minimum filter on confidence, along rows")
     depth: int = Field(2, ge=0, le=16, description="rows above and below that connected segments may reach")
     quantile: float = Field(0.9, ge=0.5, le=1, description="quantile of upper bounds; 1 - quantile of lower bounds")
 
