@@ -247,7 +247,7 @@ def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, 
     assert {end["state"] for end in report.values()} == {"failed"}
     assert hashes(tmp_path / "pair1") == before
     told = invoke("status", tmp_path / "pair1")
-    assert "1 of 1 tiles done, 0 failed, 0 left; no run is at work" in told.stdout
+    assert "1 of 1 tiles done, 0 failed, 0 left; no run is active" in told.stdout
     report = match_batch(pairs, tmp_path, {"median": None})
     assert {end["state"] for end in report.values()} == {"done"}
     assert hashes(tmp_path / "pair1") != before
@@ -418,6 +418,8 @@ def test_plan__prints_what_a_run_will_take(images):
     assert result.exit_code == 0, result.stderr
     assert "expected time, 3 tiles at once" in result.stdout
     assert "smaller than set, to fit" in result.stdout
+    assert re.search(r"memory of a worker: +\d+ MB, fits in 400 MB\n", result.stdout)
+    assert re.search(r"with 3 tiles at once: +\d+ MB, does not fit in 400 MB: give --workers [12]\n", result.stdout)
     refused = invoke("plan", *pair, "--memory", "100MB")
     assert refused.exit_code == 2
     assert "given are 100 MB" in refused.stderr
@@ -464,5 +466,5 @@ def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     (out / "tiles" / "records" / "1_1.json").unlink()
     Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
     result = invoke("status", out)
-    assert "10 of 12 tiles done, 1 failed, 1 left; no run is at work" in result.stdout
+    assert "10 of 12 tiles done, 1 failed, 1 left; no run is active" in result.stdout
     assert "tile 0_1: no more disk" in result.stdout

@@ -152,7 +152,7 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
         (["--left-mask", "{}/half-mask.tif"], ["half-mask.tif has 100 x 260 pixels", "left.tif 200 x 260", "size"]),
         (["--right-mask", "{}/half-mask.tif"], ["half-mask.tif has 100 x 260 pixels", "right.tif 200 x 260"]),
         (["--right-mask", "{}/absent.tif"], ["absent.tif cannot be read: No such file or directory"]),
-        (["--left-mask", ""], ["'--left-mask': it is empty: name a file"]),
+        (["--left-mask", ""], ["'--left-mask': it is empty: give a file"]),
         (["--window", 150, 0, 100, 100], ["row 150, column 0, 100 x 100 pixels: must lie inside", "200 x 260 pixels"]),
         (["--window", -1, 0, 100, 100], ["row -1, column 0, 100 x 100 pixels: must lie inside", "left.tif"]),
         (["--window", 0, 0, 0, 9], ["0 x 9 pixels: must lie inside"]),
@@ -209,12 +209,12 @@ def test_match__asks_for_a_search_range(folder, tmp_path):
 def test_match__refuses_empty_names(folder, tmp_path, place):
     arguments = matching(folder, tmp_path / "out")
     arguments[1 + place] = ""
-    assert_refused(invoke(*arguments), f"'{('LEFT', 'RIGHT', 'OUT')[place]}': it is empty: name a file or folder")
+    assert_refused(invoke(*arguments), f"'{('LEFT', 'RIGHT', 'OUT')[place]}': it is empty: give a file or folder")
 
 
 def test_match__refuses_names_that_gdal_cannot_be_told(folder, tmp_path):
     name = os.fsdecode(b"left\xff.tif")
-    assert_refused(invoke("match", name, folder / "right.tif", tmp_path), "is no UTF-8: rename it")
+    assert_refused(invoke("match", name, folder / "right.tif", tmp_path), "is not UTF-8: rename it")
 
 
 def test_match__notices_swapped_arguments(folder, tmp_path):
@@ -555,6 +555,8 @@ def test_match__prints_plain_lines_and_a_table(done):
     assert "writing files" in lines
     assert lines[-3:] == [str(out / name) for name in ("intervals.tif", "validity.tif", "run.json")]
     report = json.loads((out / "run.json").read_text())
+    assert set(report["counts_meaning"]) <= set(report["counts"])
+    assert report["counts"]["flags"]["regularized"] >= report["counts"]["low_confidence"] > 0
     share = 100 * report["counts"]["valid"] / report["counts"]["pixels"]
     assert re.search(rf"^valid pixels +{share:.1f} %$", result.stdout, re.MULTILINE)
     assert re.search(r"^median interval width +\d+\.\d\d px$", result.stdout, re.MULTILINE)
@@ -564,7 +566,7 @@ def test_match__prints_plain_lines_and_a_table(done):
 
 
 def test_match__quiet_prints_nothing(folder, tmp_path):
-    result = command(*matching(folder, tmp_path / "out", "--quiet"))
+    result = command(*matching(folder, tmp_path / "out", "-q"))
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
 

@@ -688,7 +688,5 @@ def test_commands__say_that_the_working_directory_is_gone(tmp_path, words):
         ["sh", "-c", script, "sh", COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
-    assert (
-        done.stderr.splitlines()[-1] == "sat-intervals: the working directory is gone: change to a folder that is there"
-    )
+    assert done.stderr.splitlines()[-1] == "sat-intervals: the working directory was deleted: change to another folder"
     assert "Traceback" not in done.stderr

@@ -73,7 +73,7 @@ def test_main__names_a_malformed_dask_configuration(tmp_path):
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert str(tmp_path / "distributed.yaml") in line
-    assert line.endswith("mend it, or point DASK_CONFIG elsewhere")
+    assert line.endswith("fix it, or set DASK_CONFIG to another")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="a network of its own needs root")
@@ -93,12 +93,21 @@ def test_explained__a_failed_allocation_is_a_lack_of_memory(error):
     assert "not enough memory: choose a smaller --tile-size or fewer --workers" in line
 
 
-def test_main__ends_quietly_when_its_reader_goes():
+@pytest.mark.parametrize("arguments", [["config"], ["--help"], ["--version"], ["match", "--help"]])
+def test_main__ends_quietly_when_its_reader_goes(arguments):
     read, written = os.pipe()
     os.close(read)
-    result = subprocess.run([COMMAND, "config"], stdout=written, stderr=subprocess.PIPE, check=False, timeout=60)
+    result = subprocess.run([COMMAND, *arguments], stdout=written, stderr=subprocess.PIPE, check=False, timeout=60)
     os.close(written)
     assert (result.returncode, result.stderr) == (141, b"")
+
+
+def test_main__keeps_the_status_of_an_error_when_the_reader_of_stderr_goes():
+    read, written = os.pipe()
+    os.close(read)
+    result = subprocess.run([COMMAND, "match", "a", "b"], stdout=written, stderr=written, check=False, timeout=60)
+    os.close(written)
+    assert result.returncode == 2
 
 
 def test_main__ends_quietly_when_the_reader_of_its_progress_goes(tmp_path):

@@ -132,7 +132,7 @@ def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
     with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
         wait_for_tiles(first, store, 3)
         with halted(first):
-            assert "a run is at work" in status_of(out, store)
+            assert "a run is active" in status_of(out, store)
     done = records(store)
     assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out, store)
     with started(pair, out, store, "--keep-tiles") as again:
