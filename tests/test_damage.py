@@ -131,7 +131,9 @@ def test_match__ends_where_a_disk_damages_whatever_is_written(scene, tmp_path, m
     settings = yaml.safe_load((scene / "settings.yaml").read_text())
     with monkeypatch.context() as patch:
         patch.setattr(run, "match_tile", and_damage)
-        with pytest.raises(RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: the same command matches them"):
+        with pytest.raises(
+            RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: rerun the same command: it matches them"
+        ):
             match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
     match(scene, tmp_path / "out")
@@ -209,7 +211,7 @@ def test_match__finds_its_tiles_where_the_note_of_their_place_is_damaged(scene, 
     note = tmp_path / "out" / "tiles" / "store.json"
     note.write_text(text, encoding="latin-1")
     said = match(scene, tmp_path / "out", status=2)
-    assert f"{note} cannot be read: give the --store of before to go on, or --overwrite" in said
+    assert f"{note} cannot be read: give the same --store as before to resume, or --overwrite" in said
     records = {file: file.stat().st_mtime_ns for file in (tmp_path / "store").glob("*/records/*")}
     assert len(records) == 6
     match(scene, tmp_path / "out", *store)
@@ -259,7 +261,7 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
         match_pair(scene / "left.tif", scene / "right.tif", out, settings)
     assert list(tmp_path.rglob("records/*.json"))
     assert match(scene, out, *store) == (
-        f"sat-intervals: the run in {out} was complete; the tiles that it left are removed now\n"
+        f"sat-intervals: the run in {out} was already complete; its remaining tiles were removed\n"
     )
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
     assert not list(tmp_path.rglob("arrays.zarr"))
@@ -276,7 +278,7 @@ def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tm
         match(scene, out, status=1)
     damage(out / name, how)
     said = match(scene, out, status=2)
-    assert f"{out / name} was changed after the run, whose tiles are still there: delete it" in said
+    assert f"{out / name} was changed after the run, but the tiles still exist: delete it" in said
     assert (out / name).stat().st_size == 0 or how != "empty"
     (out / name).unlink()
     match(scene, out)
@@ -340,7 +342,7 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
 def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
     mine = with_files(tmp_path / "out" / "tiles", [name])
     said = match(scene, tmp_path / "out", *options, status=2)
-    assert f"{tmp_path}/out/tiles holds files that no run made, such as {name}: move them away" in said
+    assert f"{tmp_path}/out/tiles has files that no run made, such as {name}: move them away" in said
     assert_kept(mine)
 
 

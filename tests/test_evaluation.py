@@ -320,8 +320,11 @@ def test_find_pairs__says_what_is_wrong_with_a_folder(tmp_path, meta, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("left,right,minimum,maximum\na,b,1,2\n", "row 1 lacks truth: needed is a row a pair, with left, right, truth"),
-        ("left,right,truth,minimum,maximum\n", "pairs.csv holds no pairs: needed is a row a pair, with left, right"),
+        (
+            "left,right,minimum,maximum\na,b,1,2\n",
+            "row 1 lacks truth: give a list of pairs, each with left, right, truth",
+        ),
+        ("left,right,truth,minimum,maximum\n", "pairs.csv holds no pairs: give a list of pairs, each with left, right"),
         ("left,right,truth,minimum,maximum,name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
         ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "row 1: minimum '1', maximum 'x', needed: integers"),
         (
@@ -452,7 +455,7 @@ def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
         (["PAIR", "--config", "nope.yaml"], "nope.yaml"),
         (
             ["nothere.csv"],
-            "nothere.csv cannot be read: No such file or directory: needed is a row a pair",
+            "nothere.csv cannot be read: No such file or directory: give a list of pairs",
         ),
     ],
 )

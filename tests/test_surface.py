@@ -280,7 +280,7 @@ def test_projection__refuses_what_is_no_map_in_metres(crs):
 
 def test_projection__takes_a_number_and_no_heights():
     assert Projection("32637").crs == "EPSG:32637"
-    with pytest.raises(SatIntervalsError, match=r"has heights too: give a map alone, and a geoid by --geoid"):
+    with pytest.raises(SatIntervalsError, match=r"includes heights: give a horizontal CRS, and a geoid with --geoid"):
         Projection("EPSG:32637+5773")
 
 
@@ -316,7 +316,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([far[0]], ["--output", str(tmp_path)], "exists and is not a surface model: choose another --output"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "says -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(tmp_path / "none.gtx")], "none.gtx: no such file"),
-        ([far[0]], ["--crs", "EPSG:4326"], "is no map in metres"),
+        ([far[0]], ["--crs", "EPSG:4326"], "is not a map in metres"),
         ([tmp_path / "nowhere"], [], "give the folder of a finished run"),
     ]
     for outs, options, message in cases:

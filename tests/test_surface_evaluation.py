@@ -128,7 +128,7 @@ def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
         ([tmp_path, "--dsm", model, "--reference", away], "evaluate one of them at a time"),
         (["--dsm", tmp_path / "none.tif", "--reference", away], "none.tif"),
         (["--dsm", model, "--reference", away], "give a reference of the same place"),
-        (["--dsm", model, "--reference", nowhere], "does not say where it lies"),
+        (["--dsm", model, "--reference", nowhere], "has no CRS or is not north up"),
         (
             ["--dsm", feet, "--reference", model],
             "feet.tif is not a surface model of sat-intervals dsm: is it the --reference?",
