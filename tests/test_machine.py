@@ -189,6 +189,7 @@ def limit(folder, figures):
         (folder / name).write_text(text)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("cgroup", ["memory"], indirect=True)
 def test_usable_memory__is_at_most_the_limit_of_a_real_cgroup(cgroup):
     folder, enter = cgroup
@@ -196,6 +197,7 @@ def test_usable_memory__is_at_most_the_limit_of_a_real_cgroup(cgroup):
     assert told("usable_memory", enter) == 2**28
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("cgroup", ["cpu"], indirect=True)
 def test_usable_cores__are_at_most_the_quota_of_a_real_cgroup(cgroup):
     folder, enter = cgroup

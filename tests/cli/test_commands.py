@@ -286,7 +286,7 @@ def test_match__says_why_no_pixel_can_be_matched(folder, tmp_path, arguments, op
     assert_nothing_final(tmp_path / "out")
 
 
-@pytest.mark.parametrize("cluster", ["threads", "processes"])
+@pytest.mark.parametrize("cluster", ["threads", pytest.param("processes", marks=pytest.mark.process)])
 def test_match__names_the_tiles_that_a_truncated_file_fails(folder, tmp_path, cluster):
     """The lower half of the left image is gone: the three lower of five rows of tiles with their overlap."""
     out = tmp_path / "out"
@@ -341,7 +341,7 @@ def logged(text):
     return re.findall(f"^{LINE}$", text, re.MULTILINE)
 
 
-@pytest.mark.parametrize("cluster", ["threads", "processes"])
+@pytest.mark.parametrize("cluster", ["threads", pytest.param("processes", marks=pytest.mark.process)])
 def test_debug__shows_stages_tiles_and_workers_and_what_dask_says(folder, tmp_path, cluster):
     options = ["--quiet", "--tile-size", 128, "--cluster", cluster, "--workers", 2, "--debug"]
     result = command(*matching(folder, tmp_path / "out", *options))
@@ -362,6 +362,7 @@ def test_debug__shows_stages_tiles_and_workers_and_what_dask_says(folder, tmp_pa
     assert re.fullmatch(r"sat-intervals match ended after \d+\.\d s", words[-1][1])
 
 
+@pytest.mark.process
 def test_log_file__keeps_what_debug_shows_and_what_it_held(folder, tmp_path):
     log = tmp_path / "run.log"
     log.write_text("mine\n")
@@ -461,6 +462,7 @@ def wait_for_a_tile(process, out):
     assert process.poll() is None, process.communicate()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("number", "word", "status"), [(signal.SIGINT, "interrupted", 130), (signal.SIGTERM, "terminated", 143)]
 )
@@ -480,6 +482,7 @@ def test_match__ended_by_a_signal_leaves_tiles_and_the_next_try_goes_on(folder, 
     assert hashes(out) == hashes(done[0])
 
 
+@pytest.mark.process
 def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, tmp_path):
     """A terminal sends Ctrl-C to every process of the group."""
     out = tmp_path / "out"
@@ -492,30 +495,8 @@ def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, t
     assert_nothing_final(out)
 
 
-@pytest.fixture
-def disk(tmp_path):
-    """A function that mounts a disk of some kB, or gives it that size; skipped where that is not allowed."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = False
-
-    def of_size(kilobytes):
-        nonlocal mounted
-        options = ("remount," if mounted else "") + f"size={kilobytes}k"
-        tried = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", place], capture_output=True, check=False)
-        if tried.returncode:
-            message = f"a small disk takes root: {tried.stderr.decode()}"
-            (pytest.fail if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1" else pytest.skip)(message)
-        mounted = True
-        return place
-
-    yield of_size
-    if mounted:
-        subprocess.run(["umount", place], check=True)
-
-
 def test_match__on_a_disk_that_the_files_fill_fails_and_goes_on_once_there_is_room(folder, tmp_path, done, disk):
-    out = disk(20_000) / "out"
+    out = disk(20 << 20) / "out"
     arguments = matching(folder, out, "--tile-size", 64, "--overlap", 20, "--quiet", "--keep-tiles")
     command(*arguments)
     for name in OUTPUTS:  # as if it had ended before them
@@ -727,10 +708,17 @@ def test_match__command_line_wins_over_the_file(folder, tmp_path):
 
 
 # ---- The other commands -----------------------------------------------------------------------------------------
-@pytest.mark.parametrize("preset", PRESETS)
-def test_config__prints_settings_that_match_takes(folder, tmp_path, preset, request):
-    if "mccnn" in preset:
-        request.getfixturevalue("mccnn_extra")
+MCCNN = pytest.mark.peer("onnxruntime", "mc_cnn")
+
+
+@pytest.mark.parametrize(
+    "preset",
+    [
+        pytest.param(name, marks=pytest.mark.peer("onnxruntime", "mc_cnn") if "mccnn" in name else ())
+        for name in PRESETS
+    ],
+)
+def test_config__prints_settings_that_match_takes(folder, tmp_path, preset):
     result = invoke("config", "--preset", preset)
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == preset_text(preset)
@@ -798,6 +786,7 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     assert hashes(out) == before
 
 
+@pytest.mark.process
 def test_demo__goes_on_where_it_was_interrupted(tmp_path):
     out = tmp_path / "out"
     arguments = ["demo", out, "--size", 200, 260, "--tile-size", 64, "--workers", 1]

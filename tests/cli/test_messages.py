@@ -76,6 +76,7 @@ def test_main__names_a_malformed_dask_configuration(tmp_path):
     assert line.endswith("mend it, or point DASK_CONFIG elsewhere")
 
 
+@pytest.mark.process
 @pytest.mark.skipif(os.geteuid() != 0, reason="a network of its own needs root")
 def test_main__needs_no_network(tmp_path):
     image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))

@@ -1,7 +1,7 @@
 """Points and heights: cameras of known geometry, shareloc's own points, a real pair and a peer's surface of it."""
 
 import csv
-import os
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -18,14 +18,14 @@ from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.tiling import Window
 
-if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") != "1":
-    pytest.importorskip("shareloc", reason="needs the extra [dsm]")
+with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
+    from sat_intervals.heights.sensors import Lattice, Sensors
+    from sat_intervals.heights.triangulate import triangulate
 
-from sat_intervals.heights.sensors import Lattice, Sensors
-from sat_intervals.heights.triangulate import triangulate
-
-# Epipolar images have no georeferencing.
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [
+    pytest.mark.peer("shareloc"),
+    pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),  # as epipolar images are
+]
 
 # Where the scene stands, and metres in a degree there, of longitude and of latitude.
 LONGITUDE, LATITUDE = 1.45, 43.6

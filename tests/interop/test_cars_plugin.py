@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import warnings
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -104,10 +103,7 @@ def test_cars_plugin__of_another_version_leaves_cars_alone(tmp_path):
     assert "this CARS cannot match with sat_intervals, which needs CARS 1.3" in done.stderr
 
 
-@pytest.mark.skipif(
-    find_spec("cars") is None and os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") != "1",
-    reason="needs the extra [cars]",
-)
+@pytest.mark.peer("cars")
 def test_cars__matches_a_real_pair_with_intervals_up_to_its_surface(shared_data, tmp_path):
     folder = shared_data / "dsm_picanteo"
     for side in ("left", "right"):

@@ -11,30 +11,31 @@ import pytest
 import sat_intervals
 from sat_intervals.kernels.compiled import FINGERPRINT, fingerprint
 
-TESTS = Path(__file__).parent
+ROOT = Path(__file__).parents[2]
 
 
 def run_tests(environment, *selection):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *selection]
     result = subprocess.run(
-        command, cwd=TESTS.parent, env=os.environ | environment, capture_output=True, text=True, timeout=600
+        command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=600
     )
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     assert " passed" in result.stdout
 
 
+@pytest.mark.ported
 # generic: SSE2 alone; haswell: AVX2. Vectors of 512 bits are split by LLVM.
 @pytest.mark.parametrize("processor", ["generic", "haswell"])
 def test_kernels__equal_their_twins_on_processors_without_avx512(tmp_path, processor):
     environment = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path)}
     run_tests(
         environment,
-        "tests/test_intervals.py::test_match_arrays__equals_reference",
-        "tests/test_correlation.py::test_correlate__worked_example",
-        "tests/test_sgm.py::test_cost_volume__equals_reference_with_penalties_that_follow_edges",
-        "tests/test_sgm.py::test_cost_volume__equals_reference_at_every_count",
-        "tests/test_intervals.py::test_match__interval_equals_reference_at_every_count",
-        "tests/test_disparity.py::test_match__equals_reference_at_every_count",
+        "tests/kernels/test_intervals.py::test_match_arrays__equals_reference",
+        "tests/kernels/test_correlation.py::test_correlate__worked_example",
+        "tests/kernels/test_sgm.py::test_cost_volume__equals_reference_with_penalties_that_follow_edges",
+        "tests/kernels/test_sgm.py::test_cost_volume__equals_reference_at_every_count",
+        "tests/kernels/test_intervals.py::test_match__interval_equals_reference_at_every_count",
+        "tests/kernels/test_disparity.py::test_match__equals_reference_at_every_count",
     )
 
 
@@ -49,12 +50,13 @@ def test_fingerprint__follows_every_source_that_decides_what_kernels_do(tmp_path
     assert fingerprint(tmp_path) != FINGERPRINT
 
 
+@pytest.mark.ported
 def test_kernels__plain_ones_equal_their_twins_without_compilation(tmp_path):
     run_tests(
         {"NUMBA_DISABLE_JIT": "1"},
-        "tests/test_disparity.py",
-        "tests/test_confidence.py",
-        "tests/test_intervals.py",
+        "tests/kernels/test_disparity.py",
+        "tests/kernels/test_confidence.py",
+        "tests/kernels/test_intervals.py",
         "-k",
         "worked_example and not match__ and not alpha_cut",
     )
@@ -79,6 +81,7 @@ def use_a_kernel(script, **environment):
     return done.stdout.split()
 
 
+@pytest.mark.process
 def test_cached__a_kernel_is_compiled_once_for_all_processes(tmp_path):
     on_a_worker = """
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from sat_intervals.tiling import Window
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),
-    pytest.mark.usefixtures("mccnn_extra"),
+    pytest.mark.peer("onnxruntime", "mc_cnn"),
 ]
 
 

@@ -7,7 +7,6 @@ pixel differ all the same, on another pair or with another Pandora.
 """
 
 import json
-import os
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -32,7 +31,10 @@ from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
 from sat_intervals.tiling import Window
 
 # Our reading of the pairs, which have no georeferencing. Pandora and its plugin raise no warning.
-pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+pytestmark = [
+    pytest.mark.peer("pandora", "pandora_plugin_libsgm", "pandora_plugin_mc_cnn"),
+    pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),
+]
 
 # Middlebury without no data; real Pleiades, of which a third is no data, 0.
 PAIRS = ("mb2003_cones", "phr_picanteo_pre")
@@ -93,13 +95,8 @@ class Peer(NamedTuple):
 
 @pytest.fixture(scope="module")
 def pandora() -> ModuleType:
-    names = ("pandora", "pandora.check_configuration", "pandora.img_tools", "pandora.state_machine")
-    required = os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1"
-    for name in ("pandora_plugin_libsgm", "pandora_plugin_mc_cnn", *names):
-        if required:
-            import_module(name)
-        else:
-            pytest.importorskip(name)
+    for name in ("pandora.check_configuration", "pandora.img_tools", "pandora.state_machine"):
+        import_module(name)
     module = import_module("pandora")
     module.import_plugin()
     return module

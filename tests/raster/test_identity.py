@@ -2,12 +2,9 @@
 
 import hashlib
 import os
-import re
 import subprocess
-import threading
 import time
-from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -20,48 +17,6 @@ from sat_intervals.raster.identity import identity, is_changed
 from sat_intervals.tiling import Window
 
 SIDE = 1024
-
-
-class Handler(BaseHTTPRequestHandler):
-    """Files of the server's folder in byte ranges, with the ETag of their bytes."""
-
-    protocol_version = "HTTP/1.1"
-
-    def do_HEAD(self) -> None:
-        self.do_GET()
-
-    def do_GET(self) -> None:
-        file = self.server.folder / self.path[1:]
-        content = file.read_bytes() if file.is_file() else b""
-        asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
-        first, last = (int(asked[1]), int(asked[2] or len(content))) if asked else (0, len(content))
-        body = content[first : last + 1]
-        self.send_response(404 if not content else 206 if asked else 200)
-        self.send_header("Content-Length", str(len(body)))
-        self.send_header("Accept-Ranges", "bytes")
-        self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
-        if asked:
-            self.send_header("Content-Range", f"bytes {first}-{first + len(body) - 1}/{len(content)}")
-        self.end_headers()
-        if self.command == "GET":
-            self.server.sent.append((self.path[1:], len(body)))
-            self.wfile.write(body)
-
-    def log_message(self, *_: object) -> None:
-        """Say nothing."""
-
-
-@pytest.fixture
-def server(tmp_path) -> Iterator[ThreadingHTTPServer]:
-    """A web server on loopback of the folder ``server.folder``; what it sent of which file is in ``server.sent``."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        server.folder, server.sent = tmp_path / "web", []
-        server.folder.mkdir()
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield server
-        server.shutdown()
-        thread.join()
 
 
 @pytest.fixture(scope="module")
@@ -97,38 +52,38 @@ def ended(process: subprocess.Popen) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("prefix", ["", "/vsicurl/"])
-def test_match__reads_windows_of_images_on_a_web_server(server, images, tmp_path, prefix):
-    put(images, server.folder)
+def test_match__reads_windows_of_images_on_a_web_server(web_server, images, tmp_path, prefix):
+    put(images, web_server.folder)
     window = "--window", "512", "384", "128", "128"
-    assert ended(match(server, tmp_path / "remote", *window, prefix=prefix)) == (0, "")
+    assert ended(match(web_server, tmp_path / "remote", *window, prefix=prefix)) == (0, "")
     for name, content in images.items():
-        sent = [count for file, count in server.sent if file == name]
+        sent = [count for file, count in web_server.sent if file == name]
         assert max(sent) < len(content) / 8
         assert sum(sent) < len(content) / 3, name
     options = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"overlap": 20}}
-    local = server.folder / "left.tif", server.folder / "right.tif", tmp_path / "local", options
+    local = web_server.folder / "left.tif", web_server.folder / "right.tif", tmp_path / "local", options
     match_pair(*local, window=Window(512, 384, 128, 128))
     assert hashes(tmp_path / "remote") == hashes(tmp_path / "local")
 
 
-def test_match__never_goes_on_with_an_image_of_another_etag(server, images, tmp_path):
-    put(images, server.folder)
+def test_match__never_goes_on_with_an_image_of_another_etag(web_server, images, tmp_path):
+    put(images, web_server.folder)
     out, tiles = tmp_path / "out", ("--tile-size", "128")
-    first = match(server, out, *tiles)
+    first = match(web_server, out, *tiles)
     while first.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
         time.sleep(0.02)
     first.terminate()
     assert ended(first)[0] == 143
     changed = bytearray(images["right.tif"])
     changed[-1] ^= 1
-    put({"right.tif": bytes(changed)}, server.folder)
-    status, output = ended(match(server, out, *tiles))
+    put({"right.tif": bytes(changed)}, web_server.folder)
+    status, output = ended(match(web_server, out, *tiles))
     assert status == 2
     tags = [hashlib.sha256(content).hexdigest() for content in (images["right.tif"], changed)]
     assert "holds the tiles of another run: inputs.right.etag was " in output
     assert output.index(tags[0]) < output.index(tags[1])
-    put(images, server.folder)
-    assert ended(match(server, out, *tiles)) == (0, "")
+    put(images, web_server.folder)
+    assert ended(match(web_server, out, *tiles)) == (0, "")
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
 
@@ -153,15 +108,15 @@ def test_identity__sees_a_change_at_equal_size_and_time_and_hashes_only_then(tmp
     assert not is_changed(str(file), before)
 
 
-def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(server, images, tmp_path):
-    put(images, server.folder)
+def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(web_server, images, tmp_path):
+    put(images, web_server.folder)
     out = tmp_path / "out"
-    run = match(server, out, "--tile-size", "128", "--workers", "1")
+    run = match(web_server, out, "--tile-size", "128", "--workers", "1")
     while run.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
         time.sleep(0.02)
     changed = bytearray(images["right.tif"])
     changed[-1] ^= 1
-    put({"right.tif": bytes(changed)}, server.folder)
+    put({"right.tif": bytes(changed)}, web_server.folder)
     status, output = ended(run)
     assert (status, output.count("\n")) == (1, 1)
     assert "right.tif was replaced or changed while the run worked on it" in output

@@ -687,24 +687,6 @@ def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_pa
     assert left_behind(tmp_path) == []
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """Mount a disk of so many bytes."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-
-    def mount(size: int) -> Path:
-        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            pytest.skip(f"no disk to fill: {done.stderr.strip()}")
-        return folder
-
-    yield mount
-    if folder.is_mount():
-        subprocess.run(["umount", str(folder)], check=True)
-
-
 # The bands have 18 bytes a pixel, 5.2 MB: there is no room for them, none beside another file, none for the files made
 # of them, which noise hardly shortens.
 @pytest.mark.parametrize(
@@ -716,18 +698,18 @@ def small_disk(tmp_path):
         (9 << 20, 0, "No space left on device"),
     ],
 )
-def test_output_writer__leaves_nothing_on_a_full_disk(small_disk, products, size, others, reason):
-    disk = small_disk(size)
+def test_output_writer__leaves_nothing_on_a_full_disk(disk, products, size, others, reason):
+    place = disk(size)
     intervals, validity = products
 
     def fill() -> None:
-        with OutputWriter(disk / "out", RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
-            (disk / "other").write_bytes(bytes(others))
+        with OutputWriter(place / "out", RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
+            (place / "other").write_bytes(bytes(others))
             for row in range(0, HEIGHT, 100):
                 output.write(row, intervals[:, row : row + 100], validity[row : row + 100])
             output.publish()
 
     with pytest.raises(OutputError) as failure:
         fill()
-    message(failure, disk / "out", reason, "choose another folder")
-    assert set(left_behind(disk)) <= {"other", "out"}
+    message(failure, place / "out", reason, "choose another folder")
+    assert set(left_behind(place)) <= {"other", "out"}

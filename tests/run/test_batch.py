@@ -179,6 +179,7 @@ print(count)
 """
 
 
+@pytest.mark.process
 def test_locked__lets_one_process_in_at_a_time(tmp_path):
     command = [sys.executable, "-c", COME_AND_GO, str(tmp_path / "new")]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]

@@ -21,29 +21,6 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
 from sat_intervals.run.batch_system import job_script, workers_there
 
-ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture(scope="module")
-def slurm(tmp_path_factory):
-    """SLURM at work; where none can be started: skip, or fail as root with SAT_INTERVALS_REQUIRE_SHARED=1."""
-    scripts = Path(os.environ.get("SAT_INTERVALS_SHARED", ROOT.parent / "shared")) / "slurm"
-    missing = "SLURM is started by root" if os.geteuid() else None
-    if missing is None and not (scripts / "up.sh").exists():
-        missing = f"no up.sh in {scripts}: SAT_INTERVALS_SHARED names the folder that holds slurm/"
-    required = os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1" and not os.geteuid()
-    if missing is None and not required and shutil.which("slurmctld") is None:
-        missing = "slurm-wlm is not installed"
-    folder = tmp_path_factory.mktemp("slurm")
-    if missing is None:
-        done = subprocess.run(["bash", scripts / "up.sh", folder], capture_output=True, text=True, timeout=300)
-        missing = None if done.returncode == 0 and "idle" in done.stdout else f"{done.stdout}{done.stderr}"
-    if missing:
-        (pytest.fail if required else pytest.skip)(missing)
-    yield
-    subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
-    subprocess.run(["bash", scripts / "down.sh", folder], check=True, timeout=30)
-
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
@@ -158,8 +135,8 @@ def test_match__goes_on_with_the_jobs_that_the_batch_system_took(slurm, pair, tm
     assert_complete(pair, tmp_path / "out")
 
 
+@pytest.mark.peer("dask_jobqueue")
 def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
-    pytest.importorskip("dask_jobqueue", reason="needs the extra [cluster]")
     images, settings = pair
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
     command = [COMMAND, "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
@@ -170,6 +147,7 @@ def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["settings.yaml"]
 
 
+@pytest.mark.peer("dask_jobqueue")
 @pytest.mark.parametrize(
     ("kind", "lines"),
     [
@@ -180,7 +158,6 @@ def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
     ],
 )
 def test_job_script__says_what_is_set_as_each_batch_system_takes_it(tmp_path, kind, lines):
-    pytest.importorskip("dask_jobqueue", reason="needs the extra [cluster]")
     given = {"cores": 2, "memory": "4GB", "walltime": "01:30:00", "queue": "day", "account": "dinamis"}
     script = job_script(Cluster(kind=kind, directives=["--exclusive"], **given), tmp_path / "out").splitlines()
     assert lines <= set(script)

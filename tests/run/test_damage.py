@@ -164,7 +164,7 @@ def test_strips__of_a_file_that_changes_between_two_of_them_end(tmp_path, scene)
         next(strips)
 
 
-@pytest.mark.usefixtures("mccnn_extra")
+@pytest.mark.peer("onnxruntime", "mc_cnn")
 @pytest.mark.parametrize("how", DAMAGES)
 def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp_path, how):
     weights = write_network(tmp_path / "network.onnx", random_weights())
@@ -181,7 +181,7 @@ def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp
     assert hashes(out) == expected
 
 
-@pytest.mark.usefixtures("mccnn_extra")
+@pytest.mark.peer("onnxruntime", "mc_cnn")
 def test_match__measures_images_again_where_their_figures_are_damaged_before_it_is_assembled(
     scene, tmp_path, monkeypatch
 ):

@@ -92,7 +92,7 @@ def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path)
     np.testing.assert_array_equal(bands(tmp_path / "whole")[1], bands(tmp_path / "tiles")[1])
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes"])
+@pytest.mark.parametrize("kind", ["threads", pytest.param("processes", marks=pytest.mark.process)])
 def test_match_pair__gives_the_same_bytes_whatever_the_workers(pair, tmp_path, kind):
     left, right, settings = pair
     settings = in_tiles(settings, 128, overlap=20)

@@ -28,6 +28,8 @@ from sat_intervals.run import pair as run
 from sat_intervals.run.job import prepare
 from sat_intervals.store.folder import LocalFolder
 
+pytestmark = pytest.mark.process
+
 TILES = 56
 
 
@@ -383,25 +385,12 @@ def test_match__is_not_stalled_by_a_tile_at_which_dask_pauses_its_worker(uneven,
         assert command.end() == 0, command.output
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A disk of a few MB; where none can be mounted: skip, or fail with SAT_INTERVALS_REQUIRE_SHARED=1."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", folder], capture_output=True)
-    if mounted.returncode:
-        if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1" and os.geteuid() == 0:
-            pytest.fail(f"no tmpfs: {mounted.stderr!r}")
-        pytest.skip("mounting a tmpfs takes root")
-    yield folder
-    subprocess.run(["umount", "--lazy", folder], check=True)
-
-
-def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, small_disk):
-    out, ballast = small_disk / "out", small_disk / "ballast"
+def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, disk):
+    place = disk(8 << 20)
+    out, ballast = place / "out", place / "ballast"
     with started(pair, out) as command:
         command.wait_for_tiles(5)
-        free = shutil.disk_usage(small_disk).free
+        free = shutil.disk_usage(place).free
         with suppress(OSError):
             ballast.write_bytes(bytes(free))
         assert command.end() == 1, command.output
@@ -410,7 +399,7 @@ def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, sm
     assert_nothing_final(out)
     assert len(done_tiles(out)) >= 5
     ballast.unlink()
-    subprocess.run(["mount", "-o", "remount,size=100m", small_disk], check=True)
+    disk(100 << 20)
     with started(pair, out) as command:
         assert command.end() == 0, command.output
     assert_complete(pair, out)

@@ -172,6 +172,7 @@ def test_plan__of_an_endless_image_ends(tmp_path):
 
 
 # ---- Workers that say nothing ------------------------------------------------------------------------------------
+@pytest.mark.process
 def test_submission__ends_when_no_worker_answers(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(submit, "SILENT", 3.0)
     monkeypatch.setattr(submit, "DEAD", 8.0)
@@ -190,6 +191,7 @@ def test_submission__ends_when_no_worker_answers(tmp_path, monkeypatch, caplog):
     assert f"waiting for {address}, not heard of for 3 s" in warned
 
 
+@pytest.mark.process
 def test_submission__does_not_end_for_a_task_that_takes_long(tmp_path, monkeypatch, caplog):
     caplog.set_level(logging.WARNING)
     monkeypatch.setattr(submit, "SILENT", 3.0)
@@ -215,6 +217,7 @@ def test_heartbeats__do_not_count_a_time_in_which_this_process_was_stopped(monke
         heartbeats.check(worker)
 
 
+@pytest.mark.process
 def test_connected__refuses_processes_that_cannot_reach_each_other(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "LOOPBACK", "192.0.2.77")
     with (
@@ -224,6 +227,7 @@ def test_connected__refuses_processes_that_cannot_reach_each_other(tmp_path, mon
         pass
 
 
+@pytest.mark.process
 def test_connected__does_not_wait_for_a_host_that_nobody_knows(tmp_path):
     began = time.monotonic()
     address = "tcp://nowhere.invalid:1"
@@ -235,6 +239,7 @@ def test_connected__does_not_wait_for_a_host_that_nobody_knows(tmp_path):
     assert time.monotonic() - began < 10
 
 
+@pytest.mark.process
 def test_connected__says_that_it_waits_for_a_scheduler(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(cluster, "_TOLD_AFTER", 0.1)
     with socket.socket() as server, dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
@@ -248,6 +253,7 @@ def test_connected__says_that_it_waits_for_a_scheduler(tmp_path, monkeypatch, ca
     assert f"waiting for the dask scheduler at {address}" in [record.getMessage() for record in caplog.records]
 
 
+@pytest.mark.process
 def test_connected__ends_when_worker_processes_do_not_start(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "STARTING", 0.05)
     with (

@@ -3,9 +3,7 @@
 import base64
 import gzip
 import json
-import os
 import re
-import shutil
 import tomllib
 from pathlib import Path
 
@@ -13,8 +11,7 @@ import numpy as np
 import pytest
 from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run
 from helpers import invoke
-from selenium.webdriver import ActionChains, Chrome, ChromeOptions
-from selenium.webdriver.chrome.service import Service
+from selenium.webdriver import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.wait import WebDriverWait
@@ -27,7 +24,7 @@ from sat_intervals.results import open_results
 from sat_intervals.show.legend import classify
 from sat_intervals.show.report import contents, write_report
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def contents_of(path):
@@ -135,37 +132,6 @@ def test_package_data__holds_the_parts_of_the_page():
 
 
 # ---- In a browser ------------------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    """A headless Chromium; where there is none: skip, or fail with SAT_INTERVALS_REQUIRE_SHARED=1."""
-    program, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if not program or not driver:
-        message = "no chromium or chromedriver here: apt-get install chromium chromium-driver"
-        if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1":
-            pytest.fail(message)
-        pytest.skip(message)
-    options = ChromeOptions()
-    options.binary_location = program
-    for argument in (
-        "--headless",
-        "--disable-gpu",
-        "--disable-quic",
-        "--no-first-run",
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-sync",
-        "--disable-dev-shm-usage",
-        f"--user-data-dir={tmp_path_factory.mktemp('browser')}",
-        "--window-size=1280,1600",
-    ):
-        options.add_argument(argument)
-    if os.geteuid() == 0:
-        options.add_argument("--no-sandbox")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    with Chrome(options=options, service=Service(driver)) as chrome:
-        yield chrome
-
-
 class Page:
     """A report, opened from the disk."""
 

@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -22,40 +21,9 @@ from sat_intervals.demo import make_scene
 TILES = 16
 
 
-@contextmanager
-def server(log) -> Iterator[str]:
-    """An S3 server on loopback: its address."""
-    command = [sys.executable, "-m", "moto.server", "--host", "127.0.0.1", "--port", "0"]
-    process = subprocess.Popen(
-        command, stdout=log, stderr=subprocess.STDOUT, env=os.environ | {"PYTHONUNBUFFERED": "1"}
-    )
-    try:
-
-        def address():
-            log.seek(0)
-            return [word for word in log.read().split() if word.startswith("http://127.0.0.1:")]
-
-        wait_until(address, "server")
-        yield address()[0]
-    finally:
-        process.kill()
-        process.wait()
-
-
 def s3():
     """A client other than the one that is tried."""
     return boto3.client("s3")
-
-
-@pytest.fixture(scope="module")
-def bucket() -> Iterator[str]:
-    """URL of a bucket that this process and those it starts can reach."""
-    service = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
-    with tempfile.TemporaryFile("w+") as log, server(log) as address, pytest.MonkeyPatch.context() as patch:
-        for name, value in {**service, "AWS_ENDPOINT_URL": address}.items():
-            patch.setenv(name, value)
-        s3().create_bucket(Bucket="bucket")
-        yield "s3://bucket"
 
 
 @pytest.fixture(scope="module")
