@@ -167,7 +167,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.run.job import prepare
 
-folder, inside, end = LocalFolder(Path(sys.argv[1])), sys.argv[1] + ".inside", time.monotonic() + 3
+folder, inside, end = LocalFolder(Path(sys.argv[1])), sys.argv[1] + ".inside", time.monotonic() + 0.5
 count = 0
 while time.monotonic() < end:
     with suppress(SatIntervalsError), folder.locked():
@@ -185,12 +185,12 @@ def test_locked__lets_one_process_in_at_a_time(tmp_path):
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]
     counts = [int(process.communicate()[0]) for process in processes]
     assert [process.returncode for process in processes] == [0] * 4
-    assert sum(counts) > 50
+    assert sum(counts) > 10
     assert not (tmp_path / "new").exists()
 
 
 def test_locked__is_not_refused_for_one_who_looks(tmp_path):
-    folder, end = LocalFolder(tmp_path), time.monotonic() + 1.0
+    folder, end = LocalFolder(tmp_path), time.monotonic() + 0.5
 
     def look():
         while time.monotonic() < end:

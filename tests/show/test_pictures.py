@@ -111,9 +111,11 @@ def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
     assert done.output == "sat-intervals: pictures need matplotlib: pip install 'sat-intervals[plot]'\n"
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (2, 300), (300, 2), (7, 9), (90, 40), (1100, 1300)])
-@pytest.mark.parametrize("bands", [random_bands, no_bands])
-def test_pictures__of_any_size_and_of_no_valid_pixel(tmp_path, shape, bands):
+@pytest.mark.parametrize(
+    ("bands", "shape"),
+    [(random_bands, (1, 1)), (random_bands, (2, 300)), (no_bands, (90, 40)), (random_bands, (1100, 1300))],
+)
+def test_pictures__of_any_size_and_of_no_valid_pixel(tmp_path, bands, shape):
     made = bands(*shape)
     results = open_results(write_run(tmp_path, *made[:2], truth=np.full(shape, -3.0)))
     draw_overview(results, tmp_path / "overview.png", dpi=60)
@@ -262,8 +264,10 @@ def write_surface(out, height, agreement=np.nan, runs=FINISHED):
         writer.publish()
 
 
-@pytest.mark.parametrize("shape", [(40, 60), (700, 30), (1, 5)])
-@pytest.mark.parametrize(("agreement", "last"), [(np.nan, "Confidence"), (1.0, "Agreement of runs")])
+@pytest.mark.parametrize(
+    ("shape", "agreement", "last"),
+    [((40, 60), np.nan, "Confidence"), ((700, 30), 1.0, "Agreement of runs"), ((1, 5), 1.0, "Agreement of runs")],
+)
 def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, last):
     out = write_run(tmp_path, *random_bands(20, 20)[:2])
     height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])) / 10
