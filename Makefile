@@ -33,7 +33,7 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(PYTEST) --quiet tests/test_architecture.py
 
-# The table of README.md: this project beside its peers; about thirteen minutes.
+# The tables of docs/speed.md: this project beside its peers; about thirteen minutes.
 bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
 
@@ -41,12 +41,15 @@ bench: $(VENV)/.has-bench
 tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/tune.py
 
-# Those of README.md; 256 colours keep them small.
-pictures: $(VENV)/.has-plot
+# The pictures of README.md and docs; 256 colours keep them small.
+pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --quiet
+	$(BIN)/python docs/pictures/demo_cameras.py demo-out
+	$(BIN)/sat-intervals triangulate demo-out --left-model demo-out/left_model.tif --right-model demo-out/right_model.tif --left-grid demo-out/left_grid.tif --right-grid demo-out/right_grid.tif --quiet
+	$(BIN)/sat-intervals dsm demo-out --resolution 1 --quiet
 	$(BIN)/sat-intervals plot demo-out --row 640 --columns 300 700 --dpi 72
 	mkdir -p .github/pictures
-	for name in overview profile; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
+	for name in overview profile dsm; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
 # Python compiles what it imports by itself, most of what is installed never.
 $(VENV)/.has-%: pyproject.toml $(VENV)/.made

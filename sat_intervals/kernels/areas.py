@@ -1,6 +1,6 @@
-"""The worst of a low-confidence area (method: section 10).
+"""Maxima over low-confidence areas (METHOD.md, section 10).
 
-Letters: r row, c column, s and t segments: runs of low-confidence pixels in a row.
+Letters: r row, c column, s and t segments (runs of low-confidence pixels in a row).
 """
 
 import numpy as np
@@ -11,21 +11,20 @@ from sat_intervals.kernels.intervals import find_segments, find_touching
 
 @cached
 def area_maximum(values, low, depth):
-    """The largest value over the low-confidence area around each low-confidence pixel (paper eq. 16).
+    """Maximum over the low-confidence area around each low-confidence pixel (paper eq. 16).
 
     Parameters
     ----------
     values
-        ``(rows, columns)`` float64; NaN does not count.
+        ``(rows, columns)`` float64; NaN is ignored.
     low
         bool of the same shape: low-confidence pixels.
     depth
-        Steps between touching segments that make an area, as in `regularize`: a row's areas reach as many rows up and
-        down.
+        Largest number of steps between touching segments of an area, as in `regularize`.
 
     Returns
     -------
-    ``(rows, columns)`` float64, NaN where not low and where the area has no value.
+    ``(rows, columns)`` float64, NaN outside low-confidence pixels and where the area has no value.
     """
     start, stop, row_start = find_segments(low)
     above, below = np.zeros((start.size, 2), np.int64), np.zeros((start.size, 2), np.int64)

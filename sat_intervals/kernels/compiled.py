@@ -1,7 +1,7 @@
-"""Kernels whose machine code is kept from one process to the next.
+"""Compilation of kernels, with machine code cached between processes.
 
-The folder is named after the kernels' sources, and after the constants that they freeze: numba itself looks at the file
-of a kernel alone, and not at those of the kernels that it calls.
+The cache folder is named by a digest of all kernel sources and of the constants that they freeze: numba itself checks
+only the file of a kernel, not the files of the kernels that it calls.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ from numba import config, njit
 
 
 def fingerprint(package: Path) -> str:
-    """Tell the kernels of a package from those of any other version."""
+    """Digest of the kernel sources and constants of a package: 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for source in (*sorted((package / "kernels").glob("*.py")), package / "products.py"):
         digest.update(source.read_bytes())
@@ -26,10 +26,11 @@ _LOCK = threading.Lock()
 
 
 def cached(kernel):
-    """Compile a kernel that releases the GIL, once a machine.
+    """Compile a kernel that releases the GIL, and cache its machine code on disk.
 
-    numba takes the folder from its configuration while it decorates. The configuration is put back at once: everybody
-    else's cached functions follow it too. Where no folder can be written, every process compiles for itself.
+    numba reads the cache folder from its global configuration while it decorates. The configuration is restored at
+    once, because it applies to the cached functions of other packages too. Without a writable folder, every process
+    compiles the kernels again.
     """
     folder = _folder()
     if folder is None:
@@ -44,9 +45,9 @@ def cached(kernel):
 
 @cache
 def _folder() -> Path | None:
-    """Where numba's own setting says, else in the user's cache; None where that cannot be written.
+    """Cache folder in NUMBA_CACHE_DIR, else in the user's cache; None where it is not writable.
 
-    Never in a place that others can foresee: numba loads what it finds there.
+    The default is never a shared folder such as /tmp: numba executes the machine code that it finds.
     """
     place = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     try:

@@ -1,4 +1,4 @@
-"""Confidence from ambiguity (Sarrazin et al. 2021; method: sections 4 and 8).
+"""Confidence from ambiguity (Sarrazin et al. 2021; METHOD.md, sections 4 and 8).
 
 Letters: r row, c column, k disparity index.
 """
@@ -12,10 +12,10 @@ from sat_intervals.products import IMPOSSIBLE_COST
 
 @njit(nogil=True, forceinline=True)
 def ambiguity(curve, count, lowest, weights):
-    """Ambiguity of one pixel: over the etas, how many disparities cost at most ``lowest + eta * span``.
+    """Ambiguity of one pixel: the number of disparities that cost at most ``lowest + eta * span``, summed over etas.
 
-    ``weights[x]`` is the number of etas that count a cost ``x`` above the lowest; an impossible candidate counts for
-    every eta.
+    ``curve`` is uint16. ``weights[x]``, uint16, is the number of etas that count a cost ``x`` above the lowest. An
+    impossible candidate counts for every eta.
     """
     total = 0
     for k in range(count):
@@ -27,12 +27,12 @@ def ambiguity(curve, count, lowest, weights):
 
 
 def ambiguity_histogram(ambiguity: np.ndarray, searched: np.ndarray, largest: int) -> np.ndarray:
-    """How many searched pixels have each ambiguity from 0 to ``largest``: int64 ``(largest + 1,)``."""
+    """Number of searched pixels with each ambiguity from 0 to ``largest``: ``(largest + 1,)`` int64."""
     return np.bincount(ambiguity[searched], minlength=largest + 1)
 
 
 def percentiles(histogram: np.ndarray) -> tuple[float, float]:
-    """1st and 99th percentile of the values ``0 .. n - 1`` that a histogram counts.
+    """1st and 99th percentile of the values ``0 .. n - 1`` of a histogram.
 
     Parameters
     ----------
@@ -41,21 +41,21 @@ def percentiles(histogram: np.ndarray) -> tuple[float, float]:
 
     Returns
     -------
-    ``(p1, p99)``, interpolated as ``numpy.percentile`` does on the values themselves; NaN where nothing is counted.
+    ``(p1, p99)``, interpolated as by ``numpy.percentile`` on the values; NaN for an empty histogram.
     """
-    upto = np.cumsum(histogram)
-    if upto.size == 0 or upto[-1] == 0:
+    cumulative = np.cumsum(histogram)
+    if cumulative.size == 0 or cumulative[-1] == 0:
         return float("nan"), float("nan")
 
     def percentile(share: float) -> float:
-        rank = share * float(upto[-1] - 1)
+        rank = share * float(cumulative[-1] - 1)
         below = int(np.floor(rank))
-        first = float(np.searchsorted(upto, below, side="right"))
-        second = float(np.searchsorted(upto, min(below + 1, int(upto[-1]) - 1), side="right"))
+        first = float(np.searchsorted(cumulative, below, side="right"))
+        second = float(np.searchsorted(cumulative, min(below + 1, int(cumulative[-1]) - 1), side="right"))
         part = rank - below
         if part < 0.5:
             return first + (second - first) * part
-        return second - (second - first) * (1.0 - part)  # as numpy rounds it
+        return second - (second - first) * (1.0 - part)  # rounds as numpy does
 
     return percentile(0.01), percentile(0.99)
 
@@ -71,11 +71,11 @@ def normalize(ambiguity, searched, p1, p99):
     searched
         bool of the same shape: pixels with a possible candidate.
     p1, p99
-        What becomes confidence 1 and 0. Where they are equal, confidence is 1 for ``A <= p1``, else 0.
+        Ambiguities that become confidence 1 and 0. Where they are equal, the confidence is 1 for ``A <= p1``, else 0.
 
     Returns
     -------
-    ``(rows, columns)`` float32, NaN where nothing was searched.
+    ``(rows, columns)`` float32, NaN outside ``searched``.
     """
     rows, columns = ambiguity.shape
     confidence = np.full((rows, columns), np.float32(np.nan))
@@ -114,13 +114,13 @@ def low_confidence(confidence, threshold, kernel):
     limit = np.float32(threshold)
     radius = kernel // 2
     low = np.zeros((rows, columns), np.bool_)
-    doubtful = np.zeros(columns + 2 * radius, np.bool_)
+    at_most = np.zeros(columns + 2 * radius, np.bool_)
     for r in range(rows):
         for c in range(columns):
-            doubtful[c + radius] = confidence[r, c] <= limit
+            at_most[c + radius] = confidence[r, c] <= limit
         for j in range(kernel):
             for c in range(columns):
-                low[r, c] |= doubtful[c + j]
+                low[r, c] |= at_most[c + j]
         for c in range(columns):
             low[r, c] &= not np.isnan(confidence[r, c])
     return low

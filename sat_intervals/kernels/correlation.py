@@ -1,4 +1,4 @@
-"""Matching costs of features: how far the cosine of two unit vectors is from 1 (Zbontar and LeCun 2016).
+"""Matching costs from features: 1 minus the cosine of two unit vectors (Zbontar and LeCun 2016).
 
 Letters: r row, c column, k disparity index, x = c + k column of the right features, f feature.
 """
@@ -13,7 +13,10 @@ from sat_intervals.products import COSINE_STEPS
 
 @njit(nogil=True)
 def _copy_row(features, r, factor, row):
-    """A row's features times a factor, close together: in the volume they lie so far apart that caches collide."""
+    """Copy the features of a row, times a factor, to contiguous memory.
+
+    The stride of the volume would make its rows collide in the cache.
+    """
     for f in range(features.shape[0]):
         for x in range(features.shape[2]):
             row[f, x] = factor * features[f, r, x]
@@ -21,10 +24,10 @@ def _copy_row(features, r, factor, row):
 
 @njit(nogil=True, forceinline=True)
 def _correlate_four(here, there, c, start, curves):
-    """Costs of the pixels ``c .. c + 3``: ``curves[i, x]`` of the pixel ``c + i`` and the right pixel ``c + x``.
+    """Costs of the pixels ``c .. c + 3``: ``curves[i, x]`` is that of pixel ``c + i`` and right pixel ``c + x``.
 
-    ``start`` and the sum of products, rounded. Four pixels share what is loaded of the right ones, and their sums do
-    not wait for each other.
+    A cost is ``start`` plus the sum of products, rounded. Four pixels share each load of right features, and their
+    sums are independent.
     """
     features, width, size = here.shape[0], there.shape[1], curves.shape[1]
     for x in range(0, size, LANES):
@@ -55,7 +58,7 @@ def _correlate(left, right, steps, costs, here, there, curves):
 
 
 def correlate(left: np.ndarray, right: np.ndarray, costs: np.ndarray) -> None:
-    """Write the costs of rows of pixels, ``round(COSINE_STEPS * (1 - cosine))``.
+    """Fill ``costs`` with ``round(COSINE_STEPS * (1 - cosine))``.
 
     Parameters
     ----------
@@ -64,7 +67,7 @@ def correlate(left: np.ndarray, right: np.ndarray, costs: np.ndarray) -> None:
     right
         ``(features, rows, columns + count - 1)``: ``right[:, r, c + k]`` faces ``left[:, r, c]``.
     costs
-        ``(rows, columns, size)`` uint8, filled: whole vectors that hold ``count`` costs, 0 to 2 COSINE_STEPS.
+        ``(rows, columns, size)`` uint8, 0 to 2 COSINE_STEPS; ``size`` is ``count`` padded to whole vectors.
     """
     features, _, columns = left.shape
     size = costs.shape[2] + LANES

@@ -1,4 +1,4 @@
-"""Matching costs as the sweeps read them: Census (Zabih and Woodfill 1994; method: section 1), or a volume.
+"""Matching costs for SGM: Census (Zabih and Woodfill 1994; METHOD.md, section 1), or a precomputed volume.
 
 Letters: r row, c column, k disparity index (disparity = minimum + k), w word of a code.
 """
@@ -28,14 +28,14 @@ class Codes(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """The matching costs of a patch: codes to compare, or costs that were computed beforehand.
+    """Matching costs of a patch: Census codes to compare, or precomputed costs.
 
     Attributes
     ----------
     left, right
-        Words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)`` with whole vectors behind the
-        last column; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None. Kernels are
-        compiled for either.
+        Words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)``, padded behind the last column
+        by whole vectors; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None. Kernels
+        are compiled for either form.
     left_state
         ``(rows, columns)`` uint8, 0 = usable window.
     right_state
@@ -49,7 +49,7 @@ class Costs(NamedTuple):
 
 
 def between(left: Codes, right: Codes) -> Costs:
-    """Costs between the codes of a patch: Hamming distances.
+    """Make `Costs` from the Census codes of a patch: Hamming distances.
 
     ``right`` has ``columns + count - 1`` columns: ``right[r, c + k]`` faces ``left[r, c]``.
     """
@@ -62,7 +62,7 @@ def between(left: Codes, right: Codes) -> Costs:
 
 @cached
 def _census_words(pixels, radius, words):
-    """Shift one bit a neighbour into each word, row by row, so that columns vectorise."""
+    """Shift one bit per neighbour into each word; the inner loop over columns vectorises."""
     bits = words.itemsize * 8
     rows, columns = words.shape[1:]
     for r in range(rows):
@@ -80,7 +80,7 @@ def _census_words(pixels, radius, words):
 
 @cached
 def _window_union(state, radius, union):
-    """Union of the states under each window, one axis after the other."""
+    """Union of the states in each window, first along rows, then along columns."""
     rows, columns = union.shape
     across = np.zeros((state.shape[0], columns), np.uint8)
     for r in range(state.shape[0]):
@@ -94,9 +94,9 @@ def _window_union(state, radius, union):
 
 
 def window_state(state: np.ndarray, radius: int) -> np.ndarray:
-    """The union of the states of each window's pixels, 0 = usable.
+    """Union of the states of each window's pixels, 0 = usable.
 
-    ``state`` is ``(rows + 2 radius, columns + 2 radius)`` uint8; returned are ``(rows, columns)``.
+    ``state`` is ``(rows + 2 radius, columns + 2 radius)`` uint8; the result is ``(rows, columns)`` uint8.
     """
     union = np.zeros((state.shape[0] - 2 * radius, state.shape[1] - 2 * radius), np.uint8)
     _window_union(state, radius, union)
@@ -104,7 +104,7 @@ def window_state(state: np.ndarray, radius: int) -> np.ndarray:
 
 
 def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
-    """Census codes: one bit a neighbour, set where the neighbour is greater than the centre.
+    """Census codes: one bit per neighbour, set where the neighbour is greater than the centre.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
 
 @njit(nogil=True, forceinline=True)
 def _matching_costs(left, right, r, c, k):
-    """Costs of the left pixel ``(r, c)`` and its candidates ``k .. k + 31``; arguments as in `Costs`."""
+    """Costs of the candidates ``k .. k + 31`` of the left pixel ``(r, c)``; arrays as in `Costs`."""
     if right is None:
         return load_bytes(left, (r * left.shape[1] + c) * left.shape[2] + k)
     rows, width = right.shape[1:]
@@ -143,16 +143,16 @@ def _matching_costs(left, right, r, c, k):
 
 
 class Candidates(NamedTuple):
-    """The candidates of a row of pixels.
+    """Candidates of a row of pixels.
 
     Attributes
     ----------
     costs
-        Their costs, possible or not.
+        Costs of all candidates, as if all were possible.
     barrier
         ``(columns + size,)`` uint16: ``barrier[c + k]`` is the cost of an impossible candidate, or 0.
     beyond
-        ``(size,)`` uint16: 0, and above every cost in the lanes behind the search range.
+        ``(size,)`` uint16: 0 in the search range, above every cost in the lanes behind it.
     """
 
     costs: Costs
@@ -162,7 +162,7 @@ class Candidates(NamedTuple):
 
 @njit(nogil=True, forceinline=True)
 def candidate_costs(candidates, r, c, k):
-    """Costs of the candidates ``k .. k + 31`` of the row's pixel ``c``."""
+    """Costs of the candidates ``k .. k + 31`` of a pixel, raised where they are impossible."""
     costs = _matching_costs(candidates.costs.left, candidates.costs.right, r, c, k)
     return larger(larger(costs, load(candidates.barrier, c + k)), load(candidates.beyond, k))
 
@@ -175,5 +175,5 @@ def cost_curve(candidates, r, c, curve):
 
 
 def padded_to_lanes(count: int) -> int:
-    """The smallest multiple of the lane count that holds ``count`` disparities."""
+    """Round a number of disparities up to a multiple of LANES."""
     return -(-count // LANES) * LANES

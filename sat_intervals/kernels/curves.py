@@ -1,8 +1,9 @@
-"""A whole aggregated volume read at once: winners, and intervals of any level (method: sections 4 to 6 and 10).
+"""Winners and intervals from a whole aggregated volume (METHOD.md, sections 4 to 6 and 10).
 
-A run never stores its volume and reads every curve while it is in the cache (`matching`); here several methods are
-compared on one volume that fits in memory, ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST where impossible. Row by
-row, because what is made on the way takes as much room as the costs it is made from.
+A run stores no finished volume: it reads each curve while it is in the cache (`matching`). These functions compare
+several methods on one volume in memory, ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
+They work row by row, because their temporary arrays are as large as the costs.
+
 Letters: r row, c column, k disparity index (disparity = minimum + k).
 """
 
@@ -18,12 +19,12 @@ def read_winners(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Winner, refined disparity and ambiguity of every curve.
 
-    Returns ``(rows, columns)`` int16 disparities, NO_DISPARITY for none, float32 ones in pixels, NaN for none, and
-    uint32 ambiguities; ``weights`` is the table of `ambiguity`, ``refine`` whether V-fit is done.
+    ``weights`` is the table of `ambiguity`; ``refine`` turns V-fit on. Returns ``(rows, columns)`` arrays: int16
+    winners, NO_DISPARITY for none; float32 disparities in pixels, NaN for none; uint32 ambiguities.
     """
     winner = np.full(volume.shape[:2], NO_DISPARITY, np.int16)
     disparity = np.full(winner.shape, np.nan, np.float32)
-    doubt = np.zeros(winner.shape, np.uint32)
+    ambiguity = np.zeros(winner.shape, np.uint32)
     for r, row in enumerate(volume):
         k = row.argmin(axis=1)
         lowest = np.take_along_axis(row, k[:, np.newaxis], axis=1)
@@ -32,12 +33,12 @@ def read_winners(
         disparity[r, found] = (minimum + k + (_vfit(row, k) if refine else 0))[found]
         if weights.size:
             above = np.where(row == IMPOSSIBLE_COST, 0, row - lowest)
-            doubt[r, found] = weights.take(above).sum(axis=1, dtype=np.uint32)[found]
-    return winner, disparity, doubt
+            ambiguity[r, found] = weights.take(above).sum(axis=1, dtype=np.uint32)[found]
+    return winner, disparity, ambiguity
 
 
 def _vfit(curves: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Sub-pixel shifts of winners, as `disparity.vfit` has them."""
+    """Sub-pixel shifts of winners, as by `disparity.vfit`."""
     pixels, last = np.arange(k.size), curves.shape[1] - 1
     before, here, after = (curves[pixels, np.clip(k + step, 0, last)].astype(np.int64) for step in (-1, 0, 1))
     steepest = np.maximum(before, after)
@@ -54,7 +55,7 @@ def read_right_winners(volume: np.ndarray, minimum: int) -> np.ndarray:
     width = columns + count - 1
     winner = np.full((rows, width), NO_DISPARITY, np.int16)
     for r in range(rows):
-        # Each line one longer than the right image: read as lines of its width, every one begins a column later.
+        # Each line is one longer than the right image: read as lines of its width, each begins one column later.
         sheared = np.full((count, width + 1), IMPOSSIBLE_COST, np.uint16)
         sheared[:, :columns] = volume[r].T
         facing = sheared.ravel()[: count * width].reshape(count, width)[::-1]
@@ -66,7 +67,7 @@ def read_right_winners(volume: np.ndarray, minimum: int) -> np.ndarray:
 def _read_bounds(
     volume: np.ndarray, minimum: int, limit: Callable[[np.ndarray, np.ndarray], np.ndarray], refine: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First and last disparity whose cost is at most the limit, made from a row's curves and their lowest costs."""
+    """First and last disparity whose cost is at most ``limit(curves, lowest costs)`` of a row."""
     lower = np.full(volume.shape[:2], NO_DISPARITY, np.int16)
     upper = lower.copy()
     last = volume.shape[2] - 1
@@ -84,7 +85,7 @@ def _read_bounds(
 
 
 def read_alpha_cuts(volume: np.ndarray, minimum: int, cut_level: int, refine: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the alpha-cut of every curve (paper eq. 5 to 9), pushed out for refinement.
+    """Bounds of the alpha-cut of every curve (paper eq. 5 to 9), extended for refinement.
 
     Returns ``(lower, upper)``, ``(rows, columns)`` int16 disparities, NO_DISPARITY for none; ``cut_level`` is
     ``floor((1 - alpha) * span)``.
@@ -93,10 +94,10 @@ def read_alpha_cuts(volume: np.ndarray, minimum: int, cut_level: int, refine: bo
 
 
 def read_baseline(volume: np.ndarray, minimum: int, part: int, whole: int) -> tuple[np.ndarray, np.ndarray]:
-    """The paper's baseline (its section 4.1): each curve normalised by its own minimum and maximum.
+    """Bounds of the paper's baseline (its section 4.1): each curve is normalised by its own minimum and maximum.
 
-    The bounds are the extreme disparities whose similarity, 1 at the lowest and 0 at the highest possible cost, is at
-    least ``1 - part / whole``, integers. Returns as `read_alpha_cuts`, nothing pushed out.
+    Similarity is 1 at a curve's lowest possible cost and 0 at its highest. The bounds are the first and last disparity
+    of similarity at least ``1 - part / whole``, two integers. Returns as `read_alpha_cuts`, without extension.
     """
 
     def limit(curves: np.ndarray, lowest: np.ndarray) -> np.ndarray:

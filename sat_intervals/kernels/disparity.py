@@ -1,7 +1,7 @@
-"""Winner's refinement, cross-checking and median (method: sections 6 and 7).
+"""Sub-pixel refinement, cross-checking and median (METHOD.md, sections 6 and 7).
 
-Letters: r row, c column, k disparity index (disparity = minimum + k), x column of the right image, from the one that
-faces the first left column at the minimum: ``x = c + k``.
+Letters: r row, c column, k disparity index, d disparity (``d = minimum + k``), x column of the right image, counted
+from the one that faces the first left column at the minimum (``x = c + k``).
 """
 
 import numpy as np
@@ -13,10 +13,11 @@ from sat_intervals.products import IMPOSSIBLE_COST, MISMATCH, NO_DISPARITY, OCCL
 
 @njit(nogil=True, forceinline=True, error_model="numpy")
 def vfit(curve, k, count):
-    """Sub-pixel shift of the winner ``k`` by V-fit (Haller et al. 2010), within half a pixel.
+    """Sub-pixel shift of the winner ``k`` by V-fit (Haller and Nedevschi 2012), at most half a pixel.
 
-    Returns ``(shift, refined)``: 0 and False at the range's ends and beside an impossible candidate. The winner is the
-    first of its ties, so the cost before it is larger and the three are never equal.
+    Returns ``(shift, refined)``: 0 and False at the ends of the range and beside an impossible candidate. The winner is
+    the first of its ties, so the cost before it is larger and the three costs are never equal.
+    Python's check for divisions by zero would make sweeps 2 to 6 % slower.
     """
     if k == 0 or k == count - 1:
         return 0.0, False
@@ -29,21 +30,21 @@ def vfit(curve, k, count):
 
 @cached
 def cross_check(winner, right_winner, minimum, tolerance):
-    """Rejected pixels: a left winner that the winner of the right pixel it points to does not confirm.
+    """Reject left winners that the winner of the right pixel they point to does not confirm.
 
     Parameters
     ----------
     winner
         ``(rows, columns)`` int16 disparities, NO_DISPARITY where there is none.
     right_winner
-        ``(rows, columns + count - 1)`` int16: ``right_winner[r, c + k]`` is the disparity, seen from the left, of the
-        right pixel that faces ``(r, c)`` at index ``k``; NO_DISPARITY where there is none.
+        ``(rows, columns + count - 1)`` int16: ``right_winner[r, c + k]`` is the winner, as a left disparity, of
+        the right pixel that faces ``(r, c)`` at index ``k``; NO_DISPARITY where there is none.
     minimum, tolerance
-        First disparity of the search range; largest difference in pixels that is kept.
+        First disparity of the search range; largest accepted difference in pixels.
 
     Returns
     -------
-    ``(rows, columns)`` uint16: 0, OCCLUSION or MISMATCH (some right pixel of the range points back).
+    ``(rows, columns)`` uint16: 0, OCCLUSION, or MISMATCH where some right pixel of the range points back.
     """
     rows, columns = winner.shape
     flags = np.zeros((rows, columns), np.uint16)
@@ -67,7 +68,7 @@ def cross_check(winner, right_winner, minimum, tolerance):
 
 @njit(nogil=True, forceinline=True)
 def _insert(values, count, value):
-    """Insert into the first ``count`` values, which are sorted."""
+    """Insert a value into the first ``count`` values, which are sorted."""
     i = count
     while i > 0 and values[i - 1] > value:
         values[i] = values[i - 1]
@@ -77,7 +78,7 @@ def _insert(values, count, value):
 
 @njit(nogil=True, forceinline=True)
 def _median_around(values, kept, r, c, radius, window):
-    """Median of the kept pixels within ``radius`` of one that is kept itself."""
+    """Median of the kept pixels in the window around the kept pixel ``(r, c)``."""
     rows, columns = values.shape
     count = 0
     for i in range(max(0, r - radius), min(rows, r + radius + 1)):
@@ -93,7 +94,7 @@ def _median_around(values, kept, r, c, radius, window):
 
 @njit(nogil=True, forceinline=True)
 def _ordered(a, b, c):
-    """Three values in ascending order; comparisons and selections only, which vectorise."""
+    """Sort three values by comparisons and selections, which vectorise."""
     a, b = (a, b) if a < b else (b, a)
     b, c = (b, c) if b < c else (c, b)
     a, b = (a, b) if a < b else (b, a)
@@ -102,7 +103,7 @@ def _ordered(a, b, c):
 
 @njit(nogil=True, forceinline=True)
 def _column(values, kept, c, infinity):
-    """The three values of a window's column in ascending order; each that is not kept is an infinity, its sign in turn.
+    """Sort the three values of a window's column, with infinities of alternating sign in place of rejected ones.
 
     Returns them and the next infinity.
     """
@@ -114,10 +115,10 @@ def _column(values, kept, c, infinity):
 
 @njit(nogil=True, forceinline=True)
 def _middle_of_nine(values, kept, c, infinity):
-    """Middle of the window of three columns from c on (Devillard 1998): as many infinities on either side, or one more.
+    """Middle of the 3 x 3 window from column c on (Devillard 1998), with infinities in place of rejected values.
 
-    So it is the median of the kept values where their number is odd. Where it is even it is the lower of the two in the
-    middle if the first infinity is positive, and the upper if it is negative.
+    For an odd number of kept values it is their median. For an even number it is the lower of the middle two if the
+    first infinity is positive, and the upper if it is negative.
     """
     (low_1, middle_1, high_1), infinity = _column(values, kept, c, infinity)
     (low_2, middle_2, high_2), infinity = _column(values, kept, c + 1, infinity)
@@ -130,7 +131,7 @@ def _middle_of_nine(values, kept, c, infinity):
 
 @njit(nogil=True)
 def _medians_of_nine(values, kept, result):
-    """Medians of the 3 x 3 windows along a row, given its three rows with one more pixel at either end."""
+    """Medians of the 3 x 3 windows along a row, from three rows with one more pixel at both ends."""
     infinity = np.float32(np.inf)
     for c in range(result.size):
         lower, upper = _middle_of_nine(values, kept, c, infinity), _middle_of_nine(values, kept, c, -infinity)
@@ -139,10 +140,10 @@ def _medians_of_nine(values, kept, result):
 
 @njit(nogil=True)
 def _median_3(values, kept):
-    """Medians of 3 x 3 windows: the same operations on every pixel, kept or not, in vectors."""
+    """Medians of 3 x 3 windows: the same operations on every pixel, kept or not, so that they vectorise."""
     rows, columns = values.shape
     result = np.empty((rows, columns), np.float32)
-    # The three rows around the current one, with a border where nothing is kept.
+    # The current row and its neighbours, with a border of pixels that are not kept.
     near, near_kept = np.zeros((3, columns + 2), np.float32), np.zeros((3, columns + 2), np.bool_)
     for r in range(-1, rows):
         entering = (r + 1) % 3
@@ -163,14 +164,14 @@ def _median_3(values, kept):
 
 @cached
 def median(values, kept, size):
-    """Median of the kept pixels of each kept pixel's window; the other pixels keep their value.
+    """Median of the kept pixels in each kept pixel's window; the other pixels keep their value.
 
-    Applied to disparity and bounds alike it keeps their order (paper eq. 10 and 11).
+    Applied separately to disparity and bounds, it keeps their order (paper eq. 10 and 11).
 
     Parameters
     ----------
     values
-        ``(rows, columns)``, float32 or integers that fit; no NaN where kept.
+        ``(rows, columns)``, float32, or integers that float32 represents exactly; not NaN where kept.
     kept
         bool of the same shape.
     size
@@ -178,7 +179,7 @@ def median(values, kept, size):
 
     Returns
     -------
-    ``(rows, columns)`` float32; of an even number of pixels the mean of the two in the middle.
+    ``(rows, columns)`` float32; for an even number of pixels the mean of the middle two.
     """
     if size == 3:
         return _median_3(values, kept)

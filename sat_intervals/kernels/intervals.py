@@ -1,6 +1,6 @@
-"""Intervals from cost curves, and their regularisation in low-confidence areas (method: sections 5 and 8).
+"""Intervals from cost curves, and their regularisation in low-confidence areas (METHOD.md, sections 5 and 8).
 
-Letters: r row, c column, k disparity index, s segment: a run of low-confidence pixels in a row.
+Letters: r row, c column, k disparity index, s and t segments (runs of low-confidence pixels in a row).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from sat_intervals.kernels.vector import LANES, first_lane, lanes_above_last, la
 def alpha_cut(curve, limit):
     """First and last index whose cost is at most ``limit = lowest + floor((1 - alpha) * span)`` (paper eq. 5 to 7).
 
-    ``curve`` is padded to whole vectors with costs above every limit, and some cost is at most ``limit``.
+    ``curve`` is padded to whole vectors with costs above every limit; at least one cost is at most ``limit``.
     """
     first = 0
     cut = lanes_at_most(load(curve, first), limit)
@@ -33,7 +33,11 @@ def alpha_cut(curve, limit):
 
 @njit(nogil=True)
 def find_segments(low):
-    """The runs of low-confidence pixels: their first and last columns, and the first segment of each row."""
+    """Find the runs of low-confidence pixels.
+
+    Returns the columns ``[start, stop)`` of each segment, int32, and the first segment of each row, ``(rows + 1,)``
+    int64; the last entry is the number of segments.
+    """
     rows, columns = low.shape
     count = 0
     for r in range(rows):
@@ -58,7 +62,7 @@ def find_segments(low):
 
 @njit(nogil=True)
 def find_touching(start, stop, row_start, neighbours, step):
-    """Fill ``neighbours[s] = first, after last`` of the segments in row ``r + step`` that share a column with s."""
+    """Fill ``neighbours[s]`` with ``first, stop`` of the segments in row ``r + step`` that share a column with s."""
     rows = row_start.size - 1
     for r in range(rows):
         if not 0 <= r + step < rows:
@@ -76,7 +80,7 @@ def find_touching(start, stop, row_start, neighbours, step):
 
 @njit(nogil=True)
 def _area(s, depth, above, below, visited, area):
-    """Collect the segments reached from s in at most ``depth`` steps; returns how many. ``visited`` is stamped s."""
+    """Collect the segments reached from s in at most ``depth`` steps, marked s in ``visited``; return their number."""
     area[0] = s
     visited[s] = s
     count = 1
@@ -95,8 +99,8 @@ def _area(s, depth, above, below, visited, area):
 
 
 @njit(nogil=True)
-def _count(steps, segment_row, start, stop, area, members, counts):
-    """Count the bounds of all pixels of some segments; returns how many pixels there are."""
+def _count_bounds(steps, segment_row, start, stop, area, members, counts):
+    """Fill the histograms of both bounds over the pixels of an area; return the number of pixels."""
     counts[:] = 0
     size = 0
     for i in range(members):
@@ -111,26 +115,26 @@ def _count(steps, segment_row, start, stop, area, members, counts):
 
 @njit(nogil=True)
 def _quantile(counts, size, quantile):
-    """Quantile of the ``size`` values that are counted, interpolated linearly between the two ranks around it."""
+    """Quantile of the ``size`` values of a histogram, interpolated linearly between the two nearest ranks."""
     rank = quantile * (size - 1)
     below = int(rank)
     value = 0
-    seen = counts[0]
-    while seen <= below:
+    cumulative = counts[0]
+    while cumulative <= below:
         value += 1
-        seen += counts[value]
+        cumulative += counts[value]
     first = value
-    while seen <= min(below + 1, size - 1):
+    while cumulative <= min(below + 1, size - 1):
         value += 1
-        seen += counts[value]
+        cumulative += counts[value]
     return first + (value - first) * (rank - below)
 
 
 @njit(nogil=True)
 def _half_pixels(lower, upper, low, minimum):
-    """Bounds as steps of half a pixel above ``minimum``: the number of steps, ``(2, rows, columns)`` bounds as steps.
+    """Convert bounds to half-pixel steps above ``minimum``; return the number of bins and ``(2, rows, columns)`` steps.
 
-    uint16, in half the time of int32: no two disparities lie more than 32000 pixels apart.
+    uint16 takes half the time of int32, and suffices for disparities within 32000 pixels of each other.
     """
     rows, columns = low.shape
     least = most = np.float32(minimum)
@@ -145,7 +149,7 @@ def _half_pixels(lower, upper, low, minimum):
 
 @njit(nogil=True)
 def _same_neighbours(s, t, above, below):
-    """Whether two segments of a row touch the same segments, at least one."""
+    """Whether two segments of a row touch the same segments, and at least one."""
     same = (above[s] == above[t]).all() and (below[s] == below[t]).all()
     return same and (above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1])
 
@@ -160,19 +164,19 @@ def regularize(lower, upper, low, minimum, depth, quantile, first, last):
     Parameters
     ----------
     lower, upper
-        ``(rows, columns)`` float32 bounds within 32000 pixels of each other, whole multiples of half a pixel (integers
-        and means of two) wherever ``low``, so that quantiles come from counts.
+        ``(rows, columns)`` float32 bounds in pixels, within 32000 pixels of each other. Where ``low`` they are
+        multiples of half a pixel (integers and means of two), so that quantiles come from histograms.
     low
         bool of the same shape: low-confidence pixels.
     minimum
-        No bound of theirs is less: the first disparity of the search range. Steps are counted from it, and not from the
-        least bound of these rows, so that a pixel's quantile is rounded alike whatever rows it comes with.
+        First disparity of the search range. Steps are counted from it, not from the smallest bound of these rows, so
+        that the rounding of a quantile does not depend on the other rows.
     depth
-        Steps, and so the rows above and below a row that its areas reach.
+        Largest number of steps, and so of rows that an area reaches above and below.
     quantile
         Of the upper bounds; the lower bounds take ``1 - quantile``.
     first, last
-        The rows ``[first, last)`` are returned; the others are there to be reached.
+        The rows ``[first, last)`` are returned; areas may reach the others.
 
     Returns
     -------
@@ -192,12 +196,11 @@ def regularize(lower, upper, low, minimum, depth, quantile, first, last):
     new_lower, new_upper = lower[first:last].copy(), upper[first:last].copy()
     low_bound = high_bound = 0.0
     for s in range(row_start[first], row_start[last]):
-        # Segments of a row that touch the same segments have, from two steps on, the same area: without this, a row
-        # of short segments beside one long segment would cost their number squared. It still would where each of them
-        # touches another one as well, two dotted rows below a full one.
+        # From two steps on, segments of a row that touch the same segments have the same area. Reusing it avoids
+        # quadratic time for a row of short segments beside a long one, but not for two dotted rows below a full one.
         if not (depth > 1 and s > row_start[segment_row[s]] and _same_neighbours(s - 1, s, above, below)):
             members = _area(s, depth, above, below, visited, area)
-            size = _count(steps, segment_row, start, stop, area, members, counts)
+            size = _count_bounds(steps, segment_row, start, stop, area, members, counts)
             low_bound = minimum + 0.5 * _quantile(counts[0], size, 1.0 - quantile)
             high_bound = minimum + 0.5 * _quantile(counts[1], size, quantile)
         new_lower[segment_row[s] - first, start[s] : stop[s]] = low_bound

@@ -1,6 +1,6 @@
-"""Trilinear interpolation of what varies smoothly with row, column and disparity.
+"""Trilinear interpolation on a lattice over rows, columns and disparities.
 
-Letters: r row, c column, i, j, k node of the lattice along rows, columns and disparities, v value.
+Letters: r row, c column; i, j, k lattice node along rows, columns and disparities; v value.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from sat_intervals.kernels.compiled import cached
 
 @cached
 def interpolate(lattice, spacing, first, disparity):
-    """Values at the disparities of some pixels.
+    """Interpolate the values of a lattice at the disparities of pixels.
 
     Parameters
     ----------
@@ -19,9 +19,9 @@ def interpolate(lattice, spacing, first, disparity):
     spacing
         Pixels between nodes along rows, columns and disparities.
     first
-        Row, column and disparity of the first node, in the frame in which the first pixel is ``0, 0``.
+        Row, column and disparity of the first node; the first pixel is ``0, 0``.
     disparity
-        ``(rows, columns)`` in pixels, NaN for none.
+        ``(rows, columns)`` in pixels, NaN where there is none.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """SGM and the reading of every finished cost curve, in two sweeps over a patch.
 
-The sweep down keeps the sum of its four paths; the sweep up adds its own to it and reads winner, refinement,
-interval, ambiguity and the right view's winner off the finished curve while it is in the cache. No volume but the
-first sweep's sum is stored, and neither sweep goes further than the wanted pixels ask.
+The sweep down stores the sum of its four paths. The sweep up adds its own four, and reads winner, refinement, interval,
+ambiguity and the right view's winner from the finished curve while it is in the cache. No other volume is stored, and
+each sweep ends at the last row of the wanted pixels.
 
 Letters: r row, c column, k disparity index (disparity = minimum + k).
 """
@@ -46,23 +46,22 @@ from sat_intervals.tiling import Window
 
 
 class Settings(NamedTuple):
-    """What the kernels need to know of a configuration.
+    """Settings in the form that the kernels take.
 
     Attributes
     ----------
     minimum, count
         First disparity of the search range and number of disparities.
     impossible
-        Matching cost of an impossible candidate inside SGM, above all others.
+        Matching cost of an impossible candidate inside SGM, above all possible ones.
     p1, p2, regularized
-        SGM penalties where they are constant; without regularisation the aggregated cost is the matching cost itself.
+        Constant SGM penalties, and whether SGM runs; without it the aggregated cost is the matching cost.
     cut_level
         ``floor((1 - alpha) * span)``; -1: no interval.
     weights
-        uint16: the number of etas that count a cost so far above the lowest, for all that there can be; empty: no
-        ambiguity.
+        uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine
-        Whether winners are refined, and bounds extended for it.
+        Whether winners are refined, and bounds extended by one for it.
     """
 
     minimum: int
@@ -77,20 +76,20 @@ class Settings(NamedTuple):
 
 
 class Raw(NamedTuple):
-    """Products of single curves, all ``(rows, columns)``.
+    """Products read from single curves, all ``(rows, columns)``.
 
     Attributes
     ----------
     winner, lower, upper
-        int16 disparities in pixels, NO_DISPARITY where there are none.
+        int16 disparities in pixels, NO_DISPARITY for none.
     disparity
-        float32 refined disparity in pixels, NaN where there is none.
+        float32 refined disparity in pixels, NaN for none.
     cost
-        uint16 aggregated cost of the winner, IMPOSSIBLE_COST where there is none.
+        uint16 aggregated cost of the winner, IMPOSSIBLE_COST for none.
     ambiguity
         uint32, 0 where there is no candidate.
     validity
-        uint16 flags, but for the left image's own mask, cross-checking and regularisation.
+        uint16 flags, without those of the left image's mask, cross-checking and regularisation.
     """
 
     winner: np.ndarray
@@ -103,14 +102,14 @@ class Raw(NamedTuple):
 
 
 class RightView(NamedTuple):
-    """The right view's winners as far as some left pixels see them; ``[r, c + k]`` faces left ``(r, c)`` at k.
+    """Winners of right pixels among the left pixels of a core; ``[r, c + k]`` faces left ``(r, c)`` at k.
 
     Attributes
     ----------
     cost
-        ``(rows, columns + count - 1)`` uint16: the smallest aggregated cost, IMPOSSIBLE_COST where there is none.
+        ``(rows, columns + count - 1)`` uint16: the smallest aggregated cost, IMPOSSIBLE_COST for none.
     winner
-        int16 of the same shape: its disparity as seen from the left, the largest at ties; NO_DISPARITY for none.
+        int16 of the same shape: its left disparity in pixels, the largest at ties; NO_DISPARITY for none.
     """
 
     cost: np.ndarray
@@ -118,7 +117,7 @@ class RightView(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """A window, as kernels take it."""
+    """Window in the form that the kernels take."""
 
     row: int
     column: int
@@ -127,19 +126,19 @@ class _Pixels(NamedTuple):
 
 
 @njit(nogil=True, forceinline=True)
-def _holds(pixels, r, c):
+def _contains(pixels, r, c):
     return pixels.row <= r < pixels.row_stop and pixels.column <= c < pixels.column_stop
 
 
 class _Patch(NamedTuple):
-    """What both sweeps read, and the row, the paths and the curve that they are at.
+    """Inputs of both sweeps, and buffers for the current row, paths and curve.
 
     Attributes
     ----------
     possible
-        ``(columns,)`` int64: how many candidates of each of the row's pixels are possible.
+        ``(columns,)`` int64: number of possible candidates of each pixel of the row.
     curve
-        ``(size,)`` uint16: room for one.
+        ``(size,)`` uint16: buffer of one curve.
     """
 
     candidates: Candidates
@@ -165,7 +164,10 @@ def _prepare(costs: Costs, gradients: Gradients | None, settings: Settings) -> _
 
 @njit(nogil=True)
 def _enter_row(patch, gradients, settings, r, down):
-    """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it."""
+    """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
+
+    Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
+    """
     (costs, barrier, _), possible, penalties, paths, _ = patch
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
@@ -183,8 +185,8 @@ def _enter_row(patch, gradients, settings, r, down):
 
 
 @njit(nogil=True, forceinline=True)
-def _wall_off(curve, candidates, c):
-    """Put IMPOSSIBLE_COST where a candidate is impossible or beyond the range; returns the lowest cost."""
+def _close_impossible(curve, candidates, c):
+    """Set impossible candidates and lanes behind the range to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
     for k in range(0, curve.size, LANES):
         closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), load(candidates.beyond, k)))
@@ -196,7 +198,7 @@ def _wall_off(curve, candidates, c):
 
 @njit(nogil=True, forceinline=True)
 def _winner(curve, lowest):
-    """The first index that has the lowest cost."""
+    """First index with the lowest cost."""
     k = 0
     mask = lanes_at_most(load(curve, k), lowest)
     while mask == 0:
@@ -207,22 +209,22 @@ def _winner(curve, lowest):
 
 @njit(nogil=True, forceinline=True)
 def _interval(curve, lowest, count, cut_level, refine):
-    """First and last index of the alpha-cut; refinement moves a winner at a bound by up to half a pixel out of it."""
+    """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
     first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
     first -= refine & (first > 0) & (curve[first] == lowest)
     last += refine & (last < count - 1) & (curve[last] == lowest)
     return first, last
 
 
-class _Seen(NamedTuple):
-    """The right pixels that the left pixels of ``core`` see.
+class _RightPixels(NamedTuple):
+    """Best candidates so far of the right pixels that face the left pixels of ``core``.
 
     Attributes
     ----------
     indices
         ``(size,)`` uint16: 0, 1, ...
     cost, best
-        ``(rows, columns + size)`` uint16: the smallest cost yet, and its index.
+        ``(rows, columns + size)`` uint16: the smallest cost so far, and its index k.
     """
 
     core: _Pixels
@@ -232,23 +234,23 @@ class _Seen(NamedTuple):
 
 
 @njit(nogil=True, forceinline=True)
-def _see_from_right(curve, seen, r, c):
-    """Offer a left pixel's candidates to the right pixels it faces.
+def _update_right(curve, right, r, c):
+    """Update the right pixels that a left pixel faces with its candidates.
 
-    The sweep up visits the left pixels of a row from right to left, so that ``k`` grows at a right pixel and a tie
-    goes to the largest.
+    The sweep up visits the left pixels of a row from right to left, so ``k`` ascends at each right pixel and ties go to
+    the largest.
     """
-    start = (r - seen.core.row) * seen.cost.shape[1] + c - seen.core.column
+    start = (r - right.core.row) * right.cost.shape[1] + c - right.core.column
     for k in range(0, curve.size, LANES):
-        candidate, known = load(curve, k), load(seen.cost, start + k)
-        best = choose_smaller(candidate, known, load(seen.indices, k), load(seen.best, start + k))
-        store(seen.best, start + k, best)
-        store(seen.cost, start + k, smaller(candidate, known))
+        candidate, known = load(curve, k), load(right.cost, start + k)
+        best = choose_smaller(candidate, known, load(right.indices, k), load(right.best, start + k))
+        store(right.best, start + k, best)
+        store(right.cost, start + k, smaller(candidate, known))
 
 
 @njit(nogil=True)
-def _explain(costs, r, c, count, possible):
-    """Validity flags of what could be searched at a pixel; the left and the right image are blamed separately."""
+def _search_flags(costs, r, c, count, possible):
+    """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
     flags = 0
     if costs.left_state[r, c] != 0:
         flags |= LEFT_WINDOW
@@ -264,21 +266,22 @@ def _explain(costs, r, c, count, possible):
 
 
 @njit(nogil=True, forceinline=True)
-def _read_curve(curve, least, settings):
-    """Winner, refinement and whether it was done, bounds and ambiguity of a finished curve, given its lowest cost."""
-    k = _winner(curve, least)
+def _read_curve(curve, lowest, settings):
+    """Winner, sub-pixel shift, whether it was refined, both bounds and ambiguity of a finished curve."""
+    k = _winner(curve, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
     lower = upper = NO_DISPARITY
     if settings.cut_level >= 0:
-        first, last = _interval(curve, least, settings.count, settings.cut_level, settings.refine)
+        first, last = _interval(curve, lowest, settings.count, settings.cut_level, settings.refine)
         lower, upper = settings.minimum + first, settings.minimum + last
-    doubt = ambiguity(curve, settings.count if settings.weights.size else 0, least, settings.weights)
-    return settings.minimum + k, shift, refined, lower, upper, doubt
+    # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
+    count = settings.count if settings.weights.size else 0
+    return settings.minimum + k, shift, refined, lower, upper, ambiguity(curve, count, lowest, settings.weights)
 
 
 @cached
 def _sweep_down(patch, gradients, settings, output, volume):
-    """Store the sums of the downward paths of the wanted pixels."""
+    """Store the sums of the four downward paths at the pixels of ``output``."""
     candidates, possible, penalties, paths, curve = patch
     for r in range(output.row_stop):
         falling, rising = _enter_row(patch, gradients, settings, r, True)
@@ -286,7 +289,7 @@ def _sweep_down(patch, gradients, settings, output, volume):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
-            elif _holds(output, r, c):
+            elif _contains(output, r, c):
                 offset = ((r - output.row) * volume.shape[1] + c - output.column) * curve.size
                 advance_pixel(candidates, penalties, paths, slots, r, c, volume, offset)
             else:
@@ -294,10 +297,10 @@ def _sweep_down(patch, gradients, settings, output, volume):
 
 
 @cached
-def _sweep_up(patch, gradients, settings, output, volume, raw, seen, keep):
-    """Finish the curves of the wanted pixels and read them, for the right view as well."""
+def _sweep_up(patch, gradients, settings, output, volume, raw, right, keep):
+    """Finish and read the curves of the pixels of ``output``, and update the right view."""
     candidates, possible, penalties, paths, curve = patch
-    winner, lower, upper, disparity, cost, doubt, validity = raw
+    winner, lower, upper, disparity, cost, ambiguity, validity = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
         falling, rising = _enter_row(patch, gradients, settings, r, False)
@@ -307,11 +310,11 @@ def _sweep_up(patch, gradients, settings, output, volume, raw, seen, keep):
                 restart(paths, slots)
             elif settings.regularized:
                 advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
-            if not _holds(output, r, c):
+            if not _contains(output, r, c):
                 continue
             i, j = r - output.row, c - output.column
             if possible[c] < settings.count:
-                validity[i, j] = _explain(costs, r, c, settings.count, possible[c])
+                validity[i, j] = _search_flags(costs, r, c, settings.count, possible[c])
             if possible[c] == 0:
                 if keep:
                     volume[i, j] = IMPOSSIBLE_COST
@@ -320,23 +323,25 @@ def _sweep_up(patch, gradients, settings, output, volume, raw, seen, keep):
                 add_curve(curve, volume, (i * volume.shape[1] + j) * curve.size)
             else:
                 cost_curve(candidates, r, c, curve)
-            least = _wall_off(curve, candidates, c)
-            winner[i, j], shift, refined, lower[i, j], upper[i, j], doubt[i, j] = _read_curve(curve, least, settings)
-            disparity[i, j], cost[i, j] = winner[i, j] + shift, least
+            lowest = _close_impossible(curve, candidates, c)
+            winner[i, j], shift, refined, lower[i, j], upper[i, j], ambiguity[i, j] = _read_curve(
+                curve, lowest, settings
+            )
+            disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
                 validity[i, j] |= NOT_REFINED
-            if _holds(seen.core, r, c):
-                _see_from_right(curve, seen, r, c)
+            if _contains(right.core, r, c):
+                _update_right(curve, right, r, c)
             if keep:
                 volume[i, j] = curve
 
 
 def _sweep(costs, gradients, settings, output, core, keep):
-    """Both sweeps; returns the raw products, the right view and the volume (whole curves only with ``keep``)."""
+    """Run both sweeps; return the raw products, the right view and the volume (finished curves only with ``keep``)."""
     patch = _prepare(costs, gradients, settings)
     size = patch.curve.size
     shape = output.height, output.width
-    # fresh for each tile: room kept between tiles (4 % faster) would leave a worker of dask paused, above its memory
+    # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
@@ -349,14 +354,14 @@ def _sweep(costs, gradients, settings, output, core, keep):
     )
     wanted, cores = (_Pixels(w.row, w.column, w.row_stop, w.column_stop) for w in (output, core))
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
-    seen = _Seen(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
+    right = _RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         _sweep_down(patch, gradients, settings, wanted, volume)
         for state in patch.paths:
             state[:] = 0
-    _sweep_up(patch, gradients, settings, wanted, volume, raw, seen, keep)
+    _sweep_up(patch, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
-    winner = seen.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
+    winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
     return raw, RightView(cost, winner), volume
 
@@ -373,29 +378,29 @@ def match(
     Parameters
     ----------
     costs
-        Of ``(rows, columns)`` pixels.
+        Matching costs of ``(rows, columns)`` pixels.
     settings
-        See `Settings`; 8 times the largest cost and the largest P2 stay below IMPOSSIBLE_COST.
+        See `Settings`; 8 times the sum of the largest cost and the largest P2 is below IMPOSSIBLE_COST.
     output
-        The pixels of the patch whose products are wanted; the others only support them.
+        Pixels of the patch whose products are returned; the others only support them.
     core
-        The pixels that make the right view; by default those of ``output``.
+        Left pixels that make the right view; by default those of ``output``.
     gradients
-        What P1 and P2 follow; by default they are those of ``settings`` everywhere.
+        Gradients that P1 and P2 follow; by default P1 and P2 are those of ``settings``.
 
     Returns
     -------
     Raw
-        of the shape of ``output``.
+        Of the shape of ``output``.
     RightView
-        of ``core.height`` rows and ``core.width + count - 1`` columns.
+        Of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
     raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False)
     return raw, right_view
 
 
 def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = None) -> np.ndarray:
-    """Aggregated costs S (the matching cost itself without regularisation) of a whole patch.
+    """Aggregated costs of a whole patch; without SGM these are the matching costs.
 
     Parameters as in `match`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """

@@ -1,8 +1,8 @@
-"""Penalties of SGM that follow the gradients of the images along each path.
+"""SGM penalties that follow image gradients along each path.
 
-MC-CNN (Mei et al. 2011, Zbontar and LeCun 2016): P1 and P2 of a candidate fall where the left image, the right image at
-the pixel it faces, or both have an edge between the path's two pixels. Banz et al. 2012: P2 of a pixel falls with the
-gradient of the left image.
+MC-CNN (Mei et al. 2011; Zbontar and LeCun 2016): P1 and P2 of a candidate decrease where the left image, the right
+image, or both have an edge between the path's two pixels. Banz et al. 2012: P2 of a pixel decreases as the gradient of
+the left image increases.
 
 Letters: r row, c column, k disparity index, x = c + k, i path of a sweep: 0 along the row, 1 along the falling
 diagonal, 2 along the rising one, 3 along the column.
@@ -19,21 +19,21 @@ EDGES, NEGATIVE, INVERSE = range(3)
 
 
 class Rule(NamedTuple):
-    """How penalties follow gradients; integers in units of the cost.
+    """How penalties follow gradients; penalties are integers in units of the matching cost.
 
     Attributes
     ----------
     kind
         EDGES, NEGATIVE or INVERSE.
     p1, p2
-        ``(4, 3)`` uint16, by path and by how many of the two images have an edge; the first columns are all that
-        NEGATIVE and INVERSE know, p2 as the least.
+        ``(4, 3)`` uint16, by path and by the number of images with an edge. NEGATIVE and INVERSE use only the first
+        column, p2 as the minimum of P2.
     left_edge, right_edge
-        EDGES: gradients above are edges, in the images' grey values.
+        EDGES: gradients above these are edges, in grey values.
     facing
-        EDGES: whether the right image is looked at where a candidate faces it, or at the left pixel's own column.
+        EDGES: whether the right gradient is taken at the facing pixel, or at the left pixel's own column.
     own_column
-        Index x of the right pixel in the left pixel's own column, less c.
+        ``x - c`` of the right pixel in the left pixel's own column.
     alpha, beta, gamma
         P2 is ``gamma - alpha * gradient``, or ``gamma + alpha / (gradient + beta)``, and at least p2.
     """
@@ -51,7 +51,7 @@ class Rule(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """A rule and the images of a patch that it looks at.
+    """A rule and the images of a patch that it applies to.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Gradients(NamedTuple):
     right
         ``(rows, columns + count - 1)`` float32: ``right[r, c + k]`` faces ``left[r, c]``.
     rule
-        What penalties they make.
+        How penalties follow the gradients of both.
     """
 
     left: np.ndarray
@@ -69,7 +69,7 @@ class Gradients(NamedTuple):
 
 
 class RowPenalties(NamedTuple):
-    """Penalties of a row of pixels that follow gradients.
+    """Gradient-dependent penalties of a row of pixels.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class RowPenalties(NamedTuple):
 
 
 class Penalties(NamedTuple):
-    """P1 and P2: those of the row, or constants where that is None. Kernels are compiled for either."""
+    """P1 and P2: those of ``row``, or constants where it is None. Kernels are compiled for either form."""
 
     p1: int
     p2: int
@@ -93,7 +93,7 @@ class Penalties(NamedTuple):
 
 
 def make_penalties(gradients: Gradients | None, p1: int, p2: int, columns: int, size: int) -> Penalties:
-    """Constant penalties without gradients, else room for those of a row, which `fill_row` fills."""
+    """Allocate penalties: constants without gradients, else buffers of a row for `fill_row`."""
     if gradients is None:
         return Penalties(p1, p2, None)
     first, second = np.zeros((2, 4, columns), np.uint16), np.zeros((2, 4, columns), np.uint16)
@@ -102,7 +102,7 @@ def make_penalties(gradients: Gradients | None, p1: int, p2: int, columns: int, 
 
 @njit(nogil=True)
 def _step_back(i, down):
-    """Where the previous pixel of a path lies: rows and columns to add."""
+    """Offset to the previous pixel of a path: rows and columns to add."""
     row = 0 if i == 0 else 1
     column = (1, 1, -1, 0)[i]
     return (-row, -column) if down else (row, column)
@@ -110,7 +110,7 @@ def _step_back(i, down):
 
 @njit(nogil=True)
 def _differences(image, r, row, column, differences):
-    """Gradients of a row of pixels towards others beside them, 0 where those lie outside: there paths start."""
+    """Absolute differences of a row to the pixels at an offset; 0 where these lie outside: paths start there."""
     columns = image.shape[1]
     differences[:] = 0
     if 0 <= r + row < image.shape[0]:
@@ -121,7 +121,7 @@ def _differences(image, r, row, column, differences):
 
 @njit(nogil=True)
 def _fill_edges(gradients, r, down, row_penalties):
-    """Penalties of a row by the edges of both images."""
+    """Fill the penalties of a row from the edges of both images."""
     (left, right, rule), (p1, p2, edges) = gradients, row_penalties
     left_gradient, right_gradient = np.empty(left.shape[1], np.float32), np.empty(right.shape[1], np.float32)
     for i in range(4):
@@ -142,7 +142,7 @@ def _fill_edges(gradients, r, down, row_penalties):
 
 @njit(nogil=True)
 def _fill_banz(gradients, r, down, row_penalties):
-    """Penalties of a row by the gradient of the left image."""
+    """Fill the penalties of a row from the gradient of the left image."""
     (left, _, rule), (p1, p2, _) = gradients, row_penalties
     gradient = np.empty(left.shape[1], np.float32)
     for i in range(4):
@@ -159,7 +159,7 @@ def _fill_banz(gradients, r, down, row_penalties):
 
 @njit(nogil=True)
 def fill_row(gradients, r, down, row):
-    """Set the penalties of a row, for a sweep down or up; without gradients there are none."""
+    """Fill the penalties of a row for a sweep down or up; do nothing without gradients."""
     if gradients is not None:
         if gradients.rule.kind == EDGES:
             _fill_edges(gradients, r, down, row)

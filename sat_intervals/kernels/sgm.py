@@ -1,12 +1,12 @@
-"""Semi-global matching over 8 paths (Hirschmuller 2008; method: section 2).
+"""Semi-global matching over 8 paths (Hirschmuller 2008; METHOD.md, section 2).
 
     L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + P1, L(q, d + 1) + P1, min L(q) + P2) - min L(q)
 
-with q the pixel before p on the path; P1 and P2 are constant, or those of the candidate on the path. A sweep down the
-rows, columns ascending, advances the four paths that come from the left, the upper left, above and the upper right; a
-sweep up the rows, columns descending, the other four.
+where q is the pixel before p on the path. P1 and P2 are constant, or depend on candidate and path. A sweep down the
+rows, columns ascending, advances the four paths from the left, the upper left, above and the upper right. A sweep up,
+columns descending, advances the other four.
 
-Letters: r row, c column, k disparity index, in blocks of 32 lanes.
+Letters: r row, c column, k disparity index (disparity d = minimum + k), in blocks of 32 lanes.
 """
 
 from typing import NamedTuple
@@ -29,17 +29,17 @@ from sat_intervals.kernels.vector import (
     subtract,
 )
 
-# Above every L of a candidate: an impossible one reaches at most 2 P2 + 2 and the largest cost twice, < 16505.
+# Above every L of a candidate: an impossible one is at most 2 P2 + 2 plus twice the largest cost, < 16505.
 WALL = 32768
 
 
 class Paths(NamedTuple):
-    """The paths under way. One that starts at its next pixel has all zeros in both, which makes ``L = C``.
+    """State of the paths. A path that starts at its next pixel has zeros in both arrays, which makes ``L = C``.
 
     Attributes
     ----------
     curves
-        ``(slots, size)`` uint16: the last L of each.
+        ``(slots, size)`` uint16: L at the last pixel of each path.
     lowest
         ``(slots,)`` uint16: its minimum.
     """
@@ -50,7 +50,7 @@ class Paths(NamedTuple):
 
 @njit(nogil=True, forceinline=True)
 def _begin(paths, slot):
-    """What a step of a path needs to know of the one before: where it lives, ``min L(q)``, blocks, the minimum yet."""
+    """State of a path at a pixel: start of its curve, ``min L(q)``, L(q) of two blocks, and the least L so far."""
     start = slot * paths.curves.shape[1]
     wall, nothing_yet = splat(np.uint16(WALL)), splat(np.uint16(65535))
     return start, splat(paths.lowest[slot]), wall, load(paths.curves, start), nothing_yet
@@ -58,7 +58,7 @@ def _begin(paths, slot):
 
 @njit(nogil=True, forceinline=True)
 def _advance(path, curves, k, costs, penalties):
-    """The recurrence for the candidates ``k .. k + 31`` of one path: the path behind them, and their L."""
+    """Apply the recurrence to the candidates ``k .. k + 31`` of a path; return its next state and their L."""
     start, lowest, before, here, minimum = path
     p1, p2 = penalties
     after = load(curves, start + k + LANES) if k + LANES < curves.shape[1] else splat(np.uint16(WALL))
@@ -69,9 +69,9 @@ def _advance(path, curves, k, costs, penalties):
 
 @njit(nogil=True, forceinline=True)
 def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
-    """Advance the four paths in ``slots`` by the pixel ``(r, c)``; write the sum of their L from ``offset`` on.
+    """Advance the four paths in ``slots`` by the pixel ``(r, c)``; write their sum of L to ``target`` from ``offset``.
 
-    Four named paths, because numba unrolls no loop over a tuple.
+    The four paths have names because numba does not unroll a loop over a tuple.
     """
     curves, lowest = paths
     p1, p2, row = penalties
@@ -87,6 +87,7 @@ def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
         path_2, cost_2 = _advance(path_2, curves, k, costs, penalties_of(p1, p2, row, 1, c, k))
         path_3, cost_3 = _advance(path_3, curves, k, costs, penalties_of(p1, p2, row, 2, c, k))
         path_4, cost_4 = _advance(path_4, curves, k, costs, penalties_of(p1, p2, row, 3, c, k))
+        # All stores after all loads: in `_advance` they would make sweeps 4 % slower.
         store(curves, path_1[0] + k, cost_1)
         store(curves, path_2[0] + k, cost_2)
         store(curves, path_3[0] + k, cost_3)
@@ -98,11 +99,11 @@ def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
 
 @njit(nogil=True, forceinline=True)
 def path_slots(c, columns, falling, rising):
-    """Where the paths through ``(r, c)`` live: along the row, the falling and the rising diagonal, the column.
+    """Slots of the paths through ``(r, c)``: along the row, the falling and the rising diagonal, the column.
 
-    A slot belongs to the line, not to the pixel, so that a sweep updates it in place, in either direction. The
+    A slot belongs to a line, not to a pixel, so that a sweep updates it in place, in either direction. The
     diagonals through ``(r, c)`` are the lines ``c - r`` and ``c + r``, modulo the columns; ``falling = -r % columns``
-    and ``rising = r % columns`` belong to the row.
+    and ``rising = r % columns`` come once a row: divisions at every pixel would make sweeps 5 % slower.
     """
     falling += c
     rising += c
@@ -115,7 +116,7 @@ def path_slots(c, columns, falling, rising):
 
 @njit(nogil=True, forceinline=True)
 def restart(paths, slots):
-    """Let paths start at their next pixels."""
+    """Reset paths, so that they start at their next pixels."""
     for slot in slots:
         paths.curves[slot] = 0
         paths.lowest[slot] = 0
@@ -132,7 +133,7 @@ def add_curve(curve, volume, offset):
 def enter_row(paths, columns, falling, rising, down):
     """Restart the paths that enter the patch in this row: along it, and the diagonals at its two ends.
 
-    A diagonal's slot that wraps around holds the path that left the patch at the other end of the row before.
+    The slot of a diagonal that enters holds the path that left the patch at the other end of the previous row.
     """
     first, last = path_slots(0, columns, falling, rising), path_slots(columns - 1, columns, falling, rising)
     if down:

@@ -1,18 +1,18 @@
-"""Points on the ground to the cells of a grid.
+"""Accumulation of ground points in the cells of a grid.
 
-Letters: i, j row and column of a cell, u, v position of a point in cells from the grid's upper left corner.
+Letters: n point; i, j row and column of a cell; u, v column and row of a point, in cells from the first cell's centre.
 """
 
 import numpy as np
 
 from sat_intervals.kernels.compiled import cached
 
-# What is gathered of a cell.
+# Layers of the cells.
 WEIGHT, HEIGHT, CONFIDENCE, LOWER, UPPER, LEAST, MOST, COUNT, BOUNDED = range(9)
 
 
 def empty_cells(rows: int, columns: int) -> np.ndarray:
-    """Cells that no point has reached: ``(9, rows, columns)`` float64, see `splat`."""
+    """Cells without points: ``(9, rows, columns)`` float64, see `splat`."""
     cells = np.zeros((9, rows, columns))
     cells[LEAST], cells[MOST] = np.inf, -np.inf
     return cells
@@ -20,22 +20,22 @@ def empty_cells(rows: int, columns: int) -> np.ndarray:
 
 @cached
 def splat(column, row, height, lower, upper, confidence, radius, cells):
-    """Let points reach the cell they fall in and all cells whose centre lies within a radius.
+    """Add points to the cells they fall in and to all cells whose centre lies within a radius.
 
-    A point weighs ``exp(-d^2 / 2)`` at a distance of ``d`` cells, and next to nothing from 30 cells on.
+    The weight of a point at a distance of ``d`` cells is ``exp(-d^2 / 2)``, constant from 30 cells on.
 
     Parameters
     ----------
     column, row
-        ``(n,)`` positions in cells from the upper left corner of the first cell; those of centres end in one half.
+        ``(n,)`` positions in cells from the upper left corner of the first cell, whose centre is at 0.5, 0.5.
     height, lower, upper, confidence
-        ``(n,)``; a point of NaN height reaches nothing, NaN bounds count for nothing.
+        ``(n,)``; points of NaN height and NaN bounds are ignored.
     radius
-        In cells.
+        Radius in cells.
     cells
         ``(9, rows, columns)`` float64, updated: sums of weights and of weighted height, confidence, lower and upper
-        bound, the least lower bound, the largest upper bound, the number of points, the sum of weights of those with
-        bounds.
+        bound; the smallest lower and the largest upper bound; the number of points; the sum of the weights of points
+        with bounds.
     """
     rows, columns = cells.shape[1:]
     for n in range(height.size):

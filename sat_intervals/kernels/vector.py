@@ -1,10 +1,10 @@
-"""Explicit vectors of 32 lanes for numba kernels: unsigned 16-bit ones, and floats for correlation.
+"""Explicit vectors of 32 lanes for numba kernels: uint16, and float32 for correlation.
 
-LLVM vectorises a plain loop over disparities only behind run-time checks that no two arrays overlap, which costs
-more than the loop itself when a curve is two or four vectors long. These few primitives say what is meant. LLVM
-lowers them to whatever the processor has: one AVX-512 register, two of AVX2, four of SSE2 or NEON.
+LLVM vectorises a plain loop over disparities only behind run-time checks that arrays do not overlap. They take longer
+than the loop itself where a curve has two or four vectors. LLVM lowers these primitives to the registers of the
+processor: one of AVX-512, two of AVX2, four of SSE2 or NEON.
 
-Sums and differences wrap around; comparisons are unsigned; a mask of lanes is a 32-bit number, lane 0 lowest.
+Sums and differences wrap around. Comparisons are unsigned. A mask of lanes is a 32-bit number, lane 0 the lowest bit.
 """
 
 from llvmlite import ir
@@ -24,7 +24,7 @@ _LANE_INDEX = ir.VectorType(_WORD, LANES)
 
 
 class _VectorType(types.Type):
-    """The numba type of 32 lanes of a kind."""
+    """The numba type of a vector of 32 lanes."""
 
     def __init__(self, lane: str, kind: ir.VectorType) -> None:
         super().__init__(name=f"vector_32_{lane}")
@@ -42,7 +42,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _address(context, builder, array_type, array, index, pointee):
-    """Pointer to element ``index`` of a C-contiguous array, flat, as a pointer to a vector."""
+    """Pointer to the flat element ``index`` of a C-contiguous array, as a pointer to a vector."""
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), pointee.as_pointer())
 
@@ -129,7 +129,7 @@ def multiply_add(typing_context, first, second, total):
 
 @intrinsic
 def store_rounded(typing_context, array, index, vector):
-    """Write a float vector, rounded to the nearest of 0 to 255, to ``array.ravel()[index : index + 32]``, uint8."""
+    """Write a float vector, rounded and clipped to 0 .. 255, to ``array.ravel()[index : index + 32]`` of uint8."""
 
     def generate(context, builder, signature, arguments):
         array, index, value = arguments
@@ -200,7 +200,7 @@ def smallest(typing_context, vector):
     def generate(context, builder, signature, arguments):
         value = arguments[0]
         width = LANES
-        while width > 8:  # halve to 8 lanes: x86 has one instruction for the minimum of 8
+        while width > 8:  # down to 8 lanes: x86 has an instruction for the minimum of 8
             width //= 2
             halves = [
                 builder.shuffle_vector(
@@ -229,7 +229,7 @@ def lanes_at_most(typing_context, vector, limit):
 
 @intrinsic
 def fill_where_nonzero(typing_context, vector):
-    """Return 65535 in the lanes that are not zero, 0 in the others."""
+    """Return 65535 in the nonzero lanes, 0 in the others."""
 
     def generate(context, builder, signature, arguments):
         zeros = ir.Constant(_VECTOR, [0] * LANES)
@@ -240,7 +240,7 @@ def fill_where_nonzero(typing_context, vector):
 
 @intrinsic
 def mix(typing_context, mask, first, second):
-    """Return ``second`` in the lanes whose mask is 65535, ``first`` in those whose mask is 0."""
+    """Return ``second`` in the lanes where the mask is 65535, ``first`` where it is 0."""
 
     def generate(context, builder, signature, arguments):
         mask, first, second = arguments
@@ -251,7 +251,7 @@ def mix(typing_context, mask, first, second):
 
 @intrinsic
 def choose_smaller(typing_context, candidate, best, index, best_index):
-    """Return ``best_index`` with ``index`` in the lanes where ``candidate <= best``."""
+    """Return ``index`` in the lanes where ``candidate <= best``, ``best_index`` in the others."""
 
     def generate(context, builder, signature, arguments):
         candidate, best, index, best_index = arguments
@@ -274,15 +274,15 @@ def _bit_count(name, doc):
     return function
 
 
-first_lane = _bit_count("cttz", "Return the number of the lowest lane of a mask that is not empty.")
-lanes_above_last = _bit_count("ctlz", "Return how many lanes lie above the highest lane of a mask that is not empty.")
+first_lane = _bit_count("cttz", "Return the number of the lowest lane of a non-empty mask.")
+lanes_above_last = _bit_count("ctlz", "Return the number of lanes above the highest lane of a non-empty mask.")
 
 
 @intrinsic
 def hamming(typing_context, words, index, word):
     """Return the Hamming distances of 32 consecutive words of a contiguous array to one word.
 
-    ``words`` holds uint32 or uint64; distances are added up over several words of a code by the caller.
+    ``words`` is uint32 or uint64. The caller adds up the distances of codes of several words.
     """
 
     def generate(context, builder, signature, arguments):

@@ -1,1 +1,1 @@
-"""The method on one patch: arrays in, raw products and final bands out. No files, no scheduler."""
+"""The method on one patch: from arrays to raw products and final bands, without files or scheduler."""

@@ -1,4 +1,4 @@
-"""A pair of arrays in memory, matched as one tile: no files, no store, no scheduler."""
+"""Matching of two arrays in memory as one tile, without files, store or scheduler."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -26,21 +26,21 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     Parameters
     ----------
     left, right
-        ``(rows, columns)`` real numbers; the rows correspond, the numbers of columns may differ. NaN and infinity are
-        no data, and so are the masked pixels of a masked array.
+        ``(rows, columns)`` real numbers; the rows correspond, the numbers of columns may differ. NaN, infinity and
+        the masked pixels of a masked array are no data.
     config
-        Settings, or a mapping of them as `load_config` takes it; ``tiles`` does not matter.
+        Settings, or a mapping as `load_config` takes it; ``tiles`` has no effect.
 
     Returns
     -------
     Dataset
         ``disparity``, ``lower``, ``upper`` (pixels), ``confidence`` (0 to 1), float32, and ``validity``, uint16
-        flags; dimensions and coordinates of a left DataArray are kept.
+        flags; with the dimensions and coordinates of a left DataArray.
 
     Raises
     ------
     SatIntervalsError
-        For arrays that do not fit each other or the search range, and for a volume larger than the memory.
+        If the arrays do not fit each other or the search range, or the volume does not fit in memory.
     """
     config = load_config(config)
     pixels = _pixels(left, "left"), _pixels(right, "right")
@@ -69,7 +69,7 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
 
 
 def flag_attributes() -> dict[str, object]:
-    """The validity flags as CF conventions write them."""
+    """Attributes that describe the validity flags by the CF conventions."""
     return {
         "long_name": "validity flags",
         "flag_masks": np.array([flag.value for flag in FLAGS], np.uint16),
@@ -78,24 +78,24 @@ def flag_attributes() -> dict[str, object]:
 
 
 def _pixels(array: Array, side: str) -> np.ma.MaskedArray:
-    """What was given, as it is, if it is an image."""
+    """Pixels of an array as given; raise if it is not an image."""
     values = np.ma.asanyarray(array.data if isinstance(array, xr.DataArray) else array)
     if values.ndim != 2 or values.dtype.kind not in "uif":
         raise SatIntervalsError(
             f"the {side} array has {values.ndim} dimensions of {values.dtype}: "
-            "give 2, rows and columns, of real numbers"
+            "give 2 dimensions, rows and columns, of real numbers"
         )
     is_long = values.dtype in (np.int64, np.uint64)
     if is_long and ((values.compressed() > 2**53) | (values.compressed() < -(2**53))).any():
         raise SatIntervalsError(
-            f"the {side} array has {values.dtype} values that float64 does not hold, so that texture is lost: subtract "
-            "an offset"
+            f"the {side} array has {values.dtype} values that float64 cannot represent, which would lose texture: "
+            "subtract an offset"
         )
     return values
 
 
 def _image(pixels: np.ma.MaskedArray) -> np.ma.MaskedArray:
-    """The pixels as float, masked where they are no data."""
+    """Convert pixels to float and mask no data."""
     dtype = np.float32 if np.can_cast(pixels.dtype, np.float32) else np.float64
     return np.ma.masked_invalid(pixels.astype(dtype))
 
@@ -118,13 +118,13 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
 
 
 def _moments(image: np.ma.MaskedArray) -> Iterator[Moments]:
-    """Of the blocks of an image, in their order."""
+    """Moments of the blocks of an image, in order."""
     for block in blocks(*image.shape):
         yield moments(image.data[block.slices], np.ma.getmaskarray(image)[block.slices])
 
 
 def _view(image: np.ma.MaskedArray, window: Window) -> View:
-    """The image in a window that may go beyond it."""
+    """Pixels and states of a window, which may extend beyond the image."""
     pixels = np.zeros((window.height, window.width), image.dtype)
     state = np.full(pixels.shape, NO_DATA, np.uint8)
     inside = window.clipped(Window(0, 0, *image.shape))

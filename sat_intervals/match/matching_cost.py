@@ -1,4 +1,4 @@
-"""From the pixels of two views to the matching costs of areas, and to the penalties that their gradients make."""
+"""Matching costs of areas from the pixels of two views, and gradients for their penalties."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -14,21 +14,21 @@ from sat_intervals.match.mccnn import RADIUS, Network, load_network, weights_fil
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import Window, facing
 
-# Rows that go through the network together: their features, and what it holds meanwhile, stay small.
+# Rows that go through the network at once; few, which limits the memory for features.
 STRIP = 64
 
 
 class Area(NamedTuple):
-    """Pixels of one view to match, and those of the other that face them.
+    """Pixels of one view to match, and the pixels of the other view that face them.
 
     Attributes
     ----------
     base, facing
-        Windows of the two images, of the same rows.
+        Windows of the two images, in the same rows.
     minimum
         Disparity at which the first pixel of ``base`` faces the first of ``facing``.
     mirrored
-        Whether the base is in the right image.
+        Whether ``base`` is in the right image.
     """
 
     base: Window
@@ -38,29 +38,29 @@ class Area(NamedTuple):
 
     @classmethod
     def of(cls, base: Window, config: Config) -> "Area":
-        """A left area and what it faces over the search range."""
+        """Make the area of left pixels and the right pixels that face them."""
         search = config.disparity
         return cls(base, facing(base, search.minimum, search.maximum), search.minimum)
 
     @classmethod
     def mirror(cls, base: Window, config: Config) -> "Area":
-        """A right area and what it faces in the left image."""
+        """Make the area of right pixels and the left pixels that face them."""
         search = config.disparity
         return cls(base, facing(base, -search.maximum, -search.minimum), -search.maximum, mirrored=True)
 
     @property
     def left(self) -> Window:
-        """The part in the left image."""
+        """Window in the left image."""
         return self.facing if self.mirrored else self.base
 
     @property
     def right(self) -> Window:
-        """The part in the right image."""
+        """Window in the right image."""
         return self.base if self.mirrored else self.facing
 
 
 class MatchingCost(NamedTuple):
-    """What the kernels match an area by, the states of its base's pixels, and which of them are `_textureless`."""
+    """Costs and gradients of an area, with the states of its base's pixels and those that are `_textureless`."""
 
     costs: Costs
     gradients: Gradients | None
@@ -76,23 +76,23 @@ class View(NamedTuple):
     state: np.ndarray
 
     def inner(self, array: np.ndarray, window: Window) -> np.ndarray:
-        """The part of pixels or states in a window."""
+        """Crop ``pixels`` or ``state`` to a window."""
         return np.ascontiguousarray(array[window.relative_to(self.window).slices])
 
 
 Views = tuple[View, View]
-"""Of the left and of the right image."""
+"""Views of the left and of the right image."""
 
 
 def view_windows(areas: Sequence[Area], config: Config) -> tuple[Window, Window]:
-    """The windows of the left and of the right image that areas of the same rows need, with those of their costs."""
+    """Windows of both images that the costs of areas need; the areas are in the same rows."""
     radius = config.cost.window // 2
     left, right = (_around(windows) for windows in zip(*((area.left, area.right) for area in areas), strict=True))
     return left.grown(radius, radius), right.grown(radius, radius)
 
 
 def _around(windows: Sequence[Window]) -> Window:
-    """The smallest window of the same rows that holds all of them."""
+    """Smallest window that contains all windows, which are in the same rows."""
     column = min(window.column for window in windows)
     width = max(window.column_stop for window in windows) - column
     return Window(windows[0].row, column, windows[0].height, width)
@@ -101,14 +101,14 @@ def _around(windows: Sequence[Window]) -> Window:
 def cost_areas(
     views: Views, areas: Sequence[Area], config: Config, statistics: PairStatistics | None = None
 ) -> list[MatchingCost]:
-    """Costs and penalties of areas of two views.
+    """Costs and gradients of areas of two views.
 
     Parameters
     ----------
     views
-        The images in the `view_windows` of the areas.
+        Both images in the `view_windows` of the areas.
     areas
-        What to match.
+        Areas to match.
     config
         Settings.
     statistics
@@ -116,7 +116,7 @@ def cost_areas(
     """
     radius = config.cost.window // 2
     if isinstance(config.cost, Mccnn):
-        assert statistics is not None  # whoever matches by MC-CNN has measured the images
+        assert statistics is not None  # MC-CNN always comes with statistics
         costs = _correlations(views, areas, statistics, load_network(weights_file(config.cost.weights)))
     else:
         costs = _hamming(views, areas, radius)
@@ -133,9 +133,9 @@ def cost_areas(
 
 
 def _of_area(area: Area, views: Views, arrays: Sequence[np.ndarray], radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """The columns of an area's base and of what it faces.
+    """Crop the arrays of both views to an area: columns of its base, and of the pixels that face it.
 
-    ``arrays`` ``(..., columns)`` are of the left and of the right view without their ``radius`` on all sides.
+    ``arrays``, ``(..., columns)``, belong to the left and the right view without a margin of ``radius``.
     """
     sides = (area.mirrored, area.base), (not area.mirrored, area.facing)
     first = [wanted.column - views[side].window.column - radius for side, wanted in sides]
@@ -148,7 +148,7 @@ def _of_area(area: Area, views: Views, arrays: Sequence[np.ndarray], radius: int
 
 # ---- Texture -----------------------------------------------------------------------------------------------
 def _varies(view: View, radius: int) -> np.ndarray:
-    """Where a pixel's window changes along any of its rows: bool of the view's window without ``radius``."""
+    """Pixels whose window varies along any of its rows: bool, without a margin of ``radius``."""
     height, width = view.window.height - 2 * radius, view.window.width - 2 * radius
     differs = view.pixels[:, 1:] != view.pixels[:, :-1]
     in_column = reduce(np.logical_or, (differs[row : row + height] for row in range(2 * radius + 1)))
@@ -157,16 +157,16 @@ def _varies(view: View, radius: int) -> np.ndarray:
 
 
 def _textureless(costs: Costs, base_varies: np.ndarray, there_varies: np.ndarray) -> np.ndarray:
-    """Pixels of the base whose window, and all usable windows that it faces, do not change along the row.
+    """Pixels of the base whose window, and all usable windows that face it, do not vary along any row.
 
-    All their candidates cost the same. SGM would still choose among them, by what it carries in from the images' ends.
+    All their candidates cost the same. SGM would still choose among them, by costs carried in from the image borders.
     """
     flat: np.ndarray = ~base_varies & (costs.left_state == 0)
-    rows = flat.any(axis=1)  # few, as a rule: the rest costs nothing
-    telling = there_varies[rows] & (costs.right_state[rows] == 0)
-    upto = np.pad(np.cumsum(telling, axis=1, dtype=np.int32), [(0, 0), (1, 0)])
+    rows = flat.any(axis=1)  # usually few: skip the others
+    textured = there_varies[rows] & (costs.right_state[rows] == 0)
+    cumulative = np.pad(np.cumsum(textured, axis=1, dtype=np.int32), [(0, 0), (1, 0)])
     columns = flat.shape[1]
-    flat[rows] &= upto[:, -columns:] == upto[:, :columns]
+    flat[rows] &= cumulative[:, -columns:] == cumulative[:, :columns]
     return flat
 
 
@@ -182,7 +182,7 @@ def _hamming(views: Views, areas: Sequence[Area], radius: int) -> list[Costs]:
 
 # ---- MC-CNN ------------------------------------------------------------------------------------------------
 def _correlations(views: Views, areas: Sequence[Area], statistics: PairStatistics, network: Network) -> list[Costs]:
-    """Costs of all areas, strip by strip: features are never kept, and computed once however many areas there are."""
+    """Costs of all areas, strip by strip: all areas share the features of a strip, which are then discarded."""
     states = [window_state(view.state, RADIUS) for view in views]
     made = [
         np.empty(
@@ -203,15 +203,15 @@ def _correlations(views: Views, areas: Sequence[Area], statistics: PairStatistic
 
 
 def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStatistics, network: Network) -> np.ndarray:
-    """Features of rows of a view, ``(features, rows, columns)``; zero beside the columns with a usable window."""
+    """Features of rows of a view, ``(features, rows, columns)``; zero before and behind the usable columns."""
     height, width = rows.stop - rows.start, state.shape[1]
     usable = np.flatnonzero((state[rows] == 0).any(axis=0))
     if not usable.size:
         return np.zeros((network.count, height, width), np.float32)
     first, last = usable[0], usable[-1] + 1
-    seen = np.s_[rows.start : rows.stop + 2 * RADIUS, first : last + 2 * RADIUS]
-    pixels = (view.pixels[seen].astype(np.float64) - statistics.mean) / statistics.deviation
-    pixels[view.state[seen] != 0] = 0
+    part = np.s_[rows.start : rows.stop + 2 * RADIUS, first : last + 2 * RADIUS]
+    pixels = (view.pixels[part].astype(np.float64) - statistics.mean) / statistics.deviation
+    pixels[view.state[part] != 0] = 0
     inner = network(pixels.astype(np.float32))
     if inner.shape[2] == width:
         return inner
@@ -222,7 +222,7 @@ def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStati
 
 # ---- Penalties ---------------------------------------------------------------------------------------------
 def _gradients(area: Area, views: Views, config: Config, statistics: PairStatistics | None) -> Gradients | None:
-    """What the penalties of an area follow; None where they are constant."""
+    """Gradients that the penalties of an area follow; None for constant penalties."""
     if isinstance(config.sgm, MccnnSgm):
         edges = np.full(2, config.sgm.d)
         if config.sgm.gradients == "normalized":

@@ -1,37 +1,37 @@
-"""Memory of a worker, from the sizes of what it holds; and the tile that fits in a given one."""
+"""Estimates of the memory that matching needs, and the largest tile that fits in a given memory."""
 
 from sat_intervals.config import Config, ConfigError, Mccnn
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.machine import usable_memory
 
-# A process before its first tile, its libraries and compiled kernels; measured 240 MB.
+# A process before its first tile, with libraries and compiled kernels; measured 240 MB.
 PROCESS_BYTES = 300 * 10**6
-# Per pixel of a tile with its overlap: pixels as float32 and float64 on their way, states, codes of both images, and
-# what numpy keeps meanwhile; per pixel of the core: raw products and their compressed copies.
+# Per pixel of a tile with its overlap: pixels as float32 and float64, states, codes of both images, and temporary
+# arrays; per pixel of the core: raw products and their compressed copies.
 _PATCH_BYTES, _CORE_BYTES = 40, 60
-# Per column of a patch: what the network of MC-CNN holds of a strip of rows, and the features of both images.
+# Per column of a patch: layers of MC-CNN's network for a strip of rows, and the features of both images.
 _NETWORK_BYTES = 140_000
 
 
 def _lanes(config: Config) -> int:
-    """Disparities in whole vectors."""
+    """Number of disparities, padded to whole vectors."""
     return -(-config.disparity.count // 32) * 32
 
 
 def volume_bytes(height: int, width: int, config: Config) -> int:
-    """The volume of so many pixels, the most of what matching takes; that of MC-CNN's costs comes on top."""
+    """Bytes of the cost volume, the largest part of matching; with MC-CNN also of its matching costs."""
     return (3 if isinstance(config.cost, Mccnn) else 2) * height * width * _lanes(config)
 
 
 def tile_bytes(config: Config, size: int | None = None) -> int:
-    """Memory that a tile takes while it is matched, on top of its process; ``size`` in place of the settings' own."""
+    """Bytes that matching a tile needs on top of its process; ``size`` replaces ``tiles.size`` of the settings."""
     size = size or config.tiles.size
     lanes = _lanes(config)
     patch = size + 2 * config.tiles.overlap
     volume = 2 * (size + 2) ** 2 * lanes
     accurate = config.cross_check is not None and config.cross_check.method == "accurate"
     if accurate:
-        volume = 2 * size * (size + config.disparity.count) * lanes  # that of the right view, which is wider
+        volume = 2 * size * (size + config.disparity.count) * lanes  # the volume of the right view is wider
     if isinstance(config.cost, Mccnn):
         volume += lanes * patch * (patch + accurate * (patch + config.disparity.count))
         volume += _NETWORK_BYTES * (patch + config.disparity.count)
@@ -40,12 +40,12 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
 
 
 def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
-    """The settings with the largest tile, no larger than theirs, of which so many fit in a process with its memory.
+    """Reduce the tile size until ``tiles_at_once`` tiles fit in a process of ``memory`` bytes.
 
     Raises
     ------
     ConfigError
-        Where not even the smallest fits; the search range is never cut.
+        If the smallest tile does not fit; the search range is never reduced.
     """
     sizes = range(config.tiles.size, 0, -64)
     for size in sizes:
@@ -54,13 +54,15 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
     needed = PROCESS_BYTES + tiles_at_once * tile_bytes(config, sizes[-1])
     raise ConfigError(
         f"tiles of {sizes[-1]} pixels with overlap {config.tiles.overlap} and {config.disparity.count} disparities, "
-        f"{tiles_at_once} at once, need {needed / 1e6:.0f} MB, given are {memory / 1e6:.0f} MB: "
+        f"{tiles_at_once} at once, need {needed / 1e6:.0f} MB, but {memory / 1e6:.0f} MB are given: "
         "give more memory or fewer workers"
     )
 
 
 def check_memory(needed: int, what: str, way_out: str) -> None:
-    """Refuse what needs more bytes than this process may use.
+    """Raise if ``needed`` bytes exceed the memory that this process may use.
+
+    ``what`` and ``way_out`` begin and end the message.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Mean and standard deviation of a whole image, from blocks that any worker may read (Chan, Golub and LeVeque 1983).
+"""Mean and standard deviation of a whole image, merged from blocks (Chan, Golub and LeVeque 1983).
 
-What a network is given must not depend on the tile: a mean of the tile, no data included, changes 1 to 21 % of the
-winners of the reference implementation.
+The input of a network must not depend on the tile: statistics of a tile, no data included, change 1 to 21 % of the
+winners of Pandora.
 """
 
 import math
@@ -12,12 +12,12 @@ import numpy as np
 
 from sat_intervals.tiling import Grid, Window
 
-# Side of the blocks of an image, in pixels: with them the order of sums, and so the last bit, is always the same.
+# Side of the blocks of an image in pixels. It fixes the order of sums, and so the last bit.
 BLOCK = 2048
 
 
 class Moments(NamedTuple):
-    """Number, mean and summed squared differences from it of some pixels."""
+    """Number of pixels, their mean, and the sum of squared differences from it."""
 
     number: int
     mean: float
@@ -25,30 +25,30 @@ class Moments(NamedTuple):
 
 
 class ImageStatistics(NamedTuple):
-    """Mean and standard deviation of an image's usable pixels; 0 and 1 where there are none."""
+    """Mean and standard deviation of an image's usable pixels; 0 and 1 if there are none."""
 
     mean: float
     deviation: float
 
 
 class PairStatistics(NamedTuple):
-    """Those of both images."""
+    """Statistics of both images."""
 
     left: ImageStatistics
     right: ImageStatistics
 
     @classmethod
     def of_report(cls, report: dict[str, Any]) -> "PairStatistics":
-        """What `report` made."""
+        """Read the mapping that `report` makes."""
         return cls(ImageStatistics(**report["left"]), ImageStatistics(**report["right"]))
 
     def report(self) -> dict[str, Any]:
-        """As manifests and run.json hold them."""
+        """Make the mapping that manifests and run.json hold."""
         return {side: getattr(self, side)._asdict() for side in self._fields}
 
 
 def moments(pixels: np.ndarray, state: np.ndarray) -> Moments:
-    """Of the usable pixels of a block, whose state is 0."""
+    """Moments of the usable pixels of a block: those with state 0."""
     values = pixels[state == 0].astype(np.float64)
     if not values.size:
         return Moments(0, 0.0, 0.0)
@@ -57,12 +57,12 @@ def moments(pixels: np.ndarray, state: np.ndarray) -> Moments:
 
 
 def blocks(height: int, width: int) -> list[Window]:
-    """The blocks of an image, in their order."""
+    """Blocks of an image, in order."""
     return [tile.core for tile in Grid(Window(0, 0, height, width), BLOCK)]
 
 
 def statistics_of(blocks: Iterable[Moments]) -> ImageStatistics:
-    """Of an image, from its blocks in their order."""
+    """Statistics of an image from the moments of its blocks, in order."""
     number, mean, squares = 0, 0.0, 0.0
     for block in blocks:
         total = number + block.number

@@ -1,4 +1,4 @@
-"""One patch of two images to raw products: the windows it needs, its costs, its match, its right view."""
+"""Raw products of one patch: the windows that it needs, its costs, its match, its right view."""
 
 from typing import NamedTuple
 
@@ -18,11 +18,11 @@ class Patch(NamedTuple):
     Attributes
     ----------
     raw
-        Of the pixels of ``output``.
+        Products of the pixels of ``output``.
     output
-        The core and, where the region goes on, one pixel around it: the ring that neighbours compute too.
+        The core and, inside the region, a ring of one pixel around it, which neighbours compute too.
     right
-        The right view as the core's left pixels see it.
+        The right view among the core's left pixels.
     """
 
     raw: Raw
@@ -31,8 +31,8 @@ class Patch(NamedTuple):
 
 
 def kernel_settings(config: Config) -> Settings:
-    """What the kernels need to know of a configuration."""
-    # others come with the gradients that they follow
+    """Convert a configuration to the settings of the kernels."""
+    # penalties that follow gradients come with these
     constant = config.sgm if isinstance(config.sgm, Sgm | CosineSgm) else None
     return Settings(
         minimum=config.disparity.minimum,
@@ -48,9 +48,9 @@ def kernel_settings(config: Config) -> Settings:
 
 
 def patch_areas(core: Window, image: Window, config: Config) -> list[Area]:
-    """The area of a core with its overlap and, for accurate cross-checking, that of the right view.
+    """Area of a core with its overlap and, for accurate cross-checking, that of the right view.
 
-    ``image``: all left pixels. The overlap goes beyond a region, but not beyond the image.
+    ``image`` is the window of all left pixels. The overlap may leave the region, but not the image.
     """
     overlap = config.tiles.overlap
     areas = [Area.of(core.grown(overlap, overlap).clipped(image), config)]
@@ -60,7 +60,7 @@ def patch_areas(core: Window, image: Window, config: Config) -> list[Area]:
 
 
 def _right_area(core: Window, image: Window, config: Config) -> Area:
-    """The right pixels that a core can reach, with their overlap; they may lie outside the right image."""
+    """Area of the right pixels that face a core, with their overlap; they may lie outside the right image."""
     search, overlap = config.disparity, config.tiles.overlap
     reach = facing(core, search.minimum, search.maximum)
     rows = Window(image.row, reach.column - overlap, image.height, reach.width + 2 * overlap)
@@ -68,7 +68,7 @@ def _right_area(core: Window, image: Window, config: Config) -> Area:
 
 
 def patch_windows(core: Window, image: Window, config: Config) -> tuple[Window, Window]:
-    """The windows of the left and of the right image that matching a core needs; see `patch_areas`."""
+    """Windows of both images that matching a core needs; see `patch_areas`."""
     return view_windows(patch_areas(core, image, config), config)
 
 
@@ -85,13 +85,13 @@ def match_patch(
     Parameters
     ----------
     views
-        The images in the `patch_windows` of the core.
+        Both images in the `patch_windows` of the core.
     core
-        The left pixels whose products are kept.
+        Left pixels whose products are kept.
     region
-        The left pixels of the whole run.
+        Left pixels of the whole run.
     image
-        All left pixels.
+        All pixels of the left image.
     config
         Settings.
     statistics
@@ -102,30 +102,30 @@ def match_patch(
     area, *of_right = patch_areas(core, image, config)
     cost, *cost_of_right = cost_areas(views, [area, *of_right], config, statistics)
     wants_fast = config.cross_check is not None and config.cross_check.method == "fast"
-    seen = core if wants_fast else Window(core.row, core.column, 0, 0)
+    right_core = core if wants_fast else Window(core.row, core.column, 0, 0)
     raw, right_view = match(
-        cost.costs, settings, output.relative_to(area.base), seen.relative_to(area.base), cost.gradients
+        cost.costs, settings, output.relative_to(area.base), right_core.relative_to(area.base), cost.gradients
     )
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
-    _doubt(raw, cost.textureless[inside], config)
+    _mark_ambiguous(raw, cost.textureless[inside], config)
     if of_right:
         right_view = match_right(cost_of_right[0], of_right[0], core, settings)
     return Patch(raw, output, right_view)
 
 
-def _doubt(raw: Raw, textureless: np.ndarray, config: Config) -> None:
-    """Give pixels without texture the whole search range as interval, and the largest ambiguity."""
+def _mark_ambiguous(raw: Raw, textureless: np.ndarray, config: Config) -> None:
+    """Set the interval of textureless pixels to the whole search range, and their ambiguity to the largest."""
     if not textureless.any():
         return
-    doubtful = textureless & (raw.winner != NO_DISPARITY)
+    ambiguous = textureless & (raw.winner != NO_DISPARITY)
     if config.interval:
-        raw.lower[doubtful], raw.upper[doubtful] = config.disparity.minimum, config.disparity.maximum
-    raw.ambiguity[doubtful] = config.largest_ambiguity
+        raw.lower[ambiguous], raw.upper[ambiguous] = config.disparity.minimum, config.disparity.maximum
+    raw.ambiguity[ambiguous] = config.largest_ambiguity
 
 
 def match_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:
-    """The right view of a core from a volume of its own: images change places, and disparities their sign."""
+    """Match the right view of a core with its own volume: the images swap, and disparities change sign."""
     maximum = settings.minimum + settings.count - 1
     mirrored = settings._replace(minimum=-maximum, cut_level=-1, weights=np.zeros(0, np.uint16), refine=False)
     reach = facing(core, settings.minimum, maximum).relative_to(area.base)

@@ -1,8 +1,8 @@
 """Whole-image steps on raw products: cross-checking, confidence, medians, regularisation, final bands.
 
-Everything here sees full-width rows, with a halo of rows above and below, so that nothing depends on the tiling
-(method: sections 4, 6 to 9). The order is: winner and V-fit (in the tile), cross-check, median, quantiles, widening,
-NaN for invalid pixels.
+All steps work on full-width rows with a halo of rows above and below, so that results do not depend on the tiling
+(METHOD.md, sections 4 and 6 to 9). The order is: winner and V-fit (in the tile), cross-check, median, quantiles,
+widening, NaN for invalid pixels.
 """
 
 from collections.abc import Iterable, Iterator
@@ -21,14 +21,14 @@ Rows = TypeVar("Rows", bound=tuple[Any, ...])
 
 
 class RawRows(NamedTuple):
-    """Raw products of full-width rows, all ``(rows, columns)`` but the last.
+    """Raw products of full-width rows, all ``(rows, columns)`` except the last.
 
     Attributes
     ----------
     winner, lower, upper
-        int16 disparities, NO_DISPARITY for none.
+        int16 disparities in pixels, NO_DISPARITY for none.
     disparity
-        float32, NaN for none.
+        float32 pixels, NaN for none.
     ambiguity
         uint32.
     validity
@@ -47,23 +47,22 @@ class RawRows(NamedTuple):
 
     @classmethod
     def of(cls, raw: Raw, right: RightView) -> "RawRows":
-        """What was matched as one tile."""
+        """Make the rows of a pair that was matched as one tile."""
         return cls(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, right.winner)
 
 
 class ConfidenceScale(NamedTuple):
-    """The ambiguities that become confidence 1 and 0."""
+    """Ambiguities that become confidence 1 and 0."""
 
     p1: float
     p99: float
 
 
 def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceScale:
-    """What confidence is relative to: given figures, the whole range, or percentiles of the whole image.
+    """Scale of confidence: given figures, the whole range, or percentiles of the whole image.
 
-    Equal percentiles do not tell pixels apart, so the whole range takes their place.
-
-    ``histogram`` counts the ambiguities, ``0 .. etas * count``, of all pixels with a possible candidate.
+    ``histogram`` counts the ambiguities, ``0 .. etas * count``, of all pixels with a possible candidate. Equal
+    percentiles cannot rank pixels, so the whole range replaces them.
     """
     if settings.p1 is not None and settings.p99 is not None:
         return ConfidenceScale(settings.p1, settings.p99)
@@ -74,7 +73,7 @@ def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceSc
 
 
 def halo(config: Config) -> int:
-    """Rows above and below that the final bands of a row depend on."""
+    """Number of rows above and below that the final bands of a row depend on."""
     return _median_radius(config) + (config.regularization.depth if config.regularization else 0)
 
 
@@ -88,9 +87,9 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
     Parameters
     ----------
     rows
-        Raw products of these rows and of at least `halo` rows above and below, as far as the region goes.
+        Raw products of these rows and of at least `halo` rows above and below, inside the region.
     first, last
-        Counted from the first of ``rows``.
+        Row numbers, counted from the first of ``rows``.
     scale
         See `confidence_scale`; the same for the whole image.
     """
@@ -114,13 +113,13 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
         lower, upper = lower[inner], upper[inner]
     written = (searched if config.products.keep_rejected else kept)[inner]
     disparity = np.where(written, disparity[inner], np.float32(np.nan))
-    # The law of this tool: after medians and quantiles the interval still holds the disparity.
+    # Widen the intervals that medians or quantiles moved off the disparity.
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
     return Bands(disparity, lower, upper, confidence[inner], validity[inner])
 
 
 def _bounds(rows: RawRows, config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """Both bounds as float; what stands where nothing was searched is never written."""
+    """Both bounds as float32; values where nothing was searched are never written."""
     if config.interval is None:
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
         return nothing, nothing
@@ -149,21 +148,21 @@ def _regularized(
 
 
 def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[Bands]:
-    """Final bands of a region given strip by strip, from the top; each strip waits for the halo below it."""
+    """Final bands of a region from its strips, from the top; a row is finished once the halo below it is read."""
     for rows, first, last in with_halo(strips, halo(config)):
         yield postprocess_rows(rows, first, last, scale, config)
 
 
 def with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, int]]:
-    """Records of full-width rows, given strip by strip from the top, with the rows around them.
+    """Add rows above and below to records of full-width rows, given strip by strip from the top.
 
-    Yields records with ``first`` and ``last``: the rows between have ``margin`` rows above and below them, as far as
-    the image goes, and every row is between once.
+    Yields ``(record, first, last)``: the rows ``[first, last)`` have ``margin`` rows above and below, fewer at the
+    image's ends. Each row of the image is in one such range.
     """
     waiting: Rows | None = None
     first = 0
     for strip in strips:
-        waiting = strip if waiting is None else _made(strip, map(np.concatenate, zip(waiting, strip, strict=True)))
+        waiting = strip if waiting is None else _like(strip, map(np.concatenate, zip(waiting, strip, strict=True)))
         last = len(waiting[0]) - margin
         if last > first:
             yield waiting, first, last
@@ -174,9 +173,9 @@ def with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, 
 
 
 def cut_rows(rows: Rows, first: int, last: int) -> Rows:
-    """The rows ``[first, last)`` of a record."""
-    return _made(rows, (array[first:last] for array in rows))
+    """Cut the rows ``[first, last)`` of a record."""
+    return _like(rows, (array[first:last] for array in rows))
 
 
-def _made(like: Rows, arrays: Iterable[np.ndarray]) -> Rows:
-    return type(like)(*arrays)
+def _like(record: Rows, arrays: Iterable[np.ndarray]) -> Rows:
+    return type(record)(*arrays)

@@ -1,4 +1,4 @@
-"""Kernels compiled, or read from numba's cache, before the first tile."""
+"""Compilation of the kernels, or loading from the cache, before the first tile."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from sat_intervals.tiling import Window
 
 
 def compile_kernels(config: Config) -> None:
-    """Match a few random pixels, which compiles every kernel that the settings need."""
+    """Compile every kernel that the settings need, by matching a few random pixels."""
     random = np.random.default_rng(0)
     spot = Window(0, 0, 4, 4)
     windows = patch_windows(spot, spot, config)

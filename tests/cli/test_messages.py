@@ -145,7 +145,7 @@ def test_main__tells_of_a_line_break_in_a_path_in_one_line(tmp_path):
 
 # ---- Settings and lists ------------------------------------------------------------------------------------------
 def test_read_batch__names_what_cannot_be_read_and_names_that_are_too_long(tmp_path):
-    with pytest.raises(SatIntervalsError, match=r"nope.csv cannot be read: No such file or directory: give a list"):
+    with pytest.raises(SatIntervalsError, match=r"nope.csv cannot be read: No such file or directory: "):
         read_batch(tmp_path / "nope.csv")
     (tmp_path / "pairs.csv").write_text(f"name,left,right\n{201 * 'a'},l,r\n")
     with pytest.raises(SatIntervalsError, match=r"row 1: name 'a+' cannot be .*, take another, of 200 bytes at most$"):
@@ -230,7 +230,7 @@ def test_read_window__refuses_integers_that_no_float_holds(tmp_path):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_match_arrays__refuses_integers_that_no_float_holds(sign):
     pixels = sign * (2**60 + np.arange(81, dtype=np.int64).reshape(9, 9))
-    with pytest.raises(SatIntervalsError, match="the left array has int64 values that float64 does not hold"):
+    with pytest.raises(SatIntervalsError, match="the left array has int64 values that float64 cannot represent"):
         match_arrays(pixels, pixels, {"disparity": {"minimum": 0, "maximum": 1}})
 
 

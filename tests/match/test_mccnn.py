@@ -82,7 +82,7 @@ def test_weights_file__missing_extra_is_told(monkeypatch):
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr("sat_intervals.match.mccnn.files", nowhere)
-    with pytest.raises(SatIntervalsError, match=r"needs the weights in MCCNN: pip install sat-intervals\[mccnn\]"):
+    with pytest.raises(SatIntervalsError, match=r"needs the package MCCNN: pip install sat-intervals\[mccnn\]"):
         weights_file(None)
 
 
@@ -111,10 +111,10 @@ def test_network__without_a_unit_vector_makes_zeros(tmp_path, weights):
 @pytest.mark.parametrize(
     ("options", "layers", "message"),
     [
-        ({"unit": False}, 5, r"makes vectors of length .*, not 1: needed is a network of MC-CNN fast's form"),
-        ({"pads": 1}, 5, r"makes \(8, 11, 24\) of an image of 11 x 24"),
-        ({}, 3, r"makes \(8, 5, 18\) of an image of 11 x 24"),
-        ({"rank": 4}, 5, r"takes and gives \[\[1, 1, 'height', 'width'\]\]"),
+        ({"unit": False}, 5, r"gives vectors of length .*, not 1: give a network with the form of MC-CNN fast"),
+        ({"pads": 1}, 5, r"maps an image of 11 x 24 to \(8, 11, 24\)"),
+        ({}, 3, r"maps an image of 11 x 24 to \(8, 5, 18\)"),
+        ({"rank": 4}, 5, r"maps \[\[1, 1, 'height', 'width'\]\]"),
     ],
 )
 def test_network__another_form_is_refused(tmp_path, options, layers, message):
@@ -127,7 +127,7 @@ def test_network__another_form_is_refused(tmp_path, options, layers, message):
 def test_network__no_network_is_refused(tmp_path):
     file = tmp_path / "text.onnx"
     file.write_text("weights")
-    with pytest.raises(SatIntervalsError, match=r"text\.onnx is no ONNX network"):
+    with pytest.raises(SatIntervalsError, match=r"text\.onnx is not a valid ONNX network"):
         Network(file)
     with pytest.raises(SatIntervalsError, match=r"cost\.weights .*none\.onnx: no such file"):
         match_arrays(np.zeros((20, 20)), np.zeros((20, 20)), settings(0, 1, tmp_path / "none.onnx"))

@@ -371,7 +371,7 @@ def test_fitted__takes_the_largest_tile_that_fits():
         assert size <= base == SETTINGS.tiles.size
         assert tile_bytes(SETTINGS, size) < memory
         assert size == base or tile_bytes(SETTINGS, size + 64) > memory - 3 * 10**8
-    with pytest.raises(ConfigError, match=r"need .* MB, given are 300 MB"):
+    with pytest.raises(ConfigError, match=r"need .* MB, but 300 MB are given"):
         fitted(SETTINGS, 3 * 10**8)
 
 
@@ -413,7 +413,7 @@ def test_plan__prints_what_a_run_will_take(images):
     assert "smaller than set, to fit" in result.stdout
     refused = invoke("plan", *pair, "--memory", "100MB")
     assert refused.exit_code == 2
-    assert "given are 100 MB" in refused.stderr
+    assert "but 100 MB are given" in refused.stderr
 
 
 def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(images, tmp_path):
