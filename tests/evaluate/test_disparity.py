@@ -25,7 +25,7 @@ from sat_intervals.match.postprocess import cut_rows
 from sat_intervals.products import INVALID, OCCLUSION, Bands
 from sat_intervals.tiling import Window
 
-some = settings(max_examples=150, derandomize=True, deadline=None)
+some = settings(max_examples=50, derandomize=True, deadline=None)
 NAN = float("nan")
 
 

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.disparity import cross_check, median
-from sat_intervals.kernels.matching import Settings, cost_volume, match
+from sat_intervals.kernels.matching import Settings, match
 from sat_intervals.products import (
     IMPOSSIBLE_COST,
     LEFT_WINDOW,
@@ -29,7 +29,7 @@ from sat_intervals.products import (
 )
 from sat_intervals.tiling import Window
 
-bounded = settings(max_examples=150, derandomize=True, deadline=None)
+bounded = settings(max_examples=80, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 N = NO_DISPARITY
@@ -77,21 +77,26 @@ def test_match__without_refinement():
     assert raw.validity.tolist() == [[NOT_REFINED], [NOT_REFINED], [NOT_REFINED | RANGE_INCOMPLETE]]
 
 
+@pytest.mark.parametrize("refine", [True, False])
 @bounded
 @given(scene=reference.scenes())
-def test_match__winner_and_refinement_equal_reference(scene):
-    raw, _ = matched(scene)
+def test_match__equals_reference(refine, scene):
+    raw, right_view = matched(scene, refine=refine)
     volume = reference.volume_of(scene)
     winner = reference.winner_takes_all(volume)
-    disparity, _ = reference.vfit(volume, winner, scene.minimum)
-    np.testing.assert_array_equal(raw.winner, reference.absolute(winner, scene.minimum))
-    np.testing.assert_array_equal(raw.disparity, disparity)
+    disparity, refined = reference.vfit(volume, winner, scene.minimum)
+    seen, costs = reference.right_winners(volume)
+    left, right = (reference.window_state(state, scene.window) for state in (scene.left_state, scene.right_state))
+    absolute = reference.absolute(winner, scene.minimum)
+    np.testing.assert_array_equal(raw.winner, absolute)
+    np.testing.assert_array_equal(raw.disparity, disparity if refine else np.where(winner < 0, np.nan, absolute))
     np.testing.assert_array_equal(raw.cost, volume.min(axis=2))
-    assert [array.dtype for array in (raw.winner, raw.disparity, raw.cost)] == [
-        np.int16,
-        np.float32,
-        np.uint16,
-    ]
+    np.testing.assert_array_equal(right_view.winner, reference.absolute(seen, scene.minimum))
+    np.testing.assert_array_equal(right_view.cost, costs)
+    # The pixels' own states are the caller's: left_masked is not set here.
+    expected = reference.validity(np.zeros_like(left), left, right, refined & refine)
+    np.testing.assert_array_equal(raw.validity, expected)
+    assert [array.dtype for array in (raw.winner, raw.disparity, raw.cost)] == [np.int16, np.float32, np.uint16]
 
 
 @pytest.mark.parametrize("refine", [True, False])
@@ -132,14 +137,6 @@ def test_match__any_part_equals_the_whole(scene, data):
     seen, costs = reference.right_winners(reference.volume_of(scene)[core.slices])
     np.testing.assert_array_equal(right_view.winner, reference.absolute(seen, scene.minimum))
     np.testing.assert_array_equal(right_view.cost, costs)
-
-
-@few
-@given(scene=reference.scenes())
-def test_match__cost_is_the_least_of_the_volume(scene):
-    raw, _ = matched(scene)
-    volume = cost_volume(between(*codes_of(scene)), Settings(**reference.settings_of(scene)))
-    np.testing.assert_array_equal(raw.cost, volume.min(axis=2))
 
 
 @few
@@ -193,15 +190,6 @@ def test_match__right_view_of_unusable_pixels():
     _, right_view = bare([[2, 4, 9]], [[2, X, 8, X]], minimum=-1)
     assert right_view.winner.tolist() == [[-1, N, -1, N]]
     assert right_view.cost.tolist() == [[0, X, 1, X]]
-
-
-@bounded
-@given(scene=reference.scenes())
-def test_match__right_view_equals_reference(scene):
-    _, right_view = matched(scene)
-    seen, costs = reference.right_winners(reference.volume_of(scene))
-    np.testing.assert_array_equal(right_view.winner, reference.absolute(seen, scene.minimum))
-    np.testing.assert_array_equal(right_view.cost, costs)
 
 
 @few
@@ -260,20 +248,6 @@ def test_match__left_window_and_no_candidate_stand_together():
         assert raw.validity.item() == LEFT_WINDOW | bit
 
 
-@pytest.mark.parametrize("refine", [True, False])
-@bounded
-@given(scene=reference.scenes())
-def test_match__validity_equals_reference(refine, scene):
-    raw, _ = matched(scene, refine=refine)
-    volume = reference.volume_of(scene)
-    _, refined = reference.vfit(volume, reference.winner_takes_all(volume), scene.minimum)
-    left = reference.window_state(scene.left_state, scene.window)
-    right = reference.window_state(scene.right_state, scene.window)
-    # The pixels' own states are the caller's: left_masked is not set here.
-    expected = reference.validity(np.zeros_like(left), left, right, refined & refine)
-    np.testing.assert_array_equal(raw.validity, expected)
-
-
 @few
 @given(scene=reference.scenes())
 def test_match__pixels_without_candidate_say_why(scene):
@@ -317,14 +291,6 @@ def winners(draw):
 def test_cross_check__equals_reference(views, tolerance):
     expected = reference.cross_check(*views, tolerance)
     np.testing.assert_array_equal(cross_check(*views, tolerance), expected)
-
-
-@few
-@given(scene=reference.scenes())
-def test_cross_check__equals_reference_on_scenes(scene):
-    raw, right_view = matched(scene)
-    views = raw.winner, right_view.winner, scene.minimum
-    np.testing.assert_array_equal(cross_check(*views, 1), reference.cross_check(*views, 1))
 
 
 @few

@@ -22,9 +22,9 @@ from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import Window
 
-bounded = settings(max_examples=100, derandomize=True, deadline=None)
+bounded = settings(max_examples=60, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
-some = settings(max_examples=50, derandomize=True, deadline=None)
+some = settings(max_examples=40, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 ALPHAS = ("0.9", "0.5", "0.98", "1", "0.01", "0.005")
 N = NO_DISPARITY
@@ -375,6 +375,14 @@ def test_match_arrays__equals_reference(seed, config, holes):
     expected = reference.match_arrays(left, right, left_state * 0, right_state * 0, config)
     bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
     check(bands, found["validity"].values, expected)
+    hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
+    shown = (found["validity"].values & hidden) == 0
+    disparity, lower, upper, _ = bands
+    np.testing.assert_array_equal(np.isfinite(disparity), shown)
+    np.testing.assert_array_equal(np.isfinite(lower), shown & (config.interval is not None))
+    if config.interval is not None:
+        assert (lower[shown] <= disparity[shown]).all()
+        assert (disparity[shown] <= upper[shown]).all()
 
 
 @some
@@ -403,23 +411,6 @@ def test_match_arrays__of_images_without_texture_is_certain_of_nothing(minimum, 
     assert (found["lower"].values[valid] == minimum).all()
     assert (found["upper"].values[valid] == maximum).all()
     assert (found["confidence"].values[valid] == 0).all()
-
-
-@some
-@given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3))
-def test_match_arrays__interval_holds_the_disparity(seed, config, holes):
-    left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
-    left[left_state != 0] = np.nan
-    right[right_state != 0] = np.nan
-    found = match_arrays(left, right, config)
-    hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
-    shown = (found["validity"].values & hidden) == 0
-    disparity, lower, upper = (found[name].values for name in ("disparity", "lower", "upper"))
-    np.testing.assert_array_equal(np.isfinite(disparity), shown)
-    np.testing.assert_array_equal(np.isfinite(lower), shown & (config.interval is not None))
-    if config.interval is not None:
-        assert (lower[shown] <= disparity[shown]).all()
-        assert (disparity[shown] <= upper[shown]).all()
 
 
 def test_match_arrays__of_nothing_is_nothing():

@@ -14,7 +14,7 @@ from sat_intervals.kernels.matching import Settings, cost_volume
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.products import IMPOSSIBLE_COST, MASKED, NO_DATA
 
-bounded = settings(max_examples=150, derandomize=True, deadline=None)
+bounded = settings(max_examples=80, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 63, 64, 65, 70, 96, 97)
 X = IMPOSSIBLE_COST
@@ -101,7 +101,7 @@ def test_cost_volume__equals_reference_at_every_count(count, regularized, data):
     np.testing.assert_array_equal(volume(scene), reference.volume_of(scene))
 
 
-@pytest.mark.parametrize("count", [1, 5, 33])
+@pytest.mark.parametrize("count", [1, 33])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (9, 2), (7, 3), (12, 5), (5, 12)])
 @few
 @given(data=st.data())
@@ -113,7 +113,7 @@ def test_cost_volume__equals_reference_on_narrow_and_tall_patches(shape, count, 
     np.testing.assert_array_equal(volume(scene), reference.volume_of(scene))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_cost_volume__equals_reference_around_holes(seed):
     # Holes in the middle of the left image: paths of all directions end before them and restart behind them.
     random = np.random.default_rng(seed)
@@ -152,7 +152,7 @@ def test_cost_volume__penalties_at_their_limit():
     np.testing.assert_array_equal(volume(scene), expected)
 
 
-@bounded
+@few
 @given(scene=reference.scenes())
 def test_cost_volume__possible_costs_stay_within_the_declared_span(scene):
     costs = volume(scene)

@@ -572,6 +572,7 @@ pair.match_pair = lambda *arguments, **options: os.kill(os.getpid(), 9)
 main(sys.argv[1:])"""
 
 
+@pytest.mark.process
 def test_demo__that_was_killed_is_rolled_back_or_replaced_by_the_next(tmp_path, monkeypatch):
     out = tmp_path / "out"
     command = ["demo", str(out), "--size", "120", "140", "--quiet"]
@@ -644,7 +645,6 @@ def test_export__that_fails_keeps_the_files_of_before(finished, tmp_path, monkey
 
 @pytest.mark.parametrize("name", ["report.html", "overview.png"])
 def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, monkeypatch, name):
-    pytest.importorskip("matplotlib")
 
     def write():
         if name == "report.html":
