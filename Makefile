@@ -4,35 +4,45 @@ VENV ?= .venv
 EXTRAS ?= test,lint,plot
 
 BIN := $(VENV)/bin
-READY := $(VENV)/.installed
+READY := $(VENV)/.has-$(EXTRAS)
 
-.PHONY: demo test lint bench tune pictures clean
+# Files run apart, so that what a file prepares is prepared once.
+PYTEST := $(BIN)/python -m pytest $(OPTIONS)
+PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 
-demo: $(READY)
+.PHONY: demo test test-all lint bench tune pictures clean
+
+demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite
+	$(BIN)/sat-intervals plot demo-out
+	$(BIN)/sat-intervals report demo-out
+	@echo 'Open demo-out/overview.png and demo-out/report.html'
 
+# What needs neither services, other extras nor real pairs; three minutes on two cores.
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
+
+# Everything: what starts processes and services runs alone. OPTIONS=--skip-nothing fails what would be skipped.
+test-all: $(READY)
+	$(PYTEST) $(PARALLEL) -m 'not process'
+	$(PYTEST) -m process
 
 lint: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
-	$(BIN)/python -m pytest --quiet tests/test_architecture.py
+	$(PYTEST) --quiet tests/test_architecture.py
 
 # The tables of docs/speed.md: this project beside its peers; about thirteen minutes.
-bench: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
 
 # The tables of docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; about ten minutes.
-tune: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[mccnn]'
+tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/tune.py
 
 # The pictures of README.md and docs; 256 colours keep them small.
-pictures: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dsm,plot]'
+pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --quiet
 	$(BIN)/python docs/pictures/demo_cameras.py demo-out
 	$(BIN)/sat-intervals triangulate demo-out --left-model demo-out/left_model.tif --right-model demo-out/right_model.tif --left-grid demo-out/left_grid.tif --right-grid demo-out/right_grid.tif --quiet
@@ -41,10 +51,14 @@ pictures: $(READY)
 	mkdir -p .github/pictures
 	for name in overview profile dsm; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
-$(READY): pyproject.toml
+# Python compiles what it imports by itself, most of what is installed never.
+$(VENV)/.has-%: pyproject.toml $(VENV)/.made
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[$*]'
+	touch $@
+
+$(VENV)/.made:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "sat-intervals needs Python 3.11 or newer, $(PYTHON) is %d.%d: name another one with make PYTHON=..." % sys.version_info[:2])'
 	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	touch $@
 
 clean:

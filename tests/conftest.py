@@ -1,39 +1,72 @@
-"""What several test modules need."""
+"""Markers and fixtures of all tests."""
 
 import os
-from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+import subprocess
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import hypothesis
 import pytest
 
+pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
+
 # How long an example takes is the machine's affair: a deadline makes tests fail beside others.
 hypothesis.settings.register_profile("project", deadline=None)
 hypothesis.settings.load_profile("project")
 
-ROOT = Path(__file__).parents[1]
+# A test that asks for one of these fixtures has this marker.
+MARKERS = dict.fromkeys(("browser", "bucket", "disk", "slurm", "web_server"), "process") | {"shared_data": "peer"}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--skip-nothing", action="store_true", help="a test that would be skipped fails")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        for fixture in MARKERS.keys() & item.fixturenames:
+            item.add_marker(MARKERS[fixture])
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what ``peer("module", ...)`` marks where a module is not installed."""
+    for name in [name for marker in item.iter_markers("peer") for name in marker.args if find_spec(name) is None]:
+        pytest.skip(f"{name} is not installed")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    report = yield
+    if report.skipped and item.config.getoption("--skip-nothing"):
+        report.outcome = "failed"
+    return report
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real pairs; where it is absent: skip, or fail with SAT_INTERVALS_REQUIRE_SHARED=1."""
-    folder = Path(os.environ.get("SAT_INTERVALS_SHARED", ROOT.parent / "shared")) / "data"
+    """The folder of real pairs."""
+    folder = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
     if not folder.is_dir():
-        message = f"no real pairs in {folder}: SAT_INTERVALS_SHARED names the folder that holds data/"
-        if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1":
-            pytest.fail(message)
-        pytest.skip(message)
+        pytest.skip(f"no real pairs in {folder}: SAT_INTERVALS_SHARED names the folder that holds data/")
     return folder
 
 
-@pytest.fixture(scope="session")
-def mccnn_extra() -> None:
-    """The extra [mccnn]; where it is absent: skip, or fail with SAT_INTERVALS_REQUIRE_SHARED=1."""
-    try:
-        import_module("onnxruntime")
-        version("MCCNN")
-    except (ImportError, PackageNotFoundError) as error:
-        if os.environ.get("SAT_INTERVALS_REQUIRE_SHARED") == "1":
-            raise
-        pytest.skip(f"the extra [mccnn] is not installed: {error}")
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
+    """A function that mounts a disk of so many bytes, or gives it that size."""
+    place = tmp_path / "disk"
+    place.mkdir()
+
+    def of_size(count: int) -> Path:
+        options = f"remount,size={count}" if place.is_mount() else f"size={count}"
+        tried = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", place], capture_output=True, text=True)
+        if tried.returncode:
+            pytest.skip(f"a small disk takes root: {tried.stderr}")
+        return place
+
+    yield of_size
+    if place.is_mount():
+        subprocess.run(["umount", "--lazy", place], check=True)

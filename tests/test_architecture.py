@@ -46,6 +46,12 @@ OVER_THE_LIMITS = {
     "sat_intervals.interop.cars_method.run": "its parameters are those of CARS' method",
 }
 
+# Tests of several modules of a folder, or of what all of them keep.
+LAWS = {
+    "./architecture", "./package", "cli/commands", "cli/messages", "match/accuracy", "match/pandora", "raster/raster",
+    "run/damage", "run/kept_files", "run/survival", "run/waits", "show/pictures",
+}  # fmt: skip
+
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 FOLDERS = {"sat_intervals": ROOT / "sat_intervals"} | {
     package: ROOT / folder for package, folder in PYPROJECT["tool"]["setuptools"]["package-dir"].items()
@@ -122,3 +128,13 @@ def docstring_lines(node: ast.AST) -> range:
 
 def is_callback(node: ast.FunctionDef) -> bool:
     return any(ast.unparse(decorator).startswith("click.command(") for decorator in node.decorator_list)
+
+
+def test_tests__mirror_the_package() -> None:
+    folders = {"cli": ROOT / "cli"}
+    for file in (ROOT / "tests").rglob("test_*.py"):
+        room = file.parent.relative_to(ROOT / "tests").as_posix()
+        tested = folders.get(room, ROOT / "sat_intervals" / room)
+        name = file.stem.removeprefix("test_")
+        assert tested.is_dir(), file
+        assert (tested / name).is_dir() or (tested / f"{name}.py").exists() or f"{room}/{name}" in LAWS, file

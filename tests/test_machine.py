@@ -5,6 +5,7 @@ import re
 import resource
 import subprocess
 import sys
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -149,10 +150,10 @@ def test_usable_memory_and_cores__are_the_least_of_all_limits(tmp_path, monkeypa
     assert machine.usable_cores() == len(os.sched_getaffinity(0))
 
 
-def told(what, prepare):
+def told(what, prepare=None, root="/"):
     """What a new process says of its memory or cores, after it called ``prepare``."""
-    code = f"from sat_intervals.machine import {what}; print({what}())"
-    command = [sys.executable, "-c", code]
+    code = f"from pathlib import Path; from sat_intervals import machine; machine._ROOT = Path({str(root)!r}); "
+    command = [sys.executable, "-c", code + f"print(machine.{what}())"]
     return int(subprocess.run(command, preexec_fn=prepare, capture_output=True, check=True, timeout=60).stdout)
 
 
@@ -164,43 +165,41 @@ def test_usable_cores__are_at_most_those_of_the_affinity():
     assert told("usable_cores", partial(os.sched_setaffinity, 0, {min(os.sched_getaffinity(0))})) == 1
 
 
-@pytest.fixture
-def cgroup(request):
-    """A real cgroup below that of this process, and what a process calls to enter it."""
-    controller = request.param
+def real_cgroup(controller):
+    """A new cgroup below that of this process; None where none can be made."""
     above = list(machine._cgroups(Path("/"), controller))
-    if not above or above[0].parent in above:  # a cgroup belongs to the service that made it, with all below
-        pytest.skip(f"the {controller} cgroup of this process is not the top one in sight: {[*map(str, above)]}")
-    folder = above[0] / f"sat_intervals_{os.getpid()}"
+    if above and above[0].parent not in above:  # others belong to the service that made them, with all below
+        folder = above[0] / f"sat_intervals_{os.getpid()}"
+        with suppress(OSError):
+            folder.mkdir()
+            return folder
+    return None
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("controller", "limits", "what", "expected"),
+    [
+        ("memory", {"memory.max": 2**28, "memory.limit_in_bytes": 2**28}, "usable_memory", 2**28),
+        ("cpu", {"cpu.max": "90000 100000", "cpu.cfs_quota_us": 90000}, "usable_cores", 1),
+    ],
+)
+def test_usable_memory_and_cores__are_at_most_those_of_a_cgroup(tmp_path, controller, limits, what, expected):
+    """A real one where it can be made, else one of a made-up tree."""
+    folder = real_cgroup(controller)
+    known = {folder / name: text for name, text in limits.items() if folder and (folder / name).exists()}
     try:
-        folder.mkdir()
-    except OSError as error:
-        pytest.skip(f"no cgroup can be made: {error}")
-    yield folder, lambda: (folder / "cgroup.procs").write_text(str(os.getpid()))
-    folder.rmdir()
-
-
-def limit(folder, figures):
-    """Write those of the limits that a cgroup knows."""
-    there = {name: text for name, text in figures.items() if (folder / name).exists()}
-    if not there:
-        pytest.skip(f"{folder} has none of {', '.join(figures)}")
-    for name, text in there.items():
-        (folder / name).write_text(text)
-
-
-@pytest.mark.parametrize("cgroup", ["memory"], indirect=True)
-def test_usable_memory__is_at_most_the_limit_of_a_real_cgroup(cgroup):
-    folder, enter = cgroup
-    limit(folder, {"memory.max": str(2**28), "memory.limit_in_bytes": str(2**28)})
-    assert told("usable_memory", enter) == 2**28
-
-
-@pytest.mark.parametrize("cgroup", ["cpu"], indirect=True)
-def test_usable_cores__are_at_most_the_quota_of_a_real_cgroup(cgroup):
-    folder, enter = cgroup
-    limit(folder, {"cpu.max": "90000 100000", "cpu.cfs_quota_us": "90000"})
-    assert told("usable_cores", enter) == 1
+        for file, text in known.items():
+            file.write_text(str(text))
+        if known:
+            found = told(what, lambda: (folder / "cgroup.procs").write_text(str(os.getpid())))
+        else:
+            inside = {f"a/{name}": text for name, text in limits.items()}
+            found = told(what, root=made_up(tmp_path, "0::/a", [V2.format("/")], inside))
+    finally:
+        if folder:
+            folder.rmdir()
+    assert found == expected
 
 
 def test_match__refuses_tiles_that_do_not_fit_in_what_a_job_may_use(tmp_path):

@@ -83,6 +83,7 @@ for name in {[name.removesuffix(".__init__") for name in MODULES]!r}:
 """
 
 
+@pytest.mark.peer("cars", "matplotlib", "onnxruntime", "shareloc")
 def test_modules__importing_them_changes_nothing_of_others() -> None:
     """Other libraries may set at import what they like: theirs are imported before."""
     others = run_python(f"{IMPORT_ALL}import sys; print(*[name for name in sys.modules if name[:4] != 'sat_'])").split()

@@ -1,0 +1,273 @@
+"""Causes that do happen, each told in one line with the way out."""
+
+import logging
+import os
+import resource
+import subprocess
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import COMMAND, invoke
+from rasterio._err import CPLE_OutOfMemoryError
+
+from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
+from sat_intervals.cli import app
+from sat_intervals.config import reading
+from sat_intervals.config.pairs import read_batch
+from sat_intervals.evaluate.dsm import evaluate_surface
+from sat_intervals.products import SURFACE
+from sat_intervals.raster import RUN_FILES, Georeferencing, OutputWriter, Projection, read_window, write_layer, writer
+from sat_intervals.tiling import Window
+
+LOCAL = 'LOCAL_CS["site grid",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+
+
+def write(path, bands, crs="EPSG:32631", tags=None, **options):
+    bands = np.atleast_3d(bands).reshape(-1, *np.shape(bands)[-2:])
+    profile = {"driver": "GTiff", "height": bands.shape[1], "width": bands.shape[2], "count": len(bands)}
+    profile |= {"dtype": bands.dtype, "crs": crs, "transform": rasterio.Affine(1, 0, 3e5, 0, -1, 48e5)}
+    with rasterio.open(path, "w", **profile | options) as file:
+        file.write(bands)
+        file.update_tags(**tags or {})
+        if len(bands) == len(SURFACE):
+            file.descriptions = [band.name for band in SURFACE]
+    return path
+
+
+def ended(*arguments, **options):
+    return subprocess.run(
+        [COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=60, check=False, **options
+    )
+
+
+# ---- Processes ---------------------------------------------------------------------------------------------------
+def limited(*, address_space):
+    return partial(resource.setrlimit, resource.RLIMIT_AS, (address_space, address_space))
+
+
+def test_main__names_a_limit_of_the_address_space():
+    result = ended("match", "a", "b", "c", "--disparity", 0, 4, preexec_fn=limited(address_space=10**9))
+    assert result.stderr == (
+        "sat-intervals: the address space is limited to 1.0 GB, at least 1.5 GB are needed: raise ulimit -v\n"
+    )
+    assert result.returncode == 2
+
+
+@pytest.mark.parametrize("threads", ["0", "many"])
+def test_main__names_a_variable_that_numba_cannot_start_with(threads, monkeypatch):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
+    result = invoke("match", "a", "b", "c", "--disparity", "0", "4")
+    assert result.exit_code == 2
+    assert f"NUMBA_NUM_THREADS is {threads!r}: set it to a number above 0, or not at all" in result.stderr
+
+
+def test_main__names_a_malformed_dask_configuration(tmp_path):
+    (tmp_path / "distributed.yaml").write_text("a: [1\n b: }")
+    image = write(tmp_path / "image.tif", np.ones((9, 9), np.uint8))
+    result = ended(
+        "match", image, image, tmp_path / "out", "--disparity", 0, 4, env=os.environ | {"DASK_CONFIG": str(tmp_path)}
+    )
+    assert result.returncode == 2
+    (line,) = result.stderr.splitlines()
+    assert str(tmp_path / "distributed.yaml") in line
+    assert line.endswith("fix it, or set DASK_CONFIG to another")
+
+
+@pytest.mark.process
+@pytest.mark.skipif(os.geteuid() != 0, reason="a network of its own needs root")
+def test_main__needs_no_network(tmp_path):
+    image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
+    command = ["unshare", "-n", COMMAND, "match", image, image, tmp_path / "out", "--disparity", "-2", "2", "--quiet"]
+    result = subprocess.run(command, capture_output=True, check=False, timeout=300)  # kernels may have to be compiled
+    assert (result.returncode, result.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError("no array"), SystemError("returned NULL"), OSError(12, "Cannot allocate memory")]
+)
+def test_explained__a_failed_allocation_is_a_lack_of_memory(error):
+    status, line = app._explained(error)
+    assert status == 1
+    assert "not enough memory: choose a smaller --tile-size or fewer --workers" in line
+
+
+@pytest.mark.parametrize("arguments", [["config"], ["--help"], ["--version"], ["match", "--help"]])
+def test_main__ends_quietly_when_its_reader_goes(arguments):
+    read, written = os.pipe()
+    os.close(read)
+    result = subprocess.run([COMMAND, *arguments], stdout=written, stderr=subprocess.PIPE, check=False, timeout=60)
+    os.close(written)
+    assert (result.returncode, result.stderr) == (141, b"")
+
+
+def test_main__keeps_the_status_of_an_error_when_the_reader_of_stderr_goes():
+    read, written = os.pipe()
+    os.close(read)
+    result = subprocess.run([COMMAND, "match", "a", "b"], stdout=written, stderr=written, check=False, timeout=60)
+    os.close(written)
+    assert result.returncode == 2
+
+
+def test_main__ends_quietly_when_the_reader_of_its_progress_goes(tmp_path):
+    image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
+    read, written = os.pipe()
+    os.close(read)
+    command = [COMMAND, "match", image, image, tmp_path / "out", "--disparity", "-2", "2"]
+    result = subprocess.run(command, stdout=written, stderr=subprocess.PIPE, check=False, timeout=60)
+    os.close(written)
+    assert (result.returncode, result.stderr) == (141, b"")
+
+
+@pytest.mark.parametrize("argument", ["config", "--help", "--version"])
+def test_main__says_that_stdout_cannot_be_written(argument):
+    with open("/dev/full", "wb") as full:
+        result = subprocess.run([COMMAND, argument], stdout=full, stderr=subprocess.PIPE, check=False, timeout=60)
+    message = b"sat-intervals: stdout cannot be written: No space left on device\n"
+    assert (result.returncode, result.stderr) == (1, message)
+
+
+@pytest.mark.parametrize("error", [CPLE_OutOfMemoryError(3, 2, "no block"), OSError(12, "Cannot allocate memory")])
+def test_output_writer__tells_a_lack_of_memory_from_a_full_disk(tmp_path, monkeypatch, error):
+    def fail(*arguments, **options):
+        raise error
+
+    with OutputWriter(tmp_path, RUN_FILES, 9, 9, Georeferencing(), {}) as files:
+        monkeypatch.setattr(writer, "copy", fail)
+        monkeypatch.setattr(writer.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
+        with pytest.raises(SatIntervalsError, match=r"tif cannot be written: not enough memory \(") as caught:
+            files.build()
+    assert "space" not in str(caught.value)
+
+
+def test_main__tells_of_a_line_break_in_a_path_in_one_line(tmp_path):
+    pages = write(tmp_path / "pa\nges.tif", np.ones((9, 9), np.uint8))
+    write(pages, np.ones((9, 9), np.uint8), APPEND_SUBDATASET="YES")
+    result = invoke("plan", str(pages), "no\n\x1b[2Jne.tif", "--disparity", "0", "4")
+    assert result.exit_code == 2
+    warning, error = result.stderr.splitlines()
+    assert "pa\\nges.tif has 2 pages" in warning
+    assert "no\\n\\x1b[2Jne.tif cannot be read" in error
+
+
+# ---- Settings and lists ------------------------------------------------------------------------------------------
+def test_read_batch__names_what_cannot_be_read_and_names_that_are_too_long(tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"nope.csv cannot be read: No such file or directory: "):
+        read_batch(tmp_path / "nope.csv")
+    (tmp_path / "pairs.csv").write_text(f"name,left,right\n{201 * 'a'},l,r\n")
+    with pytest.raises(SatIntervalsError, match=r"row 1: name 'a+' cannot be .*: choose another of at most 200 bytes$"):
+        read_batch(tmp_path / "pairs.csv")
+
+
+def test_load_config__warns_once_of_penalties_that_are_not_of_the_preset(caplog):
+    satellite = {"preset": "satellite", "disparity": {"minimum": 0, "maximum": 9}}
+    mccnn = {"cost": {"method": "mccnn"}}
+    reading._warn.cache_clear()
+    load_config(satellite)
+    load_config(satellite | {"preset": "satellite-mccnn"}, mccnn)
+    load_config(satellite, mccnn | {"sgm": {"p2": 4, "span": 45}})
+    assert not caplog.records
+    for _ in range(2):
+        load_config(load_config(satellite, mccnn))
+    (record,) = caplog.records
+    assert "preset satellite has no penalties for cost.method mccnn" in record.getMessage()
+    assert "--preset satellite-mccnn" in record.getMessage()
+
+
+def test_load_config__refuses_a_preset_that_would_change_nothing_of_a_config():
+    config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 9}})
+    with pytest.raises(SatIntervalsError, match="preset 'urban' has no effect on a Config"):
+        load_config(config, {"preset": "urban"})
+    assert load_config(config, {"preset": "satellite"}) == config
+
+
+# ---- Images ------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("how", ["cut", "source"])
+def test_plan__of_an_image_that_cannot_be_read_speaks_of_no_run(tmp_path, how):
+    image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
+    bad = tmp_path / "bad.vrt"
+    if how == "cut":
+        write_layer(bad, np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8), 0, Georeferencing())
+        os.truncate(bad, bad.stat().st_size - 2000)
+    else:
+        bad.write_text(
+            '<VRTDataset rasterXSize="64" rasterYSize="64"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+            "<SourceFilename>nowhere.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+        )
+    result = invoke("plan", str(bad), str(image), "--disparity", "-2", "2")
+    (line,) = result.stderr.splitlines()
+    assert f"a sample of the pair cannot be matched: {bad} cannot be read at rows 0 to 63" in line
+    assert "--overwrite" not in line
+    assert result.exit_code == 1
+
+
+def test_open_image__refuses_a_colour_table(tmp_path):
+    path = write(tmp_path / "palette.tif", np.ones((9, 9), np.uint8))
+    with rasterio.open(path, "r+") as file:
+        file.write_colormap(1, {0: (0, 0, 0, 255), 1: (255, 0, 0, 255)})
+    with pytest.raises(
+        SatIntervalsError, match=r"palette.tif: band 1 has a colour table.* gdal_translate -expand gray"
+    ):
+        open_image(path)
+
+
+def test_open_image__warns_of_further_pages(tmp_path, caplog):
+    pixels = np.ones((9, 9), np.uint8)
+    path = write(tmp_path / "pages.tif", pixels)
+    open_image(path)
+    assert not caplog.records
+    write(path, pixels + 1, APPEND_SUBDATASET="YES")
+    caplog.set_level(logging.WARNING)
+    open_image(path)
+    (record,) = caplog.records
+    assert f"{path} has 2 pages: the first is used; name another as GTIFF_DIR:2:{path}" in record.getMessage()
+    assert open_image(f"GTIFF_DIR:2:{path}").height == 9
+
+
+def test_read_window__refuses_integers_that_no_float_holds(tmp_path):
+    pixels = 2**60 + np.arange(81, dtype=np.int64).reshape(9, 9)
+    with pytest.raises(SatIntervalsError, match=r"int64 values such as 1152921504606846976, beyond 2\^53"):
+        read_window(open_image(write(tmp_path / "large.tif", pixels)), Window(0, 0, 9, 9))
+    pixels[1:] = 2**53
+    kept, state = read_window(open_image(write(tmp_path / "some.tif", pixels, nodata=None)), Window(1, 0, 8, 9))
+    assert (kept == 2**53).all()
+    assert not state.any()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_match_arrays__refuses_integers_that_no_float_holds(sign):
+    pixels = sign * (2**60 + np.arange(81, dtype=np.int64).reshape(9, 9))
+    with pytest.raises(SatIntervalsError, match="the left array has int64 values that float64 cannot represent"):
+        match_arrays(pixels, pixels, {"disparity": {"minimum": 0, "maximum": 1}})
+
+
+# ---- Maps and heights --------------------------------------------------------------------------------------------
+def test_projection__refuses_a_map_whose_metres_are_none():
+    with pytest.raises(
+        SatIntervalsError, match=r"a metre of EPSG:3857 is 0.724 m on the ground .* such as its UTM zone EPSG:32631"
+    ):
+        Projection("EPSG:3857").check(1.4, 43.6)
+    for crs in ("EPSG:32631", "EPSG:32632", "EPSG:2154"):
+        Projection(crs).check(1.4, 43.6)
+
+
+def dsm(path, heights):
+    bands = np.stack([np.full((9, 9), value, np.float32) for value in (10, 9, 11, 1, 1, 1)])
+    return write(path, bands, tags={"HEIGHTS": heights})
+
+
+def test_evaluate_surface__refuses_a_reference_above_a_geoid(tmp_path):
+    reference = write(tmp_path / "reference.tif", np.full((9, 9), 10, np.float32), crs="EPSG:32631+5773")
+    surface = dsm(tmp_path / "dsm.tif", "above the WGS 84 ellipsoid")
+    with pytest.raises(SatIntervalsError, match=r"reference.tif has heights of EGM96 height, .* with --geoid"):
+        evaluate_surface(surface, reference)
+    above_geoid = dsm(tmp_path / "geoid.tif", "above egm96.gtx")
+    assert evaluate_surface(above_geoid, reference)["all"]["accuracy"] == 1
+
+
+def test_evaluate_surface__refuses_a_reference_of_a_local_crs(tmp_path):
+    reference = write(tmp_path / "reference.tif", np.full((9, 9), 10, np.float32), crs=LOCAL)
+    with pytest.raises(SatIntervalsError, match=r"the CRS of .*reference.tif, site grid, is a local one: give a"):
+        evaluate_surface(dsm(tmp_path / "dsm.tif", "above the WGS 84 ellipsoid"), reference)

@@ -1,0 +1,489 @@
+"""Metrics of merit against a slow twin, of maps, of runs on disk, of real pairs, and as the command prints them."""
+
+import json
+import re
+import shutil
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rasterio
+import reference_evaluation
+from helpers import invoke, write_pair
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sat_intervals import match_pair
+from sat_intervals.config.pairs import find_pairs, group_beside
+from sat_intervals.demo import make_scene
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.evaluate.disparity import evaluate, evaluate_run
+from sat_intervals.evaluate.metrics import Criteria
+from sat_intervals.evaluate.paper import SceneMetrics, table_1
+from sat_intervals.match.postprocess import cut_rows
+from sat_intervals.products import INVALID, OCCLUSION, Bands
+from sat_intervals.tiling import Window
+
+some = settings(max_examples=50, derandomize=True, deadline=None)
+NAN = float("nan")
+
+
+def same(found, expected, **tolerance):
+    """Two reports hold the same figures."""
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys()
+        for key in expected:
+            same(found[key], expected[key], **tolerance)
+    elif isinstance(expected, list):
+        assert len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            same(one, other, **tolerance)
+    elif expected is None:
+        assert found is None
+    else:
+        assert found == pytest.approx(expected, **tolerance)
+
+
+def rows_of(scene):
+    flags = np.where(scene.valid, 0, OCCLUSION).astype(np.uint16)
+    return Bands(scene.disparity, scene.lower, scene.upper, scene.confidence, flags, scene.truth)
+
+
+def cut_into(rows, heights):
+    """The rows in strips, lastly what the heights leave."""
+    edges = [0, *np.cumsum(heights).clip(max=rows.truth.shape[0]), rows.truth.shape[0]]
+    return [cut_rows(rows, a, b) for a, b in pairwise(edges) if b > a]
+
+
+@st.composite
+def scenes(draw):
+    """Maps of halves and quarters of a pixel, with holes, criteria to judge them by, and heights of strips."""
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    shape = int(random.integers(1, 12)), int(random.integers(1, 12))
+    minimum, maximum = -4, draw(st.sampled_from([-4, 4, 12]))
+    disparity = random.integers(2 * minimum, 2 * maximum + 1, shape) / 2
+    spread = draw(st.sampled_from([0, 3, 8]))
+    lower = np.maximum(disparity - random.integers(0, spread + 1, shape) / 2, minimum)
+    upper = np.minimum(disparity + random.integers(0, spread + 1, shape) / 2, maximum)
+    truth = disparity + random.integers(-6, 9, shape) / 4 * draw(st.sampled_from([0, 1, 1, 5]))
+    confidence = random.choice([0, 0.3, 0.55, 0.6, 0.601, 0.8, 1, NAN], shape).astype(np.float32)
+    holes = draw(st.sampled_from([0, 0.2, 1]))
+    lower[random.random(shape) < holes / 2] = NAN
+    truth[random.random(shape) < holes] = NAN
+    scene = SimpleNamespace(
+        disparity=disparity.astype(np.float32),
+        lower=lower.astype(np.float32),
+        upper=upper.astype(np.float32),
+        confidence=confidence,
+        valid=random.random(shape) < 0.8,
+        truth=truth,
+    )
+    depth, kernel = draw(st.integers(0, 3)), draw(st.sampled_from([1, 3, 5]))
+    criteria = Criteria(minimum, maximum, 0.6, kernel, depth, draw(st.sampled_from([0.0, 0.25])))
+    return scene, criteria, draw(st.lists(st.integers(1, 5), max_size=6))
+
+
+# ---- Maps --------------------------------------------------------------------------------------------------
+@some
+@given(scenes(), st.booleans(), st.booleans())
+def test_evaluate__equals_the_slow_twin(drawn, remove_bias, with_rejected):
+    scene, criteria, heights = drawn
+    how = {"remove_bias": remove_bias, "with_rejected": with_rejected}
+    found = evaluate(lambda: cut_into(rows_of(scene), heights), criteria, **how)
+    expected = reference_evaluation.evaluate(scene, criteria, **how)
+    # ratios of errors and widths are counted to 0.001, everything else here is exact
+    same(found, expected, abs=0.0005 + 1e-9)
+    for report in (found, expected):
+        del report["low"]["relative_overestimation"], report["with_rejected"]
+    same(found, expected, rel=1e-12)
+
+
+@some
+@given(scenes(), st.booleans())
+def test_evaluate__strips_equal_the_whole(drawn, remove_bias):
+    scene, criteria, heights = drawn
+    whole = evaluate(lambda: [rows_of(scene)], criteria, remove_bias=remove_bias, with_rejected=True)
+    strips = evaluate(lambda: cut_into(rows_of(scene), heights), criteria, remove_bias=remove_bias, with_rejected=True)
+    same(strips, whole, rel=1e-12)
+
+
+EXAMPLE = SimpleNamespace(
+    truth=np.array([[1, 2, 3, NAN, 5], [0, 1, 7, 2, 4]]),
+    disparity=np.array([[1, 2.5, 6, 4, 5], [0.5, 4, 5, 2, 0]], np.float32),
+    lower=np.array([[0, 3, 2, 3, 4], [0, 0, 4, 2, 0]], np.float32),
+    upper=np.array([[2, 4, 8, 6, 6], [1, 4, 8, 2, 2]], np.float32),
+    confidence=np.array([[0.9, 0.5, 0.5, 0.4, 0.7], [0.2, 1.0, 0.6, 0.9, 0.3]], np.float32),
+    valid=np.array([[1, 1, 1, 1, 1], [1, 1, 1, 1, 0]], bool),
+)
+
+
+def test_evaluate__worked_example():
+    # Search range -2 .. 8; low up to confidence .6, kernel 1, depth 1. Judged are 8 valid pixels of known truth.
+    #   inside  y n y . y / y y y y     7 of 8; widths 2 1 6 . 2 / 1 4 4 0, their median 2 of 10, their mean 20 / 8
+    #   low     . L L L . / L . L . L   segments of columns 1-3 above, and 0, 2, 4 below: the first and column 2 touch
+    #   high    4 of 4, widths 2 2 4 0: median 2, mean 2;   low   3 of 4, widths 1 6 1 4: median 2.5, mean 3
+    #   errors  0 .5 3 . 0 / .5 3 2 0 (4)    three above 1, none above 3
+    #   area    3 on the touching segments, .5 on column 0 below
+    #   1 - area / width: 1 - 3/1 = -2, 1 - 3/6 = .5, 1 - .5/1 = .5, 1 - 3/4 = .25: median .375
+    #   with the rejected pixel, a miss of error 4 alone in its area, width 2: 1 - 4/2 = -1, median .25
+    #   disparity - truth: 0 .5 3 . 0 / .5 3 -2 0: median .25
+    criteria = Criteria(-2, 8, 0.6, 1, 1)
+    report = evaluate(lambda: [rows_of(EXAMPLE)], criteria, with_rejected=True)
+    assert report["all"] == {"count": 8, "accuracy": 0.875, "relative_size": 0.2, "mean_width": 2.5}
+    assert report["high"] == {"count": 4, "accuracy": 1, "relative_size": 0.2, "mean_width": 2}
+    low = report["low"]
+    assert low == {
+        "count": 4, "accuracy": 0.75, "relative_size": 0.25, "mean_width": 3, "relative_overestimation": 0.375
+    }  # fmt: skip
+    assert (report["bad1"], report["bad3"], report["truth_outside_range"]) == (0.375, 0, 0)
+    assert report["with_rejected"]["all"]["count"] == 9
+    assert report["with_rejected"]["low"]["accuracy"] == 0.6
+    assert report["with_rejected"]["low"]["relative_overestimation"] == 0.25
+    # confidences .2 .5 .5 .6 .7 .9 .9 1: the middles of their ranks .5, 2, 3.5, 4.5, 6, 7.5 of 8 are in six deciles
+    assert [decile["confidence"][0] for decile in report["deciles"]] == [0.2, 0.5, 0.6, 0.7, 0.9, 1.0]
+    assert [decile["count"] for decile in report["deciles"]] == [1, 2, 1, 1, 2, 1]
+    assert [decile["accuracy"] for decile in report["deciles"]] == [1, 0.5, 1, 1, 1, 1]
+    assert evaluate(lambda: [rows_of(EXAMPLE)], criteria, remove_bias=True)["bias"] == 0.25
+
+
+def test_evaluate__bias_that_is_removed_leaves_the_figures_of_none():
+    shifted = SimpleNamespace(**vars(EXAMPLE) | {"truth": EXAMPLE.truth - 3})
+    criteria = Criteria(-2, 8, 0.6, 1, 1)
+    one, other = (
+        evaluate(lambda scene=scene: [rows_of(scene)], criteria, remove_bias=True) for scene in (EXAMPLE, shifted)
+    )
+    assert (one.pop("bias"), other.pop("bias")) == (0.25, 3.25)
+    same(other, one, rel=1e-12)
+
+
+def test_evaluate__without_confidence_all_is_high():
+    scene = SimpleNamespace(**vars(EXAMPLE) | {"confidence": np.full((2, 5), NAN, np.float32)})
+    report = evaluate(lambda: [rows_of(scene)], Criteria(-2, 8, 0.6, 5, 2))
+    assert report["high"] == report["all"]
+    assert report["low"]["count"] == 0
+    assert report["low"]["relative_overestimation"] is None
+    assert report["deciles"] == []
+
+
+# ---- Runs on disk ------------------------------------------------------------------------------------------
+def write(path, pixels, nodata):
+    profile = {"driver": "GTiff", "height": pixels.shape[0], "width": pixels.shape[1], "count": 1}
+    transform = rasterio.Affine(0.5, 0, 300000, 0, -0.5, 4800000)
+    with rasterio.open(path, "w", dtype=pixels.dtype, nodata=nodata, transform=transform, **profile) as file:
+        file.write(pixels, 1)
+
+
+def small_pair(folder, seed, group="synthetic"):
+    """A folder of a pair of 70 x 90 pixels, as `find_pairs` takes it."""
+    folder.mkdir()
+    write_pair(folder, make_scene(70, 90, seed=seed), group=group)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    return small_pair(tmp_path_factory.mktemp("pair") / "one", 1)
+
+
+def settings_of(folder, **more):
+    (pair,) = find_pairs([folder])
+    return {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}, **more}
+
+
+@pytest.fixture(scope="module")
+def run(pair, tmp_path_factory):
+    """A run that kept rejected pixels."""
+    out = tmp_path_factory.mktemp("run") / "out"
+    match_pair(pair / "left.tif", pair / "right.tif", out, settings_of(pair, products={"keep_rejected": True}))
+    return out
+
+
+def read(path):
+    with rasterio.open(path) as file:
+        return file.read()
+
+
+def scene_of(out, truth):
+    disparity, lower, upper, confidence = read(out / "intervals.tif")
+    valid = read(out / "validity.tif")[0] & INVALID == 0
+    return SimpleNamespace(
+        disparity=disparity, lower=lower, upper=upper, confidence=confidence, valid=valid, truth=truth
+    )
+
+
+def criteria_of(out, tolerance=0.0):
+    report = json.loads((out / "run.json").read_text())["settings"]
+    names = {"kernel", "threshold", "depth"}
+    low = {name: value for name, value in report["regularization"].items() if name in names}
+    return SimpleNamespace(**report["disparity"], **low, tolerance=tolerance)
+
+
+def test_evaluate_run__equals_the_slow_twin(pair, run, tmp_path, monkeypatch):
+    truth = read(pair / "truth.tif")[0]
+    mask = np.random.default_rng(0).integers(0, 2, truth.shape).astype(np.uint8)
+    write(tmp_path / "mask.tif", mask, None)
+    found = evaluate_run(run, mask=tmp_path / "mask.tif", tolerance=0.25, remove_bias=True)
+    assert found.pop("cost") == "census"
+    scene = scene_of(run, np.where(mask != 0, truth, np.nan))
+    expected = reference_evaluation.evaluate(scene, criteria_of(run, 0.25), remove_bias=True, with_rejected=True)
+    assert expected["all"]["count"] < expected["with_rejected"]["all"]["count"]
+    assert found["bias"] == pytest.approx(expected["bias"], abs=0.0005)
+    same(found, expected, abs=0.003)  # of the bias, which decides where the truth lies in its interval
+
+    monkeypatch.setattr("sat_intervals.results._STRIP", 9 * 90)
+    monkeypatch.setattr("sat_intervals.evaluate.disparity._PIXELS", 4 * 90)
+    same(
+        evaluate_run(run, mask=tmp_path / "mask.tif", tolerance=0.25, remove_bias=True) | {"cost": 0},
+        found | {"cost": 0},
+    )
+
+
+def test_evaluate_run__of_a_region_takes_its_truth_or_the_whole(pair, tmp_path):
+    window = Window(20, 30, 40, 50)
+    match_pair(pair / "left.tif", pair / "right.tif", tmp_path / "out", settings_of(pair), window=window)
+    part = read(pair / "truth.tif")[0][window.slices]
+    write(tmp_path / "part.tif", np.where(np.isnan(part), -999, part).astype(np.float32), -999)
+    whole = evaluate_run(tmp_path / "out", pair / "truth.tif")
+    assert whole["all"]["count"] > 100
+    assert evaluate_run(tmp_path / "out", tmp_path / "part.tif") == whole
+    assert whole["with_rejected"] is None
+    write(tmp_path / "other.tif", part[1:], NAN)
+    with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 70 x 90, the run 40 x 50"):
+        evaluate_run(tmp_path / "out", tmp_path / "other.tif")
+
+
+def test_evaluate_run__says_what_is_missing(run, pair, tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"run.json: No such file or directory: give the folder of a finished"):
+        evaluate_run(tmp_path)
+    lonely = tmp_path / "lonely"
+    lonely.mkdir()
+    for name in ("left.tif", "right.tif"):
+        shutil.copy(pair / name, lonely)
+    match_pair(lonely / "left.tif", lonely / "right.tif", tmp_path / "out", settings_of(pair))
+    with pytest.raises(SatIntervalsError, match=r"no truth.tif beside its left image .*left.tif: give --truth"):
+        evaluate_run(tmp_path / "out")
+    assert group_beside(lonely / "left.tif") == "all"
+    off = {"interval": None, "regularization": None}
+    match_pair(pair / "left.tif", pair / "right.tif", tmp_path / "off", settings_of(pair, **off))
+    with pytest.raises(SatIntervalsError, match="has no intervals"):
+        evaluate_run(tmp_path / "off")
+    (tmp_path / "off" / "run.json").write_text("{")
+    with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run"):
+        evaluate_run(tmp_path / "off")
+
+
+# ---- Tables and pairs --------------------------------------------------------------------------------------
+def report_of(accuracy):
+    area = {"accuracy": accuracy, "relative_size": 0.1, "relative_overestimation": None}
+    return {"cost": "census", "all": area, "high": area, "low": area, "with_rejected": None}
+
+
+def test_table_1__means_by_group_beside_the_paper():
+    names = ("a", "middlebury2003"), ("b", "satellite"), ("c", "middlebury2003")
+    scenes = [SceneMetrics(*name, report_of(accuracy)) for name, accuracy in zip(names, (0.8, 0.9, 0.95), strict=True)]
+    rows = table_1(scenes)
+    assert [row.label for row in rows] == ["middlebury2003", "paper", "reference", "satellite"]
+    assert rows[0].figures["acc."] == pytest.approx(0.875)
+    assert rows[0].figures["overest."] is None
+    assert (rows[0].scenes, rows[0].at_objective, rows[3].at_objective) == (2, 1, 1)
+    assert rows[1].figures["low size"] == 0.183
+    assert rows[2].figures["high acc."] is None
+
+
+def test_table_1__costs_of_a_group_stand_together():
+    names = ("a", "middlebury2003", "census"), ("b", "satellite", "census"), ("a", "middlebury2003", "mccnn")
+    rows = table_1([SceneMetrics(name, group, report_of(0.9) | {"cost": cost}) for name, group, cost in names])
+    labels = [row.label for row in rows if row.scenes]
+    assert labels == ["middlebury2003 census", "middlebury2003 mccnn", "satellite census"]
+    assert [row.figures["acc."] for row in rows if row.label == "paper"] == [0.973, 0.954]
+
+
+@pytest.mark.parametrize(
+    ("meta", "message"),
+    [
+        ("[", "meta.json cannot be read"),
+        ("3", "meta.json holds int"),
+        ('{"disparity": [1]}', r"disparity is \[1\], needed: \[minimum, maximum\]"),
+        (None, "meta.json missing; a pair is a folder of left.tif, right.tif, truth.tif, meta.json"),
+    ],
+)
+def test_find_pairs__says_what_is_wrong_with_a_folder(tmp_path, meta, message):
+    for name in ("left", "right", "truth"):
+        (tmp_path / f"{name}.tif").touch()
+    if meta:
+        (tmp_path / "meta.json").write_text(meta)
+    with pytest.raises(SatIntervalsError, match=message):
+        find_pairs([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "left,right,minimum,maximum\na,b,1,2\n",
+            "row 1 lacks truth: give a list of pairs, each with left, right, truth",
+        ),
+        ("left,right,truth,minimum,maximum\n", "pairs.csv holds no pairs: give a list of pairs, each with left, right"),
+        ("left,right,truth,minimum,maximum,name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
+        ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "row 1: minimum '1', maximum 'x', needed: integers"),
+        (
+            "left,right,truth,minimum,maximum\na,b,c,1,2\na,d,e,3,4\n",
+            "2 pairs or runs are called a: give each its own name",
+        ),
+    ],
+)
+def test_find_pairs__says_what_is_wrong_with_a_table(tmp_path, text, message):
+    (tmp_path / "pairs.csv").write_text(text)
+    with pytest.raises(SatIntervalsError, match=message):
+        find_pairs([tmp_path / "pairs.csv"])
+
+
+def test_find_pairs__of_a_table(tmp_path):
+    (tmp_path / "pairs.csv").write_text(
+        "name,truth,left,right,minimum,maximum,group\none,t.tif,l.tif,r.tif,-3,4,city\n,t.tif,l.tif,/r.tif,0,1,\n"
+    )
+    one, two = find_pairs([tmp_path / "pairs.csv"])
+    with_mark = tmp_path / "marked.csv"  # as spreadsheets write it
+    with_mark.write_bytes(b"\xef\xbb\xbf" + (tmp_path / "pairs.csv").read_bytes())
+    assert find_pairs([with_mark]) == [one, two]
+    assert (one.name, one.group, one.minimum, one.maximum) == ("one", "city", -3, 4)
+    assert (one.left, str(two.right)) == (tmp_path / "l.tif", "/r.tif")
+    assert (two.name, two.group) == ("l.tif", "all")
+
+
+# ---- The command -------------------------------------------------------------------------------------------
+def command(*arguments):
+    result = invoke(*arguments)
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_command__says_that_nothing_is_judged(run, tmp_path):
+    with rasterio.open(run / "validity.tif") as dataset:
+        write(tmp_path / "nowhere.tif", np.zeros(dataset.shape, np.uint8), 255)
+    status, text, _ = command("evaluate", run, "--mask", tmp_path / "nowhere.tif")
+    assert status == 0
+    assert "no valid pixel has a known truth: check truth and mask" in text
+
+
+def test_command__suggests_a_tolerance_for_a_truth_of_whole_pixels(run, pair, tmp_path):
+    with rasterio.open(pair / "truth.tif") as dataset:
+        write(tmp_path / "whole.tif", np.rint(dataset.read(1)), float("nan"))
+    assert command("evaluate", run)[2] == ""
+    says = f"warning: the truth of {run} has whole pixels only: try --tolerance 0.5\n"
+    assert command("evaluate", run, "--json", "--truth", tmp_path / "whole.tif")[2] == says
+    assert command("evaluate", run, "--truth", tmp_path / "whole.tif", "--tolerance", "0.5")[2] == ""
+
+
+def test_command__prints_the_form_of_json(run):
+    status, text, _ = command("evaluate", run, "--json")
+    report = json.loads(text)
+    assert status == 0
+    assert report == json.loads(json.dumps(evaluate_run(run)))
+    assert set(report["all"]) == set(report["high"]) == {"count", "accuracy", "relative_size", "mean_width"}
+    assert set(report["low"]) == {*report["all"], "relative_overestimation"}
+    assert {"bad1", "bad3", "deciles", "with_rejected", "tolerance", "bias"} < set(report)
+
+
+def test_command__prints_one_run(run, pair):
+    status, text, _ = command("evaluate", run, "--truth", pair / "truth.tif", "--tolerance", "0.25", "--remove-bias")
+    assert status == 0
+    lines = text.splitlines()
+    assert lines[0] == str(run)
+    assert lines[2].startswith("all pixels ")
+    figures = evaluate_run(run, tolerance=0.25, remove_bias=True)
+    assert lines[2].split()[2:5] == [str(figures["all"]["count"])] + [
+        f"{figures['all'][name]:.3f}" for name in ("accuracy", "relative_size")
+    ]
+    assert "truth up to 0.25 px outside an interval counts as inside" in lines
+    assert f"median of disparity - truth, added to the truth: {figures['bias']:.3f} px" in lines
+    assert len(lines[lines.index("by decile of confidence") :]) == 2 + len(figures["deciles"])
+
+
+def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
+    other = small_pair(tmp_path / "two", 2)
+    rows = [(pair, "one"), (other, "two")]
+    (tmp_path / "pairs.csv").write_text(
+        "left,right,truth,minimum,maximum,name,group\n"
+        + "".join(
+            f"{folder}/left.tif,{folder}/right.tif,{folder}/truth.tif,{p.minimum},{p.maximum},{name},{p.group}\n"
+            for folder, name in rows
+            for p in find_pairs([folder])
+        )
+    )
+    status, text, told = command("evaluate", tmp_path / "pairs.csv", run, "--json")
+    assert status == 0
+    assert told == "matching one\nmatching two\n"
+    reports = json.loads(text)
+    assert list(reports) == ["one", "two", str(run)]
+    assert reports["one"] == reports[str(run)]
+    status, text, _ = command("evaluate", pair, other)
+    assert status == 0
+    label, scenes, reached, accuracy, *_ = text.splitlines()[2].split()
+    assert (label, scenes) == ("synthetic", "2")
+    accuracies = [reports[name]["all"]["accuracy"] for name in ("one", "two")]
+    assert int(reached) == sum(value >= 0.9 for value in accuracies)
+    assert accuracy == f"{np.mean(accuracies):.3f}"
+
+
+def test_command__errors_are_one_line(run, tmp_path):
+    assert command("evaluate", tmp_path)[::2] == (
+        2,
+        f"sat-intervals: {tmp_path}/run.json: No such file or directory: give the folder of a finished run\n",
+    )
+    assert "--truth is given 1 times for 2 OUT" in command("evaluate", run, tmp_path, "--truth", "x.tif")[2]
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1"])
+@pytest.mark.parametrize("name", ["evaluate", "ablate"])
+def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
+    status, _, told = command(name, run, "--tolerance", value)
+    assert (status, told.count("\n")) == (2, 1)
+    assert "Invalid value for '--tolerance'" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["RUN", "--accurate"], "--accurate applies to pairs, but every OUT is a finished run: leave it out"),
+        (["RUN", "--config", "nope.yaml"], "--config nope.yaml applies to pairs"),
+        (["RUN", "--cost", "census"], "--cost census applies to pairs"),
+        (["RUN", "OTHER/../out"], "out is given 2 times: give it once"),
+        (["PAIR", "PAIR/../one"], "2 pairs or runs are called|/one/left.tif is given 2 times: give it once"),
+        (["PAIR", "PAIR"], "2 pairs or runs are called .*/one: give each its own name"),
+        (["PAIR", "--config", "OFF"], "off.yaml: interval is null, but evaluate needs intervals: leave it on"),
+        (["PAIR", "--config", "nope.yaml"], "nope.yaml"),
+        (
+            ["nothere.csv"],
+            "nothere.csv cannot be read: No such file or directory: give a list of pairs",
+        ),
+    ],
+)
+def test_command__refuses_before_it_matches(run, pair, tmp_path, arguments, says):
+    (tmp_path / "off.yaml").write_text("interval: null\nregularization: null\n")
+    names = {"RUN": run, "OTHER/": f"{run}/", "PAIR": pair, "OFF": tmp_path / "off.yaml"}
+    for name, place in names.items():
+        arguments = [argument.replace(name, str(place)) for argument in arguments]
+    status, _, told = command("evaluate", *arguments)
+    assert (status, told.count("\n")) == (2, 1)
+    assert re.search(says, told.strip())
+
+
+# ---- Real pairs --------------------------------------------------------------------------------------------
+REFERENCE = {2003: (0.975, 0.035), 2005: (0.959, 0.026)}
+PAPER = {2003: (0.973, 0.033), 2005: (0.963, 0.026)}
+
+
+@pytest.mark.parametrize("year", [2003, 2005])
+@pytest.mark.parametrize("flags", [[], ["--accurate"]])
+def test_command__reproduces_the_paper(shared_data, year, flags):
+    folders = sorted(shared_data.glob(f"mb{year}_*"))
+    status, text, _ = command("evaluate", *folders, *flags)
+    assert status == 0
+    label, scenes, reached, accuracy, size, *_ = text.splitlines()[2].split()
+    assert (label, scenes, reached) == (f"middlebury{year}", str(len(folders)), str(len(folders)))
+    for known in (REFERENCE[year], PAPER[year]):
+        assert float(accuracy) == pytest.approx(known[0], abs=0.01)
+        assert float(size) == pytest.approx(known[1], abs=0.01)
+    assert text.splitlines()[3].split()[:3] == ["paper", f"{PAPER[year][0]:.3f}", f"{PAPER[year][1]:.3f}"]
+    assert text.splitlines()[4].split()[:3] == ["reference", f"{REFERENCE[year][0]:.3f}", f"{REFERENCE[year][1]:.3f}"]

@@ -1,0 +1,363 @@
+"""Points and heights: cameras of known geometry, shareloc's own points, a real pair and a peer's surface of it."""
+
+import csv
+from contextlib import suppress
+
+import numpy as np
+import pytest
+import rasterio
+from finished import MAXIMUM, MINIMUM, write_run
+from helpers import invoke, write_pair
+from rasterio.rpc import RPC
+from rasterio.transform import Affine
+from rasterio.warp import reproject
+
+from sat_intervals import SatIntervalsError, match_pair
+from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
+from sat_intervals.heights.dsm import make_surface
+from sat_intervals.products import INVALID, POINTS
+from sat_intervals.tiling import Window
+
+with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
+    from sat_intervals.heights.sensors import Lattice, Sensors
+    from sat_intervals.heights.triangulate import triangulate
+
+pytestmark = [
+    pytest.mark.peer("shareloc"),
+    pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),  # as epipolar images are
+]
+
+# Where the scene stands, and metres in a degree there, of longitude and of latitude.
+LONGITUDE, LATITUDE = 1.45, 43.6
+EAST, NORTH = 80_700.0, 111_110.0
+BAND = {band.name: index for index, band in enumerate(POINTS)}
+
+
+def camera(path, view, longitude=LONGITUDE):
+    """Write the RPC of a view of the procedural scene: column = u + a (h - h0), row down the latitudes."""
+    scale = 0.01, 60.0  # degrees, metres; over a few metres lines in degrees are straight
+    column, line, one = np.zeros(20), np.zeros(20), np.eye(20)[0]
+    column[1], column[3] = EAST / PIXEL * scale[0], VIEWS[view] * scale[1]
+    line[2] = -NORTH / PIXEL * scale[0]
+    rpc = RPC(
+        line_off=0.0, line_scale=1.0, samp_off=0.0, samp_scale=1.0,
+        lat_off=LATITUDE, lat_scale=scale[0], long_off=longitude, long_scale=scale[0],
+        height_off=DATUM, height_scale=scale[1],
+        line_num_coeff=list(line), line_den_coeff=list(one), samp_num_coeff=list(column), samp_den_coeff=list(one),
+    )  # fmt: skip
+    with rasterio.open(
+        path, "w", driver="GTiff", height=8, width=8, count=1, dtype="uint8", crs="EPSG:4326", rpcs=rpc
+    ) as dataset:
+        dataset.write(np.zeros((1, 8, 8), np.uint8))
+    return path
+
+
+def grid(path, rows, columns, *, step=20, offset=0.5):
+    """Write the grid that leads every position to the same of the sensor, whose first pixel centre is at one half."""
+    row, column = (np.arange(-2 * step, size + 3 * step, step, dtype=np.float64) for size in (rows, columns))
+    positions = np.stack(np.broadcast_arrays(column + offset, row[:, None] + offset))
+    place = Affine(step, 0, column[0] - step / 2, 0, step, row[0] - step / 2)
+    kind = {"height": row.size, "width": column.size, "count": 2, "dtype": "float64"}
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:4326", transform=place, **kind) as dataset:
+        dataset.write(positions)
+    return path
+
+
+def cameras(folder, rows, columns, longitude=LONGITUDE):
+    return [
+        camera(folder / "left_model.tif", 0, longitude),
+        camera(folder / "right_model.tif", 1, longitude),
+        grid(folder / "left_grid.tif", rows, columns),
+        grid(folder / "right_grid.tif", rows, columns),
+    ]
+
+
+def on_the_ground(row, column, height):
+    """Longitude and latitude of the point that the left view shows at a pixel."""
+    east = (column - VIEWS[0] * (height - DATUM)) * PIXEL
+    return LONGITUDE + east / EAST, LATITUDE - row * PIXEL / NORTH
+
+
+def read(path):
+    with rasterio.open(path) as dataset:
+        return dataset.read()
+
+
+def test_triangulate__heights_of_an_exact_scene_come_back(tmp_path):
+    scene = make_scene(150, 190, seed=4)
+    truth = np.clip(scene.truth, MINIMUM + 3, MAXIMUM - 3)
+    validity = np.where(np.isnan(truth), 1, 0).astype(np.uint16)
+    bands = np.stack([truth, truth - 2.0, truth + 3.0, np.ones_like(truth)]).astype(np.float32)
+    out = write_run(tmp_path, bands, validity)
+    report = triangulate(out, *cameras(tmp_path, *truth.shape))
+    points = read(out / "points.tif")
+    known = validity == 0
+    assert report["points"] == known.sum()
+    assert report["residual"][1] < 1e-3
+    heights = {"height": truth, "height_lower": truth - 2.0, "height_upper": truth + 3.0}
+    row, column = np.indices(truth.shape)
+    for name, disparity in heights.items():
+        height = DATUM + disparity / (VIEWS[1] - VIEWS[0])
+        assert np.abs(points[BAND[name]] - height)[known].max() < 0.01, name
+        longitude, latitude = on_the_ground(row, column, height)
+        end = name.removeprefix("height")
+        assert np.abs(points[BAND[f"longitude{end}"]] - longitude)[known].max() * EAST < 0.01
+        assert np.abs(points[BAND[f"latitude{end}"]] - latitude)[known].max() * NORTH < 0.01
+    assert np.isnan(points[:, ~known]).all()
+
+
+def dimap(path, geotiff, view):
+    """Write the model of a view as DIMAP 2, which counts pixels from 1 and has the way down to the ground as well."""
+    with rasterio.open(geotiff) as dataset:
+        rpc = dataset.rpcs
+    across, up, down = rpc.samp_num_coeff[1], rpc.samp_num_coeff[3], rpc.line_num_coeff[2]
+    one = np.eye(20)[0]
+    samp, line = np.zeros(20), np.zeros(20)
+    samp[1], samp[3], line[2] = 1 / across, -up / across, 1 / down
+    ways = {
+        "Direct_Model": {"SAMP_NUM": samp, "SAMP_DEN": one, "LINE_NUM": line, "LINE_DEN": one},
+        "Inverse_Model": {
+            "SAMP_NUM": rpc.samp_num_coeff, "SAMP_DEN": one, "LINE_NUM": rpc.line_num_coeff, "LINE_DEN": one
+        },
+    }  # fmt: skip
+    scales = {
+        "LINE_OFF": rpc.line_off + 1, "SAMP_OFF": rpc.samp_off + 1, "LINE_SCALE": rpc.line_scale,
+        "SAMP_SCALE": rpc.samp_scale, "LAT_OFF": rpc.lat_off, "LAT_SCALE": rpc.lat_scale, "LONG_OFF": rpc.long_off,
+        "LONG_SCALE": rpc.long_scale, "HEIGHT_OFF": rpc.height_off, "HEIGHT_SCALE": rpc.height_scale,
+    }  # fmt: skip
+    parts = [
+        f"<{way}>" + "".join(
+            f"<{name}_COEFF_{index}>{float(value)!r}</{name}_COEFF_{index}>"
+            for name, values in polynomials.items() for index, value in enumerate(values, start=1)
+        ) + f"</{way}>"
+        for way, polynomials in ways.items()
+    ]  # fmt: skip
+    validity = "".join(f"<{name}>{float(value)!r}</{name}>" for name, value in scales.items())
+    path.write_text(
+        '<Dimap_Document><Metadata_Identification><METADATA_FORMAT version="2.0">DIMAP</METADATA_FORMAT>'
+        f"</Metadata_Identification><Rational_Function_Model><Global_RFM>{''.join(parts)}<RFM_Validity>{validity}"
+        "</RFM_Validity></Global_RFM></Rational_Function_Model></Dimap_Document>"
+    )
+    return path
+
+
+@pytest.fixture
+def level_run(tmp_path):
+    """A run of one disparity, 1, in the interval -1.5 to 4, and its cameras."""
+    bands = np.full((4, 40, 50), 1.0, np.float32)
+    bands[1], bands[2] = -1.5, 4.0
+    return write_run(tmp_path, bands, np.zeros((40, 50), np.uint16)), cameras(tmp_path, 40, 50)
+
+
+def test_triangulate__reads_models_of_dimap(level_run, tmp_path):
+    out, (left, right, *grids) = level_run
+    triangulate(out, left, right, *grids)
+    expected = read(out / "points.tif")
+    triangulate(out, dimap(tmp_path / "left.XML", left, 0), dimap(tmp_path / "right.XML", right, 1), *grids)
+    np.testing.assert_allclose(read(out / "points.tif")[:5], expected[:5], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(read(out / "points.tif")[:2], expected[:2], rtol=0, atol=1e-8)
+
+
+def test_triangulate__orders_bounds_by_height(level_run):
+    # The views change places: height falls as disparity grows.
+    out, (left, right, *grids) = level_run
+    triangulate(out, right, left, *grids)
+    points = read(out / "points.tif")
+    assert np.abs(points[BAND["height_lower"]] - (DATUM - 4.0)).max() < 0.01
+    assert np.abs(points[BAND["height_upper"]] - (DATUM + 1.5)).max() < 0.01
+    assert np.abs(points[BAND["height"]] - (DATUM - 1.0)).max() < 0.01
+
+
+def test_triangulate__says_what_shareloc_cannot_do(tmp_path):
+    out = write_run(tmp_path, np.ones((4, 40, 50), np.float32), np.zeros((40, 50), np.uint16))
+    middle = on_the_ground(20, 25, DATUM)[0] - LONGITUDE
+    # its iterations run away there: what they end with, NaN or a division by zero, is a matter of the last bit
+    with pytest.raises(SatIntervalsError, match=r"scenes across the 180th meridian|cannot use .*: division"):
+        triangulate(out, *cameras(tmp_path, 40, 50, longitude=180 - middle))
+
+
+@pytest.fixture(scope="module")
+def matched_scene(tmp_path_factory):
+    """A procedural scene, matched and triangulated: the scene and the folder of the run."""
+    folder = tmp_path_factory.mktemp("scene")
+    scene = make_scene(260, 300, seed=2)
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", write_pair(folder, scene))
+    triangulate(folder / "out", *cameras(folder, 260, 300))
+    return scene, folder / "out"
+
+
+def test_triangulate__as_many_true_heights_are_inside_as_disparities(matched_scene):
+    scene, out = matched_scene
+    (disparity, lower, upper, _), validity = read(out / "intervals.tif"), read(out / "validity.tif")[0]
+    points = read(out / "points.tif")
+    judged = (validity & INVALID == 0) & np.isfinite(scene.truth)
+    inside = ((lower <= scene.truth) & (scene.truth <= upper))[judged]
+    height = DATUM + scene.truth / (VIEWS[1] - VIEWS[0])
+    low, high = points[BAND["height_lower"]], points[BAND["height_upper"]]
+    assert 0.8 < inside.mean() < 1
+    assert ((low - 1e-3 <= height) & (height <= high + 1e-3))[judged].mean() >= inside.mean()
+    assert np.nanmax(np.abs(points[BAND["height"]] - (DATUM + disparity))) < 0.01
+
+
+def test_make_surface__as_many_true_heights_are_inside_cells_as_disparities(matched_scene, tmp_path):
+    scene, out = matched_scene
+    make_surface([out], tmp_path / "dsm.tif", resolution=PIXEL)
+    with rasterio.open(tmp_path / "dsm.tif") as dataset:
+        surface, place, crs = dataset.read(), dataset.transform, dataset.crs
+    assert crs.to_epsg() == 32631
+    # The true ground under every cell: the points of the visible truth, each in the cell it falls in.
+    row, column = np.nonzero(scene.visible)
+    height = DATUM + scene.truth[row, column]
+    x, y = rasterio.warp.transform("EPSG:4326", crs, *on_the_ground(row, column, height))
+    i = np.floor((np.array(y) - place.f) / place.e).astype(int)
+    j = np.floor((np.array(x) - place.c) / place.a).astype(int)
+    inner = (i >= 0) & (j >= 0) & (i < surface.shape[1]) & (j < surface.shape[2])
+    _, low, high = surface[:3, i[inner], j[inner]]
+    filled = np.isfinite(low)
+    inside = (low - 1e-3 <= height[inner]) & (height[inner] <= high + 1e-3)
+    (_, lower, upper, _), validity = read(out / "intervals.tif"), read(out / "validity.tif")[0]
+    judged = (validity & INVALID == 0) & scene.visible
+    held = ((lower <= scene.truth) & (scene.truth <= upper))[judged].mean()
+    assert filled.mean() > 0.9
+    assert inside[filled].mean() >= held
+
+
+def test_lattice__equals_shareloc(shared_data):
+    folder = shared_data / "dsm_picanteo"
+    sensors = Sensors.load(*(folder / name for name in FILES))
+    lattice = Lattice(sensors, Window(0, 0, 1216, 1262), 1262, -35, 18)
+    with (folder / "triangulation_check.csv").open() as stream:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
+    assert len(rows) == 200
+    for point in rows:
+        window = Window(int(point["row"]), int(point["col"]), 1, 1)
+        (here,) = lattice.points(window, np.array([[point["disparity"]]]))
+        assert abs(here.height[0, 0] - point["height"]) < 1e-3
+        assert abs(here.longitude[0, 0] - point["lon"]) * 88_000 < 1e-3
+        assert abs(here.latitude[0, 0] - point["lat"]) * 111_000 < 1e-3
+
+
+FILES = ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif")
+OPTIONS = ("--left-model", "--right-model", "--left-grid", "--right-grid")
+
+
+def given(files):
+    return [word for pair in zip(OPTIONS, files, strict=True) for word in pair]
+
+
+def test_commands__a_real_pair_to_a_surface_like_that_of_a_peer(shared_data, tmp_path):
+    folder, out = shared_data / "dsm_picanteo", tmp_path / "out"
+    steps = [
+        ("match", folder / "left.tif", folder / "right.tif", out, "--disparity", -35, 18, "--quiet"),
+        ("triangulate", out, *given(folder / name for name in FILES)),
+        ("dsm", out, "--resolution", 1),
+    ]
+    for step in steps:
+        result = invoke(*step)
+        assert result.exit_code == 0, result.output
+    with rasterio.open(folder / "peer_dsm_mean_1m.tif") as peer, rasterio.open(out / "dsm.tif") as ours:
+        expected, surface = peer.read(1), np.full(peer.shape, np.nan, np.float32)
+        assert ours.crs == peer.crs
+        reproject(ours.read(1), surface, src_transform=ours.transform, src_crs=ours.crs, dst_transform=peer.transform,
+                  dst_crs=peer.crs, src_nodata=np.nan, dst_nodata=np.nan)  # fmt: skip
+    both = np.isfinite(surface) & np.isfinite(expected)
+    difference = (surface - expected)[both]
+    assert both.sum() > 0.99 * np.isfinite(expected).sum()
+    assert abs(np.median(difference)) < 0.2
+    assert (np.abs(difference) <= 1.0).mean() > 0.9
+
+
+def test_triangulate__a_region_of_the_image_gives_the_same_points(shared_data, tmp_path):
+    folder = shared_data / "dsm_picanteo"
+    pair = folder / "left.tif", folder / "right.tif"
+    config = {"disparity": {"minimum": -35, "maximum": 18}, "regularization": None, "median": None}
+    for name, window in (("whole", Window(500, 400, 200, 240)), ("part", Window(560, 470, 80, 90))):
+        match_pair(*pair, tmp_path / name, config, window=window)
+        triangulate(tmp_path / name, *(folder / file for file in FILES))
+    part = read(tmp_path / "part" / "points.tif")
+    whole = read(tmp_path / "whole" / "points.tif")[:, 60:140, 70:160]
+    same = read(tmp_path / "part" / "intervals.tif")[0] == read(tmp_path / "whole" / "intervals.tif")[0, 60:140, 70:160]
+    assert same.mean() > 0.3
+    for band, allowed in (("longitude", 1e-8), ("latitude", 1e-8), ("height", 2e-3)):
+        assert np.abs(part - whole)[BAND[band]][same].max() < allowed
+
+
+def test_lattice__asks_shareloc_for_few_nodes_at_a_time_and_for_none_twice(shared_data, monkeypatch):
+    folder = shared_data / "dsm_picanteo"
+    sensors = Sensors.load(*(folder / name for name in FILES))
+    region = Window(0, 0, 1216, 1262)
+    lattice = Lattice(sensors, region, 1262, -35, 18)
+    disparity = np.full((region.height, 7), 3.25)
+    monkeypatch.setattr("sat_intervals.heights.sensors._AT_ONCE", 40)
+    counts, ask = [], Sensors._triangulate
+    monkeypatch.setattr(Sensors, "_triangulate", lambda self, some: counts.append(len(some)) or ask(self, some))
+    strips = [lattice.points(Window(row, 30, 19, 7), disparity[row : row + 19])[0] for row in range(0, 1216, 19)]
+    assert max(counts) == 40
+    assert sum(counts) == 39 * 41 * 3  # nodes along rows, columns, disparities
+    (whole,) = Lattice(sensors, region, 1262, -35, 18).points(Window(0, 30, 1216, 7), disparity)
+    for band in range(4):
+        np.testing.assert_allclose(np.concatenate([strip[band] for strip in strips]), whole[band], rtol=1e-12)
+
+
+def test_triangulate_command__what_it_cannot_use_gets_one_line(level_run, tmp_path):
+    out, files = level_run
+    short = grid(tmp_path / "short.tif", 10, 10, step=10)
+    descending = tmp_path / "descending.tif"
+    with rasterio.open(files[3]) as file, rasterio.open(descending, "w", **upside_down(file)) as other:
+        other.write(file.read()[:, ::-1])
+    (tmp_path / "model.geom").write_text("no model\n")
+    cases = [
+        ({0: tmp_path / "missing.geom"}, "missing.geom: no such file: give the RPC model of the image"),
+        ({1: tmp_path / "model.geom"}, "model.geom as RPC model: "),
+        ({2: tmp_path / "model.geom"}, "model.geom as epipolar grid: "),
+        (
+            {3: short},
+            "covers rows -20 to 30 and columns -20 to 30 of the right epipolar image, the run needs rows 0 to 39",
+        ),
+        ({3: grid(tmp_path / "far.tif", 40, 50, offset=9000.0)}, "the models do not fit these images"),
+        ({3: descending}, "rows of {descending} are in descending order: give a grid in ascending order"),
+    ]
+    for changed, message in cases:
+        result = invoke("triangulate", out, *given(changed.get(place, file) for place, file in enumerate(files)))
+        assert result.exit_code == 2, result.output
+        assert message.format(descending=descending) in result.output
+        assert result.output.count("\n") == 1
+        assert not (out / "points.tif").exists()
+
+
+def upside_down(file):
+    """The profile of a grid whose rows are in the opposite order."""
+    place = file.transform
+    return file.profile | {"transform": Affine(place.a, 0, place.c, 0, -place.e, place.f + file.height * place.e)}
+
+
+def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_path):
+    out, files = level_run
+    shifted = grid(tmp_path / "shifted.tif", 40, 50, offset=1.5)
+    result = invoke("triangulate", out, *given([*files[:3], shifted]), "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "warning: lines of sight miss each other by 0." in result.stderr
+    assert result.stdout == ""
+    assert invoke("triangulate", out, *given(files)).stderr == ""
+
+
+def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path):
+    out, files = level_run
+    files = [*files[:2], grid(tmp_path / "holed.tif", 40, 50, step=4), files[3]]
+    with rasterio.open(files[2], "r+") as file:
+        positions = file.read()
+        positions[:, 2, 2] = np.nan  # of epipolar row and column 0, a node of the lattice
+        file.write(positions)
+    result = invoke("triangulate", out, *given(files))
+    assert result.exit_code == 0, result.output
+    points = read(out / "points.tif")[BAND["height"]]
+    lost = np.isnan(points)
+    assert 0 < lost.sum() < lost.size
+    assert f"{lost.sum()} valid pixels have no point" in result.stderr
+
+
+def test_triangulate_command__needs_a_run(tmp_path):
+    files = cameras(tmp_path, 40, 50)
+    result = invoke("triangulate", tmp_path, *given(files))
+    assert result.exit_code == 2
+    assert "give the folder of a finished run" in result.output

@@ -1,0 +1,128 @@
+"""Which file an input is, and inputs on a web server: read window by window, known by size and ETag."""
+
+import hashlib
+import os
+import subprocess
+import time
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+import rasterio
+from helpers import COMMAND, OUTPUTS, hashes
+
+from sat_intervals import match_pair
+from sat_intervals.demo import make_scene
+from sat_intervals.raster.identity import identity, is_changed
+from sat_intervals.tiling import Window
+
+SIDE = 1024
+
+
+@pytest.fixture(scope="module")
+def images() -> dict[str, bytes]:
+    """Content of left.tif and right.tif, tiled, not compressed."""
+    scene = make_scene(SIDE, SIDE, seed=5)
+    profile = {"driver": "GTiff", "height": SIDE, "width": SIDE, "count": 1, "dtype": "uint16", "nodata": 0}
+    profile |= {"tiled": True, "blockxsize": 128, "blockysize": 128, "crs": "EPSG:32631"}
+    content = {}
+    for side in ("left", "right"):
+        with rasterio.MemoryFile() as memory:
+            with memory.open(**profile, transform=rasterio.Affine(0.5, 0, 0, 0, -0.5, 0)) as file:
+                file.write(getattr(scene, side), 1)
+            content[f"{side}.tif"] = memory.read()
+    return content
+
+
+def put(images: dict[str, bytes], folder: Path) -> None:
+    for name, content in images.items():
+        (folder / name).write_bytes(content)
+
+
+def match(server: ThreadingHTTPServer, out: Path, *options: str, prefix: str = "") -> subprocess.Popen:
+    address = f"{prefix}http://127.0.0.1:{server.server_address[1]}"
+    command = [COMMAND, "match", f"{address}/left.tif", f"{address}/right.tif", out, "--disparity", "-18", "40"]
+    command += ["--overlap", "20", "--quiet", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def ended(process: subprocess.Popen) -> tuple[int, str]:
+    output, _ = process.communicate(timeout=60)
+    return process.returncode, output
+
+
+@pytest.mark.parametrize("prefix", ["", "/vsicurl/"])
+def test_match__reads_windows_of_images_on_a_web_server(web_server, images, tmp_path, prefix):
+    put(images, web_server.folder)
+    window = "--window", "512", "384", "128", "128"
+    assert ended(match(web_server, tmp_path / "remote", *window, prefix=prefix)) == (0, "")
+    for name, content in images.items():
+        sent = [count for file, count in web_server.sent if file == name]
+        assert max(sent) < len(content) / 8
+        assert sum(sent) < len(content) / 3, name
+    options = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"overlap": 20}}
+    local = web_server.folder / "left.tif", web_server.folder / "right.tif", tmp_path / "local", options
+    match_pair(*local, window=Window(512, 384, 128, 128))
+    assert hashes(tmp_path / "remote") == hashes(tmp_path / "local")
+
+
+def test_match__never_goes_on_with_an_image_of_another_etag(web_server, images, tmp_path):
+    put(images, web_server.folder)
+    out, tiles = tmp_path / "out", ("--tile-size", "128")
+    first = match(web_server, out, *tiles)
+    while first.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
+        time.sleep(0.02)
+    first.terminate()
+    assert ended(first)[0] == 143
+    changed = bytearray(images["right.tif"])
+    changed[-1] ^= 1
+    put({"right.tif": bytes(changed)}, web_server.folder)
+    status, output = ended(match(web_server, out, *tiles))
+    assert status == 2
+    tags = [hashlib.sha256(content).hexdigest() for content in (images["right.tif"], changed)]
+    assert "holds the tiles of another run: inputs.right.etag was " in output
+    assert output.index(tags[0]) < output.index(tags[1])
+    put(images, web_server.folder)
+    assert ended(match(web_server, out, *tiles)) == (0, "")
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+def test_identity__sees_a_change_at_equal_size_and_time_and_hashes_only_then(tmp_path, monkeypatch):
+    file = tmp_path / "image.tif"
+    file.write_bytes(b"one")
+    before = identity(str(file))
+    assert before["sha256"] == hashlib.sha256(b"one").hexdigest()
+    times = file.stat().st_atime_ns, file.stat().st_mtime_ns
+    with monkeypatch.context() as patch:
+        patch.setattr(hashlib, "file_digest", None)
+        assert identity(str(file), {str(file): before}) == before
+    time.sleep(0.02)  # more than a tick of the clock of files
+    file.write_bytes(b"two")
+    os.utime(file, ns=times)
+    after = identity(str(file), {str(file): before})
+    assert {name for name in before if after[name] != before[name]} == {"sha256", "stamp"}
+    assert after["sha256"] == hashlib.sha256(b"two").hexdigest()
+    assert is_changed(str(file), before)
+    time.sleep(0.02)
+    file.write_bytes(b"one")
+    assert not is_changed(str(file), before)
+
+
+def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(web_server, images, tmp_path):
+    put(images, web_server.folder)
+    out = tmp_path / "out"
+    run = match(web_server, out, "--tile-size", "128", "--workers", "1")
+    while run.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
+        time.sleep(0.02)
+    changed = bytearray(images["right.tif"])
+    changed[-1] ^= 1
+    put({"right.tif": bytes(changed)}, web_server.folder)
+    status, output = ended(run)
+    assert (status, output.count("\n")) == (1, 1)
+    assert "right.tif was replaced or changed during the run" in output
+    assert [path.name for path in out.iterdir()] == ["tiles"]
+
+
+@pytest.mark.parametrize("path", ["http://127.0.0.1:1/image.tif", "/vsimem/image.tif", "nowhere://image.tif"])
+def test_identity__of_what_nobody_tells_more_of_is_its_name(path):
+    assert identity(path) == {"path": path}

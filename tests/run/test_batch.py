@@ -1,0 +1,471 @@
+"""Batches, plans and states of runs, through the library and the command."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import yaml
+from helpers import OUTPUTS, PLACE, hashes, invoke
+
+from sat_intervals.config import Cluster, ConfigError, load_config
+from sat_intervals.config.pairs import PairOfBatch, read_batch
+from sat_intervals.demo import make_scene
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.match.memory import fitted, tile_bytes
+from sat_intervals.raster import write_layer
+from sat_intervals.results import open_run
+from sat_intervals.run import batch
+from sat_intervals.run.batch import match_batch
+from sat_intervals.run.cluster import connected, parse_memory
+from sat_intervals.run.job import prepare
+from sat_intervals.run.pair import match_pair, matched
+from sat_intervals.run.plan import plan
+from sat_intervals.run.tile import match_tile
+from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.tiles import mark_finished
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    for seed in (1, 2):
+        scene = make_scene(150, 200, seed=seed)
+        for side in ("left", "right"):
+            write_layer(folder / f"{side}{seed}.tif", getattr(scene, side), 0, PLACE)
+    return folder
+
+
+def rows(folder, *, broken=False):
+    lines = ["name,left,right,minimum,maximum,sgm.p2"]
+    lines += [f"pair{seed},left{seed}.tif,right{seed}.tif,-18,40,{24 + seed}" for seed in (1, 2)]
+    if broken:
+        lines.insert(1, "broken,left1.tif,nowhere.tif,-18,40,")
+    (folder / "pairs.csv").write_text("\n".join(lines) + "\n")
+    return folder / "pairs.csv"
+
+
+def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
+    report = match_batch(read_batch(rows(images)), tmp_path / "batch", {"tiles": {"size": 64}})
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "done", "pair2": "done"}
+    for seed in (1, 2):
+        settings = {"disparity": {"minimum": -18, "maximum": 40}, "sgm": {"p2": 24 + seed}, "tiles": {"size": 64}}
+        match_pair(images / f"left{seed}.tif", images / f"right{seed}.tif", tmp_path / f"alone{seed}", settings)
+        assert hashes(tmp_path / "batch" / f"pair{seed}") == hashes(tmp_path / f"alone{seed}")
+        assert not (tmp_path / "batch" / f"pair{seed}" / "tiles").exists()
+
+
+def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(images, tmp_path):
+    pairs = read_batch(rows(images))[:1]
+    match_batch(pairs, tmp_path, {"tiles": {"size": 64}})
+    scratch = tmp_path / "pair1" / ".unpublished-intervals.tif" / "files" / "replaced"
+    scratch.mkdir(parents=True)
+    (scratch / "run.json").write_text("{}")
+    match_batch(pairs, tmp_path, {"tiles": {"size": 64}})
+    assert sorted(file.name for file in (tmp_path / "pair1").iterdir()) == OUTPUTS
+
+
+@pytest.mark.parametrize("place", ["option", "config"])
+def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path, place):
+    lines = ["name,left,right,minimum,maximum,preset", "one,left1.tif,right1.tif,-18,40,"]
+    lines += ["two,left2.tif,right2.tif,-18,40,mountain"]
+    (images / "presets.csv").write_text("\n".join(lines) + "\n")
+    config, overrides = {"tiles": {"size": 64, "overlap": 20}}, {}
+    (overrides if place == "option" else config)["preset"] = "satellite"
+    report = match_batch(read_batch(images / "presets.csv"), tmp_path, config, overrides=overrides)
+    assert {name: end["state"] for name, end in report.items()} == {"one": "done", "two": "done"}
+    settings = [open_run(tmp_path / name).config for name in ("one", "two")]
+    assert [(one.preset, one.sgm.p2) for one in settings] == [("satellite", 128), ("mountain", 464)]
+
+
+def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(images, tmp_path):
+    arguments = ["batch", str(rows(images, broken=True)), str(tmp_path / "out"), "--tile-size", "64"]
+    first = invoke(*arguments)
+    assert first.exit_code == 1
+    assert "1 of 3 pairs failed" in first.stderr
+    assert "nowhere.tif" in first.stderr
+    told = invoke("status", tmp_path / "out")
+    assert told.stdout.startswith(f"{tmp_path / 'out' / 'broken'}: failed: {images / 'nowhere.tif'}")
+    written = (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns
+    rows(images)
+    second = invoke(*arguments)
+    assert second.exit_code == 0
+    assert (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns == written
+    report = json.loads((tmp_path / "out" / "batch.json").read_text())
+    assert {end["state"] for end in report.values()} == {"done before"}
+    told = invoke("status", tmp_path / "out")
+    assert told.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
+
+
+def test_match_batch__never_takes_another_run_for_its_own(images, tmp_path):
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path)
+    report = match_batch(pairs, tmp_path, {"median": None})
+    assert {end["state"] for end in report.values()} == {"failed"}
+    assert "settings.median was" in report["pair1"]["error"]
+    assert "--overwrite" in report["pair1"]["error"]
+
+
+def test_match_batch__takes_no_result_of_another_image_for_that_of_a_pair(images, tmp_path):
+    for file in images.glob("*.tif"):
+        shutil.copy(file, tmp_path)
+    pairs = read_batch(rows(tmp_path))
+    match_batch(pairs, tmp_path / "out")
+    scene = make_scene(150, 200, seed=3)
+    write_layer(tmp_path / "left1.tif", scene.left, 0, PLACE)
+    report = match_batch(pairs, tmp_path / "out")
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done before"}
+    assert "inputs.left.sha256 was" in report["pair1"]["error"]
+    again = match_batch(pairs, tmp_path / "out", overwrite=True)
+    assert {end["state"] for end in again.values()} == {"done"}
+
+
+def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(images, tmp_path):
+    memory = {"kind": "threads", "memory": "520MB"}  # of which a job may take 468
+    config = {"cluster": memory, "tiles": {"size": 1024}}
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path, config)
+    assert json.loads((tmp_path / "pair1" / "run.json").read_text())["tiles"]["size"] < 1024
+    assert {end["state"] for end in match_batch(pairs, tmp_path, config).values()} == {"done before"}
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"settings": {}}', "\xff"])
+def test_match_batch__goes_on_with_the_others_where_a_report_cannot_be_read(images, tmp_path, text):
+    pairs = read_batch(rows(images))
+    folder = tmp_path / "pair1"
+    folder.mkdir()
+    for name in ("intervals.tif", "validity.tif"):
+        shutil.copy(images / "left1.tif", folder / name)
+    (folder / "run.json").write_bytes(text.encode("latin-1"))
+    report = match_batch(pairs, tmp_path)
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
+    assert "run.json" in report["pair1"]["error"]
+    assert json.loads((tmp_path / "batch.json").read_text()) == report
+
+
+def test_match_batch__refuses_a_folder_where_another_batch_is_at_work(images, tmp_path):
+    with (
+        LocalFolder(tmp_path).locked(),
+        pytest.raises(SatIntervalsError, match="another run is active in"),
+    ):
+        match_batch(read_batch(rows(images)), tmp_path)
+
+
+COME_AND_GO = """
+import os, sys, time
+from contextlib import suppress
+from pathlib import Path
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.store.folder import LocalFolder
+from sat_intervals.run.job import prepare
+
+folder, inside, end = LocalFolder(Path(sys.argv[1])), sys.argv[1] + ".inside", time.monotonic() + 0.5
+count = 0
+while time.monotonic() < end:
+    with suppress(SatIntervalsError), folder.locked():
+        os.close(os.open(inside, os.O_CREAT | os.O_EXCL))  # fails where another is inside
+        time.sleep(0.0005)
+        os.unlink(inside)
+        count += 1
+print(count)
+"""
+
+
+@pytest.mark.process
+def test_locked__lets_one_process_in_at_a_time(tmp_path):
+    command = [sys.executable, "-c", COME_AND_GO, str(tmp_path / "new")]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    counts = [int(process.communicate()[0]) for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4
+    assert sum(counts) > 10
+    assert not (tmp_path / "new").exists()
+
+
+def test_locked__is_not_refused_for_one_who_looks(tmp_path):
+    folder, end = LocalFolder(tmp_path), time.monotonic() + 0.5
+
+    def look():
+        while time.monotonic() < end:
+            folder.is_locked()
+
+    with ThreadPoolExecutor(1) as thread:
+        looking = thread.submit(look)
+        while not looking.done():
+            with folder.locked():
+                assert folder.is_locked()
+
+
+def test_locked__ends_where_no_folder_can_be_made():
+    with (
+        pytest.raises(SatIntervalsError, match=r"/proc/nothing cannot be written"),
+        LocalFolder(Path("/proc/nothing")).locked(),
+    ):
+        pass
+
+
+def test_match_batch__holds_the_folders_of_its_pairs(images, tmp_path):
+    with LocalFolder(tmp_path / "pair1" / "tiles").locked():
+        report = match_batch(read_batch(rows(images)), tmp_path)
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
+    assert "another run is active in" in report["pair1"]["error"]
+
+
+def test_match_batch__keeps_the_tiles_of_equal_pairs_apart_and_goes_on_where_those_of_one_vanish(images, tmp_path):
+    pair = PairOfBatch("first", str(images / "left1.tif"), str(images / "right1.tif"))
+    config = {"disparity": {"minimum": -18, "maximum": 40}, "cluster": {"store": str(tmp_path / "store")}}
+    vanished = []
+
+    def progress(stage, done, total):
+        if stage == "tiles" and not vanished:
+            vanished.extend((tmp_path / "store").glob("first-*"))
+            shutil.rmtree(vanished[0])
+
+    report = match_batch([pair, replace(pair, name="second")], tmp_path / "out", config, progress=progress)
+    assert {name: end["state"] for name, end in report.items()} == {"first": "failed", "second": "done"}
+    assert report["first"]["error"].startswith(f"the tiles in {vanished[0]} are gone")
+    assert not list((tmp_path / "store").iterdir())
+
+
+def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, monkeypatch):
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path)
+    before = hashes(tmp_path / "pair1")
+
+    def fail(*arguments, **named):
+        raise RunError("no more disk")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch, "assembled", fail)
+        report = match_batch(pairs, tmp_path, {"median": None}, overwrite=True)
+    assert {end["state"] for end in report.values()} == {"failed"}
+    assert hashes(tmp_path / "pair1") == before
+    told = invoke("status", tmp_path / "pair1")
+    assert "1 of 1 tiles done, 0 failed, 0 left; no run is active" in told.stdout
+    report = match_batch(pairs, tmp_path, {"median": None})
+    assert {end["state"] for end in report.values()} == {"done"}
+    assert hashes(tmp_path / "pair1") != before
+    assert not list(tmp_path.glob("*/tiles"))
+
+
+@pytest.mark.parametrize("damage", ["manifest", "record", "shard", "bit"])
+def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, tmp_path, damage):
+    pairs = read_batch(rows(images))
+    match_batch(pairs, tmp_path, {"tiles": {"size": 64}}, keep_tiles=True)
+    tiles, before = tmp_path / "pair1" / "tiles", hashes(tmp_path / "pair1")
+    for name in ("pair1", "pair2"):
+        (tmp_path / name / "run.json").unlink()
+    if damage == "manifest":
+        (tiles / "manifest.json").write_text("5")
+    elif damage == "record":
+        (tiles / "records" / "0_0.json").write_text("")
+    else:
+        shard = tiles / "arrays.zarr" / "int16" / "c" / "0" / "0" / "0"
+        content = shard.read_bytes()
+        shard.write_bytes(content[:-100] if damage == "shard" else content[:99] + b"?" + content[100:])
+    kept = (tiles / "records" / "0_1.json").stat().st_mtime_ns
+    report = match_batch(pairs, tmp_path, {"tiles": {"size": 64}}, keep_tiles=True)
+    states = {name: end["state"] for name, end in report.items()}
+    if damage == "manifest":
+        assert states == {"pair1": "failed", "pair2": "done"}
+        assert re.search(rf"^{tiles}/manifest\.json cannot be read, .*--overwrite", report["pair1"]["error"])
+        report = match_batch(pairs, tmp_path, {"tiles": {"size": 64}}, overwrite=True)
+        states = {name: end["state"] for name, end in report.items()}
+    else:  # one tile is matched again
+        assert (tiles / "records" / "0_1.json").stat().st_mtime_ns == kept
+    assert states == {"pair1": "done", "pair2": "done"}
+    assert hashes(tmp_path / "pair1") == before
+
+
+def test_match_batch__removes_tiles_that_a_death_left_beside_a_result_and_none_that_were_kept(images, tmp_path):
+    pairs = read_batch(rows(images))
+    first = match_batch(pairs, tmp_path, keep_tiles=True)
+    mark_finished(tmp_path / "pair2" / "tiles", "the run of pair2")  # as a run does before it removes its tiles
+    again = match_batch(pairs, tmp_path)
+    assert [path.parent.name for path in tmp_path.glob("*/tiles")] == ["pair1"]
+    assert (tmp_path / "pair1" / "tiles" / "manifest.json").exists()
+    assert {name: end["counts"] for name, end in again.items()} == {name: end["counts"] for name, end in first.items()}
+
+
+def test_status__of_a_batch_goes_on_after_a_pair_without_a_run(images, tmp_path):
+    match_batch(read_batch(rows(images)), tmp_path)
+    shutil.rmtree(tmp_path / "pair1")
+    result = invoke("status", tmp_path)
+    assert result.stdout == f"{tmp_path / 'pair1'}: done\n{tmp_path / 'pair2'}: complete\n"
+
+
+def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(images, tmp_path):
+    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
+    jobs = [prepare(images / f"left{n}.tif", images / f"right{n}.tif", tmp_path / f"out{n}", settings) for n in (1, 2)]
+    for job in jobs:
+        job.begin()
+    ended = []
+
+    def progress(stage, done, total):
+        if done == 3:  # as one that outlived the run before
+            for tile in jobs[1].waiting()[-4:]:
+                match_tile(jobs[1], tile)
+
+    with connected(Cluster(workers=1), tmp_path) as client:
+        for job, failures in matched(client, jobs, progress):
+            assert not failures
+            ended.append(job)
+    assert ended == jobs
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "problem"),
+    [
+        ("a.csv", "name,left\nx,l.tif\n", "row 1 lacks right"),
+        ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "a.csv: 2 pairs or runs are called x"),
+        ("a.csv", "name,left,right\nx,l,r,1\n", "more values than columns"),
+        ("a.csv", "name,left,right\n../x,l,r\n", "row 1: name '../x' cannot be a folder's name"),
+        ("a.csv", "name,left,right\nx,l,r\nlogs,l,r\n", "row 2: name 'logs' cannot be"),
+        ("a.csv", "name,left,right,sgm.p2\nx,l,r,[3\n", r"row 1: sgm.p2 is '\[3': while parsing"),
+        (
+            "a.csv",
+            "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n",
+            "row 1: sgm.p2 is '3': the row also gives sgm as a whole",
+        ),
+        (
+            "a.csv",
+            "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n",
+            "row 1: sgm is 'null': the row also gives parts of sgm",
+        ),
+        ("a.csv", "name,left,right,sgm.p2,sgm.p2\nx,l,r,1,2\n", "column sgm.p2 appears twice"),
+        ("a.csv", "name,left,right,cluster.kind\nx,l,r,slurm\n", "row 1: all pairs share one cluster"),
+        ("a.csv", 'name,left,right\n"x\ny",l,r\n', r"row 1: name 'x\\ny' cannot be"),
+        ("a.yaml", "- {name: x, left: l, left: m, right: r}", "key 'left' appears twice"),
+        ("a.yaml", "- {name: 2024-13-45, left: l, right: r}", "cannot be read"),
+        ("a.yaml", "[" * 3000, "cannot be read"),
+        ("a.yaml", "just: text\n", "holds no pairs"),
+        ("a.yaml", "- [", "cannot be read"),
+        ("a.json", "[]", "holds no pairs"),
+    ],
+)
+def test_read_batch__says_what_is_wrong(tmp_path, name, text, problem):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(SatIntervalsError, match=problem) as caught:
+        read_batch(tmp_path / name)
+    assert name in str(caught.value)
+
+
+def test_read_batch__reads_the_same_pairs_from_every_kind_of_file(tmp_path):
+    row = {"name": "a", "left": "l.tif", "right": "https://host/r.tif", "minimum": -3, "sgm": {"p1": 7}, "median": None}
+    (tmp_path / "b.json").write_text(json.dumps([row]))
+    (tmp_path / "b.yaml").write_text("- {name: a, left: l.tif, right: 'https://host/r.tif', minimum: -3, sgm.p1: 7}\n")
+    (tmp_path / "b.csv").write_text("name,left,right,minimum,sgm.p1\na,l.tif,https://host/r.tif,-3,7\n")
+    batches = [read_batch(tmp_path / f"b.{ending}") for ending in ("json", "yaml", "csv")]
+    assert batches[0] == batches[1] == batches[2]
+    pair = batches[0][0]
+    assert (pair.left, pair.right) == (str(tmp_path / "l.tif"), "https://host/r.tif")
+    assert pair.settings == {"disparity": {"minimum": -3}, "sgm": {"p1": 7}}
+
+
+SETTINGS = load_config({"disparity": {"minimum": -31, "maximum": 32}})
+
+
+def test_fitted__takes_the_largest_tile_that_fits():
+    for memory in (10**9, 5 * 10**8, 4 * 10**8):
+        size = fitted(SETTINGS, memory).tiles.size
+        base = fitted(SETTINGS, 10**10).tiles.size
+        assert size <= base == SETTINGS.tiles.size
+        assert tile_bytes(SETTINGS, size) < memory
+        assert size == base or tile_bytes(SETTINGS, size + 64) > memory - 3 * 10**8
+    with pytest.raises(ConfigError, match=r"need .* MB, but 300 MB are given"):
+        fitted(SETTINGS, 3 * 10**8)
+
+
+@pytest.mark.parametrize(
+    ("text", "count"), [("4GB", 4 * 10**9), ("512 MiB", 2**29), ("3e9", 3 * 10**9), ("1.5g", 15 * 10**8)]
+)
+def test_parse_memory__reads_figures_with_units(text, count):
+    assert parse_memory(text) == count
+
+
+@pytest.mark.parametrize("text", ["much", "4 bananas", "", "GB", "1.2.3GB", "1e400", "nan", "-4GB", "0", "0GB", "0.5"])
+def test_parse_memory__refuses_what_is_none(text):
+    with pytest.raises(ConfigError, match=f"^memory {text!r}: give a figure with a unit, such as 4GB or 512MiB$"):
+        parse_memory(text)
+
+
+def test_plan__counts_tiles_and_the_work_of_overlaps(images):
+    config = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64, "overlap": 10}}
+    made = plan(images / "left1.tif", images / "right1.tif", config, workers=2)
+    # 150 x 200 px: 3 x 4 tiles; a patch is as wide as core and overlaps, its sweeps see half of the rows behind it
+    widths, heights = [74, 84, 82, 18], [64 + 5, 64 + 10, 22 + 5]
+    assert made.tiles == 12
+    assert made.extra_work == pytest.approx(sum(widths) * sum(heights) / (150 * 200) - 1)
+    assert made.seconds > 0
+
+
+def test_plan__keeps_out_of_the_store_of_the_run(images, tmp_path):
+    store = tmp_path / "store"
+    config = {"disparity": {"minimum": -18, "maximum": 40}, "cluster": {"store": str(store)}}
+    plan(images / "left1.tif", images / "right1.tif", config, workers=1)
+    assert not store.exists()
+
+
+def test_plan__prints_what_a_run_will_take(images):
+    pair = [str(images / "left1.tif"), str(images / "right1.tif"), "--disparity", "-18", "40"]
+    result = invoke("plan", *pair, "--memory", "400MB", "--workers", "3")
+    assert result.exit_code == 0, result.stderr
+    assert "expected time, 3 tiles at once" in result.stdout
+    assert "smaller than set, to fit" in result.stdout
+    assert re.search(r"memory of a worker: +\d+ MB, fits in 400 MB\n", result.stdout)
+    assert re.search(r"with 3 tiles at once: +\d+ MB, does not fit in 400 MB: give --workers [12]\n", result.stdout)
+    refused = invoke("plan", *pair, "--memory", "100MB")
+    assert refused.exit_code == 2
+    assert "but 100 MB are given" in refused.stderr
+
+
+def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(images, tmp_path):
+    bands = tmp_path / "bands.tif"
+    with rasterio.open(images / "left1.tif") as file, rasterio.open(bands, "w", **file.profile | {"count": 2}) as copy:
+        copy.write(np.stack([file.read(1), file.read(1)]))
+    cluster = {"kind": "slurm", "jobs": 4, "maximum_jobs": 8, "cores": 3, "memory": "1GB"}
+    settings = tmp_path / "settings.yaml"
+    settings.write_text(yaml.safe_dump({"disparity": {"minimum": -18, "maximum": 40}, "cluster": cluster}))
+    arguments = ["plan", str(bands), str(images / "right1.tif"), "--config", str(settings), "--band", "1"]
+    result = invoke(*arguments, "--window", "20", "0", "100", "200", "--tile-size", "512")
+    assert result.exit_code == 0, result.stderr
+    assert "24 tiles at once" in result.stdout
+    assert "with 3 tiles at once" in result.stdout
+    assert "1 of 512 px" in result.stdout
+
+
+def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_what_match_does(images, tmp_path):
+    scene = make_scene(700, 700, seed=1)
+    for side in ("left", "right"):
+        image = getattr(scene, side).copy()
+        image[90:610, 90:610] = 0
+        write_layer(tmp_path / f"{side}.tif", image, 0, PLACE)
+    config = {"disparity": {"minimum": -18, "maximum": 40}}
+    assert plan(tmp_path / "left.tif", tmp_path / "right.tif", config, workers=1).seconds > 0
+    huge = {"disparity": {"minimum": -6000, "maximum": 6000}, "tiles": {"size": 4096}}
+    wide = np.ones((4096, 13000), np.uint8)
+    write_layer(tmp_path / "wide.tif", wide, 0, PLACE)
+    with pytest.raises(SatIntervalsError, match="GB, this process may use"):
+        plan(tmp_path / "wide.tif", tmp_path / "wide.tif", huge)
+
+
+def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
+    out = tmp_path / "out"
+    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
+    assert invoke("status", out).exit_code == 2
+    match_pair(images / "left1.tif", images / "right1.tif", out, settings, keep_tiles=True)
+    assert invoke("status", out).stdout == f"{out}: complete\n"
+    (out / "run.json").unlink()
+    (out / "tiles" / "records" / "0_1.json").unlink()
+    (out / "tiles" / "records" / "1_1.json").unlink()
+    Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
+    result = invoke("status", out)
+    assert "10 of 12 tiles done, 1 failed, 1 left; no run is active" in result.stdout
+    assert "tile 0_1: no more disk" in result.stdout

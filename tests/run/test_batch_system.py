@@ -1,0 +1,233 @@
+"""A real SLURM of one node on loopback: jobs that are cancelled, and jobs whose time is up."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
+import yaml
+from helpers import COMMAND, hashes, wait_until, write_pair
+
+from sat_intervals import SatIntervalsError, match_pair
+from sat_intervals.config import Cluster
+from sat_intervals.demo import make_scene
+from sat_intervals.errors import RunError
+from sat_intervals.run.batch_system import current_workers, job_script
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A folder with left.tif, right.tif and the run in threads that nothing disturbed; its settings."""
+    folder = tmp_path_factory.mktemp("pair")
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    return folder, settings
+
+
+@contextmanager
+def submitted(
+    pair,
+    folder: Path,
+    status: int = 0,
+    own: dict[str, object] | None = None,
+    programs: str = "",
+    constants: dict[str, float] | None = None,
+    is_quiet: bool = True,
+    **cluster: object,
+):
+    """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first.
+
+    ``constants`` are those of `run.batch_system`; where it ends well and ``is_quiet`` it must say nothing.
+    """
+    images, settings = pair
+    folder.mkdir(exist_ok=True)
+    job = {"jobs": 1, "cores": 1, "memory": "2GB", "walltime": "00:05:00"} | cluster
+    (folder / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": job}))
+    own = {
+        "JOBQUEUE__SLURM__INTERFACE": "lo",
+        "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
+        "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
+    } | (own or {})
+    code = "from sat_intervals import cli; from sat_intervals.run import batch_system; "
+    code += f"vars(batch_system).update({constants or {}}); cli.main()"
+    command = [sys.executable, "-c", code, "match", images / "left.tif", images / "right.tif", folder / "out"]
+    command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
+    with (folder / "log").open("w") as log:
+        environment = os.environ | {f"DASK_{name}": str(value) for name, value in own.items()}
+        environment["PATH"] = f"{programs}:{environment['PATH']}".lstrip(":")
+        process = subprocess.Popen(list(map(str, command)), stdout=log, stderr=subprocess.STDOUT, env=environment)
+    try:
+        yield process
+        assert process.wait(150) == status, (folder / "log").read_text()
+        if status == 0 and is_quiet:
+            assert (folder / "log").read_text() == ""
+    finally:
+        process.kill()
+        process.wait()
+        subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
+
+
+def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
+    records = folder / "out" / "tiles" / "records"
+    wait_until(lambda: len(list(records.glob("[0-9]*.json"))) >= count or process.poll() is not None, "tiles", 60)
+    assert process.poll() is None, "ended before it was disturbed"
+
+
+def jobs(state: str = "RUNNING") -> set[str]:
+    """The jobs that run, or wait."""
+    command = ["squeue", "--noheader", "--states", state, "--format", "%A"]
+    return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.split())
+
+
+def workers(folder: Path) -> list[psutil.Process]:
+    """The processes of the jobs of a run."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.NoSuchProcess):
+            if "dask_worker" in " ".join(process.cmdline()) and str(folder) in process.cmdline():
+                found += [process, *process.children(recursive=True)]
+    return found
+
+
+def assert_complete(pair, out: Path) -> None:
+    assert hashes(out) == hashes(pair[0] / "undisturbed")
+    assert {path.name for path in out.iterdir()} - {"logs"} == {"intervals.tif", "run.json", "validity.tif"}
+
+
+def test_match__goes_on_in_a_new_job_after_scancel(slurm, pair, tmp_path):
+    with submitted(pair, tmp_path, own={"JOBQUEUE__SLURM__LOG_DIRECTORY": tmp_path / "own-logs"}) as process:
+        wait_for_tiles(process, tmp_path, 5)
+        (job,) = jobs()
+        subprocess.run(["scancel", job], check=True, timeout=30)
+    assert list((tmp_path / "own-logs").glob("*.err"))
+    assert_complete(pair, tmp_path / "out")
+    wait_until(lambda: not jobs(), "end of the jobs", 40)
+
+
+def test_match__goes_on_in_a_new_job_when_the_walltime_ends(slurm, pair, tmp_path):
+    with submitted(pair, tmp_path, walltime="00:01:00", is_quiet=False) as process:  # it says whom it waits for
+        wait_for_tiles(process, tmp_path, 5)
+        (job,) = jobs()
+        for worker in workers(tmp_path):  # a pair that takes a minute would do as well
+            worker.send_signal(signal.SIGSTOP)
+        wait_until(lambda: job not in jobs(), "end of the job's time", 130)
+        assert process.poll() is None
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_match__goes_on_with_the_jobs_that_the_batch_system_took(slurm, pair, tmp_path):
+    once = tmp_path / "refused"
+    programs = sbatch(
+        tmp_path,
+        f"if mkdir {once} 2> /dev/null; then echo too many jobs >&2; exit 1; fi\n"
+        'exec $SBATCH --begin=now+5 "$@"',  # the refusal is there for longer than jobs are not
+    )
+    with submitted(pair, tmp_path, programs=programs, jobs=2):
+        pass
+    assert once.exists()
+    assert_complete(pair, tmp_path / "out")
+
+
+@pytest.mark.peer("dask_jobqueue")
+def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
+    images, settings = pair
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
+    command = [COMMAND, "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
+    command += ["--config", tmp_path / "settings.yaml", "--cluster", "slurm", "--dry-run"]
+    script = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert {"#SBATCH --cpus-per-task=2", "#SBATCH --mem=3G"} <= set(script)
+    assert f"#SBATCH -e {tmp_path}/out/logs/dask-worker-%J.err" in script
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.yaml"]
+
+
+@pytest.mark.peer("dask_jobqueue")
+@pytest.mark.parametrize(
+    ("kind", "lines"),
+    [
+        ("slurm", {"#SBATCH -p day", "#SBATCH -A dinamis", "#SBATCH --cpus-per-task=2", "#SBATCH -t 01:30:00"}),
+        ("pbs", {"#PBS -q day", "#PBS -A dinamis", "#PBS -l select=1:ncpus=2:mem=3815MB", "#PBS -l walltime=01:30:00"}),
+        ("lsf", {"#BSUB -q day", '#BSUB -P "dinamis"', "#BSUB -n 2", "#BSUB -W 01:30"}),
+        ("sge", {"#$ -q day", "#$ -P dinamis", "#$ -l h_rt=01:30:00"}),
+    ],
+)
+def test_job_script__says_what_is_set_as_each_batch_system_takes_it(tmp_path, kind, lines):
+    given = {"cores": 2, "memory": "4GB", "walltime": "01:30:00", "queue": "day", "account": "dinamis"}
+    script = job_script(Cluster(kind=kind, directives=["--exclusive"], **given), tmp_path / "out").splitlines()
+    assert lines <= set(script)
+    assert any(line.endswith(" --exclusive") for line in script)
+    with pytest.raises(SatIntervalsError, match=rf"cluster {kind} needs the memory of a job: set cluster\.memory"):
+        job_script(Cluster(kind=kind), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def sbatch(folder: Path, script: str) -> str:
+    """A folder of programs whose ``sbatch`` does more than SLURM's, which it knows as $SBATCH."""
+    (folder / "programs").mkdir()
+    program = folder / "programs" / "sbatch"
+    program.write_text(f"#!/bin/sh\nSBATCH={shutil.which('sbatch')}\n{script}\n")
+    program.chmod(0o755)
+    return str(program.parent)
+
+
+def test_match__waits_for_the_first_worker_and_says_so(slurm, pair, tmp_path):
+    programs = sbatch(tmp_path, 'exec $SBATCH --begin=now+15 "$@"')
+    with submitted(pair, tmp_path, programs=programs, constants={"_WARN_EVERY": 4, "WORKERS_GONE": 5}, is_quiet=False):
+        pass
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert 1 <= len(lines) <= 20
+    assert all("no worker has started yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_match__ends_when_the_last_worker_has_gone_and_goes_on_after(slurm, pair, tmp_path):
+    once = tmp_path / "once"
+    programs = sbatch(tmp_path, f'mkdir {once} 2> /dev/null || set -- --begin=now+1hour "$@"\nexec $SBATCH "$@"')
+    with submitted(pair, tmp_path, 1, programs=programs, constants={"WORKERS_GONE": 5}) as process:
+        wait_for_tiles(process, tmp_path, 5)
+        (job,) = jobs()
+        subprocess.run(["scancel", job], check=True, timeout=30)
+    (line,) = (tmp_path / "log").read_text().splitlines()
+    assert "the last worker ended and none has started for 5 s" in line
+    assert str(tmp_path / "out" / "logs") in line
+    assert "rerun the same command: it resumes" in line
+    images, settings = pair
+    match_pair(images / "left.tif", images / "right.tif", tmp_path / "out", settings)
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_current_workers__says_once_a_minute_that_no_worker_has_come_and_ends_minutes_after_the_last(
+    monkeypatch, caplog
+):
+    seconds, cores = [0.0], {}
+    monkeypatch.setattr(time, "monotonic", lambda: seconds[0])
+    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs", seen=None, told=0.0)
+    client = SimpleNamespace(cluster=system, nthreads=lambda: cores)
+    for seconds[0] in range(0, 3600, 2):
+        assert current_workers(client) == {}
+    assert len(caplog.messages) == 59
+    assert "/logs" in caplog.messages[0]
+    cores["one"] = 2
+    assert sum(current_workers(client).values()) == 2
+    cores.clear()
+    seconds[0] += 300
+    assert current_workers(client) == {}
+    seconds[0] += 1
+    with pytest.raises(RunError, match=r"none has started for 300 s: .* /logs; rerun the same command"):
+        current_workers(client)
+    assert len(caplog.messages) == 59
+
+
+def test_match__ends_when_the_batch_system_takes_no_job(slurm, pair, tmp_path):
+    refused = tmp_path / "refused"
+    with submitted(pair, refused, 2, queue="nowhere"):
+        pass
+    log = (refused / "log").read_text()
+    assert log.startswith("sat-intervals: the batch system refuses the job: sbatch: error: invalid partition specified")
+    assert len(log.splitlines()) == 1

@@ -1,0 +1,428 @@
+"""A store that was damaged, or shares its folder with files of the user: right bytes or a clear line, nothing lost."""
+
+import itertools
+import json
+import os
+import shutil
+
+import pytest
+import yaml
+from helpers import OUTPUTS, hashes, invoke, write_pair
+from networks import random_weights, write_network
+
+from sat_intervals import match_pair
+from sat_intervals.config.pairs import PairOfBatch
+from sat_intervals.demo import make_scene
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.results import open_run
+from sat_intervals.run import pair as run
+from sat_intervals.run.assemble import assemble
+from sat_intervals.run.batch import match_batch
+from sat_intervals.run.job import prepare
+from sat_intervals.run.tile import match_tile
+from sat_intervals.store.tiles import DamagedTilesError, Store
+
+SHARDS = ["arrays.zarr/int16/c/0/1/0", "arrays.zarr/uint32/c/0/1/0", "arrays.zarr/right/c/1/0"]
+CHUNKS = ["arrays.zarr/seams/c/1/0/0/0/0/0", "arrays.zarr/histogram/c/1/0/0"]
+DESCRIPTIONS = [
+    f"arrays.zarr/{array}zarr.json" for array in ("", "int16/", "uint32/", "right/", "seams/", "histogram/")
+]
+DAMAGES = {
+    "empty": lambda content: b"",
+    "half": lambda content: content[: len(content) // 2],
+    "bit": lambda content: (
+        content[: len(content) // 2] + bytes([content[len(content) // 2] ^ 1]) + content[len(content) // 2 + 1 :]
+    ),
+    "no text": lambda content: b"\xff\xfe" + content,
+    "gone": None,
+}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A folder with left.tif, right.tif, settings.yaml of 2 x 3 tiles, and a run of it that kept its tiles."""
+    folder = tmp_path_factory.mktemp("scene")
+    more = {"tiles": {"size": 64, "overlap": 10}, "cluster": {"workers": 1}}
+    settings = write_pair(folder, make_scene(100, 150, seed=3), **more)
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "kept", settings, keep_tiles=True)
+    return folder
+
+
+def match(scene, out, *options, status=0):
+    """``match`` in this process: what it said."""
+    command = ["match", scene / "left.tif", scene / "right.tif", out, "--config", scene / "settings.yaml", "--quiet"]
+    result = invoke(*command, *options)
+    assert result.exit_code == status, result.stderr
+    assert "should not happen" not in result.stderr
+    assert status == 0 or len(result.stderr.splitlines()) == 1, result.stderr
+    return result.stderr
+
+
+def unfinished(scene, out):
+    """A copy of the run that kept its tiles, without its end."""
+    shutil.copytree(scene / "kept", out)
+    for name in OUTPUTS:
+        (out / name).unlink()
+    return out / "tiles"
+
+
+def damage(file, how):
+    if DAMAGES[how] is None:
+        file.unlink()
+    else:
+        file.write_bytes(DAMAGES[how](file.read_bytes()))
+
+
+def assert_same(scene, out):
+    assert hashes(out) == hashes(scene / "kept")
+
+
+# Every damage to one file of a kind, and one to each of the others.
+THOROUGH = [SHARDS[1], CHUNKS[1], *DESCRIPTIONS[:2], "records/1_0.json", "manifest.json"]
+ONCE = [SHARDS[0], SHARDS[2], CHUNKS[0], *DESCRIPTIONS[2:]]
+
+
+@pytest.mark.parametrize(("name", "how"), [*itertools.product(THOROUGH, DAMAGES), *itertools.product(ONCE, ["bit"])])
+def test_match__of_a_damaged_store_gives_the_right_bytes_or_names_the_way_out(scene, tmp_path, name, how):
+    tiles = unfinished(scene, tmp_path / "out")
+    before = {file: file.stat().st_mtime_ns for file in (tiles / "records").iterdir()}
+    damage(tiles / name, how)
+    if name == "manifest.json" and how in ("half", "bit", "no text"):
+        assert f"{tiles}/manifest.json cannot be read, " in (said := match(scene, tmp_path / "out", status=2))
+        assert "--overwrite" in said
+        match(scene, tmp_path / "out", "--overwrite")
+    else:
+        match(scene, tmp_path / "out", "--keep-tiles")
+        if name != "manifest.json":
+            again = {file for file in before if file.stat().st_mtime_ns != before[file]}
+            assert again == (set() if name in DESCRIPTIONS else {tiles / "records" / "1_0.json"})
+    assert_same(scene, tmp_path / "out")
+
+
+def test_match__matches_tiles_again_that_were_exchanged(scene, tmp_path):
+    shards = unfinished(scene, tmp_path / "out") / "arrays.zarr/uint32/c/0/0"
+    (shards / "0").rename(shards / "9")
+    (shards / "1").rename(shards / "0")
+    (shards / "9").rename(shards / "1")
+    match(scene, tmp_path / "out")
+    assert_same(scene, tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", [*SHARDS, *CHUNKS])
+def test_match__heals_what_is_damaged_before_it_is_assembled(scene, tmp_path, monkeypatch, name):
+    log = tmp_path / "log"
+    log.touch()
+
+    def and_damage(job, tile):
+        match_tile(job, tile)
+        if tile.name == "1_0" and tile.name not in log.read_text():
+            damage(job.store.home / name, "bit")
+        with log.open("a") as file:
+            print(tile.name, file=file)
+
+    monkeypatch.setattr(run, "match_tile", and_damage)
+    said = match(scene, tmp_path / "out")
+    assert f"tiles 1_0 in {tmp_path}/out/tiles are damaged" in said
+    assert sorted(log.read_text().split()) == ["0_0", "0_1", "0_2", "1_0", "1_0", "1_1", "1_2"]
+    assert_same(scene, tmp_path / "out")
+
+
+def test_match__ends_where_a_disk_damages_whatever_is_written(scene, tmp_path, monkeypatch):
+    def and_damage(job, tile):
+        match_tile(job, tile)
+        damage(job.store.home / f"arrays.zarr/uint32/c/0/{tile.grid_row}/{tile.grid_column}", "bit")
+
+    settings = yaml.safe_load((scene / "settings.yaml").read_text())
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "match_tile", and_damage)
+        with pytest.raises(
+            RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: rerun the same command: it matches them"
+        ):
+            match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+    assert not list((tmp_path / "out").glob("*.*"))
+    match(scene, tmp_path / "out")
+    assert_same(scene, tmp_path / "out")
+
+
+def test_match__in_a_file_system_of_fsspec_checks_what_it_reads(scene, tmp_path):
+    import fsspec
+
+    store = ("--store", "memory://damaged", "--keep-tiles")
+    match(scene, tmp_path / "out", *store)
+    memory = fsspec.filesystem("memory")
+    (tmp_path / "out" / "run.json").unlink()
+    (shard,) = (name for name in memory.find("/damaged") if name.endswith("/uint32/c/0/1/0"))
+    memory.pipe_file(shard, DAMAGES["bit"](memory.cat_file(shard)))
+    assert "are damaged" in match(scene, tmp_path / "out", *store)
+    assert_same(scene, tmp_path / "out")
+
+
+def test_strips__of_a_file_that_changes_between_two_of_them_end(tmp_path, scene):
+    settings = write_pair(tmp_path, make_scene(256, 150, seed=3), tiles={"size": 256, "overlap": 10})
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    job = prepare(*images, tmp_path / "out", settings)
+    match_pair(*images, tmp_path / "out", settings, keep_tiles=True)
+    assert len(list(job.store.strips(128, job.store.records()))) == 2
+    strips = job.store.strips(128, job.store.records())
+    next(strips)
+    damage(tmp_path / "out/tiles/arrays.zarr/uint32/c/0/0/0", "bit")
+    with pytest.raises(DamagedTilesError, match=r"tiles 0_0 in .* are damaged"):
+        next(strips)
+
+
+@pytest.mark.peer("onnxruntime", "mc_cnn")
+@pytest.mark.parametrize("how", DAMAGES)
+def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp_path, how):
+    weights = write_network(tmp_path / "network.onnx", random_weights())
+    settings = yaml.safe_load((scene / "settings.yaml").read_text())
+    settings |= {"cost": {"method": "mccnn", "weights": str(weights)}}
+    images, out = (scene / "left.tif", scene / "right.tif"), tmp_path / "out"
+    once = match_pair(*images, out, settings, keep_tiles=True)
+    expected = hashes(out)
+    for name in ("run.json", "tiles/records/0_0.json"):
+        (out / name).unlink()
+    damage(out / "tiles" / "normalization.json", how)
+    again = match_pair(*images, out, settings)
+    assert again["normalization"] == once["normalization"]
+    assert hashes(out) == expected
+
+
+@pytest.mark.peer("onnxruntime", "mc_cnn")
+def test_match__measures_images_again_where_their_figures_are_damaged_before_it_is_assembled(
+    scene, tmp_path, monkeypatch
+):
+    weights = write_network(tmp_path / "network.onnx", random_weights())
+    settings = yaml.safe_load((scene / "settings.yaml").read_text())
+    settings |= {"cost": {"method": "mccnn", "weights": str(weights)}}
+    damaged = []
+
+    def damage_and_assemble(job, *arguments, **named):
+        if not damaged:
+            damaged.append(job.store.normalization())
+            damage(job.store.home / "normalization.json", "empty")
+        return assemble(job, *arguments, **named)
+
+    monkeypatch.setattr(run, "assemble", damage_and_assemble)
+    report = match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+    assert report["normalization"] == damaged[0]
+
+
+@pytest.mark.parametrize("text", ["", "{", "5", "\xff"])
+def test_match__finds_its_tiles_where_the_note_of_their_place_is_damaged(scene, tmp_path, text):
+    store = ("--store", tmp_path / "store", "--keep-tiles")
+    match(scene, tmp_path / "out", *store)
+    (tmp_path / "out" / "run.json").unlink()
+    note = tmp_path / "out" / "tiles" / "store.json"
+    note.write_text(text, encoding="latin-1")
+    said = match(scene, tmp_path / "out", status=2)
+    assert f"{note} cannot be read: give the same --store as before to resume, or --overwrite" in said
+    records = {file: file.stat().st_mtime_ns for file in (tmp_path / "store").glob("*/records/*")}
+    assert len(records) == 6
+    match(scene, tmp_path / "out", *store)
+    assert {file: file.stat().st_mtime_ns for file in records} == records
+    assert_same(scene, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("records/1_0.json", b"{}"),
+        ("records/1_0.json", b'{"files": 5}'),
+        ("manifest.json", b"[]"),
+        ("manifest.json", b'{"region": "\xff"}'),
+        ("failures/1_0.json", b"\xff{"),
+    ],
+)
+def test_status__of_a_damaged_store_says_what_it_can(scene, tmp_path, name, content):
+    tiles = unfinished(scene, tmp_path / "out")
+    (tiles / "records/1_0.json").unlink()
+    (tiles / name).write_bytes(content)
+    result = invoke("status", tmp_path / "out")
+    assert len(result.output.splitlines()) == 1 + name.startswith("failures")
+    assert ("--overwrite" if name == "manifest.json" else "5 of 6 tiles done") in result.output
+    match(scene, tmp_path / "out", *(["--overwrite"] if name == "manifest.json" else []))
+    assert_same(scene, tmp_path / "out")
+
+
+def dies(*arguments, **named):
+    raise RunError("killed")
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_path, monkeypatch, is_begun, elsewhere):
+    out, store = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, *store, status=1)
+    report = (out / "run.json").read_bytes()
+    if is_begun:
+        for file in tmp_path.rglob("manifest.json"):
+            file.unlink()
+    assert f"{out} already holds a run" in match(scene, out, *store, "--tile-size", "128", status=2)
+    settings = yaml.safe_load((scene / "settings.yaml").read_text()) | {"median": None}  # of which no tile knows
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(scene / "left.tif", scene / "right.tif", out, settings)
+    assert list(tmp_path.rglob("records/*.json"))
+    assert match(scene, out, *store) == (
+        f"sat-intervals: the run in {out} was already complete; its remaining tiles were removed\n"
+    )
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+    assert not list(tmp_path.rglob("arrays.zarr"))
+    assert (out / "run.json").read_bytes() == report
+    assert "already holds a run" in match(scene, out, *store, status=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [("intervals.tif", "half"), ("validity.tif", "bit"), *itertools.product(["run.json"], ["half", "bit", "empty"])],
+)
+def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tmp_path, monkeypatch, name, how):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, status=1)
+    damage(out / name, how)
+    said = match(scene, out, status=2)
+    assert f"{out / name} was changed after the run, but the tiles still exist: delete it" in said
+    assert (out / name).stat().st_size == 0 or how != "empty"
+    (out / name).unlink()
+    match(scene, out)
+    assert_same(scene, out)
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+MARKS = [".sat-intervals.finished", ".sat-intervals.replacing"]
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "store.json", *MARKS, "arrays.zarr/zarr.json"])
+def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
+    tiles = unfinished(scene, tmp_path / "out")
+    (tiles / name).unlink(missing_ok=True)
+    os.mkfifo(tiles / name)
+    assert f"{tiles / name} is a named pipe" in match(scene, tmp_path / "out", status=2)
+
+
+def with_files(folder, names):
+    """Files of the user, with their content."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(f"mine: {name}")
+    return {folder / name: f"mine: {name}" for name in names}
+
+
+def assert_kept(mine):
+    assert {file: file.read_text() for file in mine} == mine
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_path, monkeypatch, elsewhere):
+    out, options = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
+    match(scene, out, *options, "--keep-tiles")
+    (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
+    shutil.rmtree(tiles)
+    shutil.rmtree(out)
+    names = ["notes.txt", "records/notes.json", "failures/all.json", "arrays.zarr/int16/table", "arrays.zarr/.zattrs"]
+    mine = with_files(tiles, names)
+    top = [
+        "records/0_0.json", "failures/0_0.json", "arrays.zarr/zarr.json", "normalization.json", "manifest.json"
+    ]  # fmt: skip
+    if elsewhere:
+        mine |= with_files(tmp_path / "store", top)
+    match(scene, out, *options)
+    assert_kept(mine)
+    match(scene, out, *options, "--overwrite", "--keep-tiles")
+    assert_kept(mine)
+    mine |= with_files(tiles, ["records/77_0.json"])
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "assembled", dies)
+        match(scene, out, *options, "--overwrite", status=1)
+    assert_kept(mine)
+    match(scene, out, *options, "--overwrite")
+    assert_kept(mine)
+    assert {file for file in tiles.rglob("*") if file.is_file()} == {file for file in mine if tiles in file.parents}
+
+
+@pytest.mark.parametrize("name", ["records/0_0.json", *SHARDS[:1], "normalization.json", "manifest.json"])
+@pytest.mark.parametrize("options", [[], ["--overwrite"]])
+def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
+    mine = with_files(tmp_path / "out" / "tiles", [name])
+    said = match(scene, tmp_path / "out", *options, status=2)
+    assert f"{tmp_path}/out/tiles has files that no run made, such as {name}: move them away" in said
+    assert_kept(mine)
+
+
+def test_match__takes_an_input_of_a_damaged_manifest_for_unknown(scene, tmp_path):
+    tiles = unfinished(scene, tmp_path / "out")
+    manifest = json.loads((tiles / "manifest.json").read_text())
+    manifest["inputs"]["left"]["sha256"] = manifest["inputs"]["left"]["sha256"][::-1]
+    (tiles / "manifest.json").write_text(json.dumps(manifest))
+    assert "it is damaged: --overwrite" in match(scene, tmp_path / "out", status=2)
+
+
+@pytest.mark.parametrize("how", ["half", "bit"])
+@pytest.mark.parametrize("name", ["intervals.tif", "validity.tif"])
+def test_match_batch__takes_no_damaged_result_for_done(scene, tmp_path, name, how):
+    pairs = [PairOfBatch("kept", str(scene / "left.tif"), str(scene / "right.tif"))]
+    shutil.copytree(scene / "kept", tmp_path / "kept")
+    assert match_batch(pairs, tmp_path, scene / "settings.yaml")["kept"]["state"] == "done before"
+    damage(tmp_path / "kept" / name, how)
+    before = (tmp_path / "kept" / name).read_bytes()
+    told = match_batch(pairs, tmp_path, scene / "settings.yaml", keep_tiles=True)["kept"]
+    assert told["state"] == "failed"
+    assert f"{tmp_path}/kept/{name} " in told["error"]
+    assert told["error"].endswith(f"move {tmp_path}/kept away, or match again with --overwrite")
+    assert (tmp_path / "kept" / name).read_bytes() == before
+    match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)
+    assert_same(scene, tmp_path / "kept")
+
+
+def test_match__keeps_the_tiles_of_a_dead_run_of_which_a_bit_flipped(scene, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, status=1)
+    status = (out / "validity.tif").stat()
+    damage(out / "validity.tif", "bit")
+    os.utime(out / "validity.tif", ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert f"{out}/validity.tif is not what the run published" in match(scene, out, status=2)
+    assert list((out / "tiles" / "records").glob("*.json"))
+
+
+@pytest.mark.parametrize("command", ["evaluate OUT", "report OUT", "plot OUT", "export OUT TARGET --to otb"])
+def test_commands__refuse_a_result_of_another_size(scene, tmp_path, command):
+    shutil.copytree(scene / "kept", tmp_path / "OUT")
+    with (tmp_path / "OUT" / "intervals.tif").open("ab") as file:
+        file.write(b"0")  # which GDAL does not see
+    words = [str(tmp_path / word) if word.isupper() else word for word in command.split()]
+    result = invoke(*words)
+    size = (scene / "kept" / "intervals.tif").stat().st_size
+    assert f"{tmp_path}/OUT/intervals.tif has {size + 1} bytes, by run.json {size}; it is damaged" in result.stderr
+    assert result.exit_code == 2
+
+
+def test_open_run__of_a_report_without_sizes_opens(scene, tmp_path):
+    shutil.copytree(scene / "kept", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    del report["files"]
+    (tmp_path / "out" / "run.json").write_text(json.dumps(report))
+    open_run(tmp_path / "out").check_whole()
+
+
+def test_match__keeps_empty_files_in_a_folder_without_signs_of_a_run(scene, tmp_path):
+    mine = [tmp_path / "out" / "tiles" / name for name in ("records/9_9.json", "arrays.zarr/int16/c/0/9/9")]
+    for file in mine:
+        file.parent.mkdir(parents=True)
+        file.touch()
+    match(scene, tmp_path / "out")
+    assert_same(scene, tmp_path / "out")
+    assert [file.stat().st_size for file in mine] == [0, 0]
+
+
+@pytest.mark.parametrize("name", [SHARDS[0], "records/1_0.json"])
+def test_match__names_a_folder_where_a_file_of_a_tile_must_be(scene, tmp_path, name):
+    (tmp_path / "out" / "tiles" / name).mkdir(parents=True)
+    command = ["match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--config", scene / "settings.yaml"]
+    result = invoke(*command, "--quiet")
+    assert result.exit_code == 1
+    assert f"tile 1_0: {tmp_path}/out/tiles/{name}: Is a directory" in result.stderr.splitlines()[1]

@@ -1,0 +1,692 @@
+"""Files of the user: inputs, what lies in a folder by chance, and a good run are never lost, whatever is asked."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import zipfile
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from finished import random_bands, write_run
+from helpers import COMMAND, PLACE, hashes, invoke, write_pair
+
+from sat_intervals.config.pairs import PairOfBatch
+from sat_intervals.demo import make_scene
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.interop.export import export
+from sat_intervals.raster import (
+    RUN_FILES,
+    Georeferencing,
+    OutputError,
+    OutputWriter,
+    open_image,
+    other_files,
+    put_back,
+    write_layer,
+)
+from sat_intervals.raster.identity import ChangedInputError, identity
+from sat_intervals.results import Run, open_results
+from sat_intervals.run import assemble
+from sat_intervals.run.batch import match_batch
+from sat_intervals.run.job import prepare
+from sat_intervals.run.pair import match_pair
+from sat_intervals.run.tile import match_tile
+from sat_intervals.show.maps import draw_overview
+from sat_intervals.show.report import write_report
+from sat_intervals.store.folder import LocalFolder
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+LOCK = ".sat-intervals.lock"
+VRT = """<VRTDataset rasterXSize="180" rasterYSize="150"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
+<SourceFilename relativeToVRT="1">mask.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """A folder with left.tif, right.tif, mask.tif, mask.vrt of it, and other.tif; and settings of six tiles."""
+    scene = make_scene(150, 180, seed=2)
+    write_layer(tmp_path / "other.tif", scene.right[::-1].copy(), 0, PLACE)
+    write_layer(tmp_path / "mask.tif", np.zeros(scene.left.shape, np.uint8), 0, PLACE)
+    (tmp_path / "mask.vrt").write_text(VRT)
+    tiles, cluster = {"size": 64, "overlap": 20}, {"workers": 1, "retries": 0}
+    disparity = {"minimum": -18, "maximum": 40}
+    return tmp_path, write_pair(tmp_path, scene, disparity=disparity, tiles=tiles, cluster=cluster)
+
+
+def refused(arguments, *parts):
+    """Run a command that must end with status 2, and one line."""
+    result = invoke(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.count("\n") == 1
+    for part in parts:
+        assert part in result.stderr
+
+
+def contents(folder):
+    return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+# Inputs that change
+
+
+def swap(file, content):
+    """Put another file in the place of one, of the same size and time where it can be."""
+    status, new = file.stat(), file.with_name("new")
+    new.write_bytes(content)
+    os.utime(new, ns=(status.st_atime_ns, status.st_mtime_ns))
+    os.replace(new, file)
+
+
+@pytest.mark.parametrize("stage", ["tiles", "bands"])
+@pytest.mark.parametrize("name", ["right.tif", "mask.tif", "link"])
+def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, name, stage):
+    folder, settings = pair
+    right, mask, kept = folder / "right.tif", folder / "mask.vrt", (folder / "right.tif").read_bytes()
+    if name == "link":
+        right = folder / "link.tif"
+        right.symlink_to("right.tif")
+    before = (folder / "mask.tif").read_bytes()
+    write_layer(folder / "masked.tif", np.ones((150, 180), np.uint8), 0, PLACE)
+    undone = True
+
+    def progress(now, done, total):
+        nonlocal undone
+        if now == stage and done and undone:
+            undone = False
+            if name == "link":
+                right.unlink()
+                right.symlink_to("other.tif")
+            else:
+                swap(folder / name, (folder / ("other.tif" if name == "right.tif" else "masked.tif")).read_bytes())
+
+    images = open_image(folder / "left.tif", mask=mask), open_image(right)
+    with pytest.raises(ChangedInputError, match=rf"{name}.* was replaced or changed during the run") as error:
+        match_pair(*images, folder / "out", settings, progress=progress)
+    assert "\n" not in str(error.value)
+    assert isinstance(error.value, RunError)
+    assert not list((folder / "out").glob("*.*"))
+    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: inputs\..*sha256 was "):
+        match_pair(open_image(folder / "left.tif", mask=mask), open_image(right), folder / "out", settings)
+    if name == "link":
+        right.unlink()
+        right.symlink_to("right.tif")
+    swap(folder / "mask.tif", before)
+    swap(folder / "right.tif", kept)
+    images = open_image(folder / "left.tif", mask=mask), open_image(right)
+    match_pair(*images, folder / "out", settings)
+    match_pair(*images, folder / "once", settings)
+    assert hashes(folder / "out") == hashes(folder / "once")
+
+
+@pytest.mark.parametrize("kind", ["/vsizip/{}", "/vsizip/{{{}}}"])
+def test_match_pair__knows_an_image_in_an_archive(pair, kind):
+    folder, settings = pair
+    left = kind.format(folder / "a.zip") + "/left.tif"
+
+    def pack(name):
+        with zipfile.ZipFile(folder / "a.zip", "w") as archive:
+            archive.write(folder / name, "left.tif")
+
+    pack("left.tif")
+    report = match_pair(left, folder / "right.tif", folder / "out", settings, keep_tiles=True)
+    assert report["inputs"]["left"]["path"] == left
+    assert report["inputs"]["left"]["sha256"] == identity(str(folder / "a.zip"))["sha256"]
+    assert open_results(folder / "out").left.path == left
+    (folder / "out" / "run.json").unlink()
+    (folder / "out" / "tiles" / "records" / "1_1.json").unlink()
+    pack("other.tif")
+    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: inputs\.left\.bytes was "):
+        match_pair(left, folder / "right.tif", folder / "out", settings)
+    (folder / "in" / "tiles").mkdir(parents=True)
+    inside = shutil.copy(folder / "a.zip", folder / "in" / "tiles")
+    with pytest.raises(SatIntervalsError, match="is an input inside"):
+        match_pair(f"/vsizip/{inside}/left.tif", folder / "right.tif", folder / "in", settings)
+
+
+def test_other_files__are_those_of_the_sources_of_a_virtual_raster_too(pair):
+    folder, _ = pair
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(folder / "mask.tif", "r+") as file:
+        file.write_mask(np.full((150, 180), 255, np.uint8))
+    assert other_files(str(folder / "mask.vrt")) == [str(folder / "mask.tif"), str(folder / "mask.tif.msk")]
+
+
+def test_match_pair__goes_on_where_an_input_is_touched_and_not_changed(pair):
+    folder, settings = pair
+
+    def progress(stage, done, total):
+        if stage == "tiles":
+            (folder / "left.tif").chmod(0o600 + done % 2)
+            shutil.copy(folder / "right.tif", folder / "copy")
+            os.replace(folder / "copy", folder / "right.tif")
+
+    report = match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, progress=progress)
+    assert report["inputs"]["right"]["sha256"] == identity(str(folder / "right.tif"))["sha256"]
+
+
+def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
+    folder, settings = pair
+    job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    job.begin()
+    (folder / "left.tif").unlink()
+    monkeypatch.setattr("sat_intervals.run.tile.match_patch", None)
+    with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed"):
+        match_tile(job, next(iter(job.store.grid)))
+
+
+# Inputs among the outputs
+
+
+@pytest.mark.parametrize("way", ["path", "symlink", "hard link", "mask", "tiles", "source"])
+def test_match__refuses_an_input_that_it_would_lose(pair, way):
+    folder, _ = pair
+    out = folder / "out"
+    (out / "tiles").mkdir(parents=True)
+    left, options, target = folder / "left.tif", [], out / "intervals.tif"
+    if way == "path":
+        left = shutil.copy(left, target)
+    elif way == "symlink":
+        left = shutil.copy(left, target)
+        (folder / "link.tif").symlink_to(target)
+        left = folder / "link.tif"
+    elif way == "hard link":
+        target.hardlink_to(left)
+    elif way == "mask":
+        target = shutil.copy(folder / "mask.tif", out / "validity.tif")
+        options = ["--left-mask", target]
+    elif way == "tiles":
+        left = target = shutil.copy(left, out / "tiles" / "left.tif")
+    else:
+        target = shutil.copy(folder / "mask.tif", out / "validity.tif")
+        (folder / "source.vrt").write_text(VRT.replace("mask.tif", "out/validity.tif"))
+        options = ["--left-mask", folder / "source.vrt"]
+    before = contents(folder)
+    command = ["match", left, folder / "right.tif", out, "--config", folder / "settings.yaml", "--overwrite"]
+    refused([*command, *options], "is an input", "choose another output")
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("name", ["run.json", "tiles/manifest.json"])
+def test_commands__refuse_settings_that_they_would_lose(pair, name):
+    folder, _ = pair
+    for out in (folder / "out", folder / "batch" / "one"):
+        (out / "tiles").mkdir(parents=True)
+        shutil.copy(folder / "settings.yaml", out / name)
+    rows = [{"name": "one", "left": str(folder / "left.tif"), "right": str(folder / "right.tif")}]
+    (folder / "pairs.json").write_text(json.dumps(rows))
+    before = contents(folder)
+    config = ["--config", folder / "out" / name, "--overwrite"]
+    refused(["match", folder / "left.tif", folder / "right.tif", folder / "out", *config], f"{name} is an input")
+    refused(["demo", folder / "out", "--size", "100", "100", *config], f"{name} is an input")
+    config = ["--config", folder / "batch" / "one" / name, "--overwrite"]
+    refused(["batch", folder / "pairs.json", folder / "batch", *config], f"{name} is an input")
+    assert contents(folder) == before
+
+
+def test_match__takes_no_file_of_the_user_for_a_mark_of_its_own(pair):
+    folder, settings = pair
+    images, out = (folder / "left.tif", folder / "right.tif"), folder / "out"
+    marks = {out / "tiles" / name: "mine" for name in ("replacing", "finished")}
+    (out / "tiles").mkdir(parents=True)
+    for mark, text in marks.items():
+        mark.write_text(text)
+    match_pair(*images, out, settings)
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(*images, out, settings | {"median": None})
+    assert {mark: mark.read_text() for mark in marks} == marks
+
+
+def test_match__refuses_an_input_inside_the_store(pair):
+    folder, settings = pair
+    settings["cluster"]["store"] = str(folder / "store")
+    images = folder / "left.tif", folder / "right.tif"
+    place = Path(prepare(*images, folder / "out", settings).store.elsewhere)
+    (place / "records").mkdir(parents=True)
+    shutil.move(folder / "left.tif", place / "records" / "left.json")
+    (folder / "left.tif").symlink_to(place / "records" / "left.json")
+    with pytest.raises(SatIntervalsError, match="is an input inside"):
+        match_pair(*images, folder / "out", settings, overwrite=True)
+
+
+def test_batch__refuses_an_input_that_another_pair_or_its_report_would_replace(pair):
+    folder, settings = pair
+    out = folder / "out"
+    (out / "one").mkdir(parents=True)
+    shutil.copy(folder / "mask.tif", out / "one" / "validity.tif")
+    images = str(folder / "left.tif"), str(folder / "right.tif")
+    pairs = [PairOfBatch("one", *images), PairOfBatch("two", *images, left_mask=str(out / "one" / "validity.tif"))]
+    before = contents(folder)
+    with pytest.raises(SatIntervalsError, match=r"is an input, and .* would be written"):
+        match_batch(pairs, out, settings, overwrite=True)
+    assert contents(folder) == before
+    (out / "batch.json").write_text(json.dumps([{"name": "one", "left": images[0], "right": images[1]}]))
+    before = contents(folder)
+    refused(["batch", out / "batch.json", out, "--config", folder / "settings.yaml"], "batch.json is an input")
+    assert contents(folder) == before
+
+
+def test_log_file__is_no_input(pair):
+    folder, _ = pair
+    before = contents(folder)
+    command = ["match", folder / "left.tif", folder / "right.tif", folder / "out", "--disparity", "-18", "40"]
+    refused([*command, "--log-file", folder / "left.tif"], "left.tif is an input")
+    assert contents(folder) == before
+
+
+@pytest.fixture
+def finished(tmp_path):
+    """A run made up, with its images; its left image bears a name that each tool writes to."""
+    return write_run(tmp_path, *random_bands(40, 50))
+
+
+@pytest.mark.parametrize("name", ["run.json", "intervals.tif"])
+def test_log_file__is_no_file_of_the_run(finished, name):
+    before = contents(finished)
+    refused(["report", finished, "--log-file", finished / name], f"{name} is an input")
+    assert contents(finished) == before
+
+
+def test_export__ends_where_another_run_replaces_the_one_it_reads(finished, tmp_path, monkeypatch):
+    read = Run.read_bands
+
+    def and_replace(run, window):
+        shutil.copy(finished / "run.json", tmp_path / "new")
+        os.replace(tmp_path / "new", finished / "run.json")
+        return read(run, window)
+
+    monkeypatch.setattr(Run, "read_bands", and_replace)
+    with pytest.raises(RunError, match="was replaced while it was read: rerun the command"):
+        export(finished, "otb", tmp_path / "target")
+    assert not list((tmp_path / "target").glob("*.tif"))
+
+
+def rename_left(out, name):
+    """Give the left image of a run another name beside its files."""
+    report = json.loads((out / "run.json").read_text())
+    shutil.move(report["inputs"]["left"]["path"], out / name)
+    report["inputs"]["left"]["path"] = str(out / name)
+    (out / "run.json").write_text(json.dumps(report))
+
+
+@pytest.mark.parametrize(
+    ("form", "name"), [("otb", "mask.tif"), ("s2p", "rectified_disp.tif"), ("cars", "epi_disp.tif")]
+)
+def test_export__refuses_to_replace_an_image_of_the_run(finished, form, name):
+    rename_left(finished, name)
+    before = contents(finished)
+    with pytest.raises(SatIntervalsError, match=rf"{name} is an input"):
+        export(finished, form, finished)
+    assert contents(finished) == before
+
+
+def test_export__refuses_to_replace_a_file_of_the_run_through_a_link(finished, tmp_path):
+    (tmp_path / "target").mkdir()
+    (tmp_path / "target" / "mask.tif").symlink_to(finished / "validity.tif")
+    with pytest.raises(SatIntervalsError, match=r"validity\.tif is an input"):
+        export(finished, "otb", tmp_path / "target")
+
+
+def test_report_and_plot__refuse_to_replace_an_image_of_the_run(finished):
+    rename_left(finished, "report.html")
+    before = contents(finished)
+    refused(["report", finished], "report.html is an input")
+    shutil.move(finished / "report.html", finished / "left.tif")
+    rename_left_back = json.loads((finished / "run.json").read_text())
+    rename_left_back["inputs"]["left"]["path"] = str(finished / "left.tif")
+    (finished / "run.json").write_text(json.dumps(rename_left_back))
+    rename_left(finished, "overview.png")
+    refused(["plot", finished], "overview.png is an input")
+    assert (finished / "overview.png").read_bytes() == before[str(finished / "report.html")]
+
+
+# Files of others in the folders
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "folder", "pipe"])
+def test_locked__keeps_what_is_not_its_lock(tmp_path, kind):
+    precious, folder = tmp_path / "precious", tmp_path / "folder"
+    folder.mkdir()
+    precious.write_text("mine")
+    lock = folder / LOCK
+    if kind == "link":
+        lock.symlink_to(precious)
+    elif kind == "folder":
+        lock.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(lock)
+    else:
+        lock.write_text("mine")
+    (folder / ".lock").write_text("mine")
+
+    def work():
+        with LocalFolder(folder).locked():
+            assert kind == "file"
+
+    if kind == "file":
+        work()
+        assert lock.read_text() == "mine"
+    else:
+        with pytest.raises(
+            SatIntervalsError, match=r"cannot be written: (.*symbolic link|Is a dir|.*not a regular file)"
+        ):
+            work()
+    assert os.path.lexists(lock)
+    assert (precious.read_text(), (folder / ".lock").read_text()) == ("mine", "mine")
+
+
+@pytest.mark.parametrize("inner", ["", "files", "files/replaced"])
+def test_output_writer__adopts_no_folder_through_a_link(tmp_path, inner):
+    precious = tmp_path / "precious"
+    (precious / "files" / "replaced").mkdir(parents=True)
+    (precious / "files" / "strips-intervals.tif").write_text("mine")
+    (precious / "files" / "replaced" / "intervals.tif").write_text("mine")
+    link = tmp_path / "out" / ".unpublished-intervals.tif" / inner
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if inner == "":
+        link.rmdir() if link.exists() else None
+    (tmp_path / "out" / ".unpublished-intervals.tif" / inner).symlink_to(precious / inner)
+    before = contents(precious)
+    with (
+        pytest.raises(OutputError, match="is a symbolic link"),
+        OutputWriter(tmp_path / "out", RUN_FILES, 4, 5, Georeferencing(), {}),
+    ):
+        pass
+    assert contents(precious) == before
+
+
+def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files"
+    (place / "replaced").mkdir(parents=True)
+    for file in (place / "mine.txt", place / "replaced" / "mine.txt", place / "strips-intervals.tif"):
+        file.write_text("mine")
+    with OutputWriter(tmp_path, RUN_FILES, 4, 5, Georeferencing(), {}) as writer:
+        writer.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        writer.publish()
+    names = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
+    hidden = ".unpublished-intervals.tif/files"
+    assert names == [f"{hidden}/mine.txt", f"{hidden}/replaced/mine.txt", "intervals.tif", "validity.tif"]
+
+
+def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(pair):
+    folder, settings = pair
+    (folder / "precious" / "records").mkdir(parents=True)
+    (folder / "precious" / "records" / "0_0.json").write_text("mine")
+    (folder / "real").mkdir()
+    (folder / "out").symlink_to("real")
+    (folder / "real" / "tiles").symlink_to(folder / "precious")
+    images = folder / "left.tif", folder / "right.tif"
+    before = contents(folder)
+    with pytest.raises(SatIntervalsError, match="tiles is a symbolic link"):
+        match_pair(*images, folder / "out", settings, overwrite=True)
+    assert contents(folder) == before
+    (folder / "real" / "tiles").unlink()
+    match_pair(*images, folder / "out", settings)
+    assert (folder / "real" / "run.json").exists()
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["records", "failures", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
+def test_match__refuses_a_link_among_the_folders_of_its_tiles(pair, name, overwrite):
+    folder, settings = pair
+    (folder / "precious").mkdir()
+    (folder / "precious" / "0_0.json").write_text("mine")
+    link = folder / "out" / "tiles" / name
+    link.parent.mkdir(parents=True)
+    link.symlink_to(folder / "precious")
+    with pytest.raises(SatIntervalsError, match=rf"{name} is a file or a symbolic link, .*: move it away"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, overwrite=overwrite)
+    assert contents(folder / "precious") == {str(folder / "precious" / "0_0.json"): b"mine"}
+
+
+def test_match__takes_the_tiles_of_a_user_for_no_run_of_its_own(pair):
+    folder, settings = pair
+    (folder / "out" / "tiles").mkdir(parents=True)
+    (folder / "out" / "tiles" / "12_34.png").write_text("mine")
+    (folder / "out" / "validity.tif").write_text("mine")
+    before = contents(folder)
+    with pytest.raises(SatIntervalsError, match=r"already holds a run \(validity.tif\)"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("content", [b'{"finished": 1}', b"II*\0some raster", b"<html>"])
+def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
+    file = tmp_path / "file"
+    file.write_bytes(content)
+    refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", file], "is no log", "--log-file")
+    assert file.read_bytes() == content
+
+
+@pytest.fixture
+def elsewhere(tmp_path):
+    """A web server that counts what it is asked for, and a folder of the user's own that looks like a store."""
+    asked = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_error(404)
+
+        do_HEAD = do_GET  # noqa: N815
+
+        def log_message(self, *_):
+            """Say nothing."""
+
+    precious = tmp_path / "precious"
+    for name in ("records/0_0.json", "arrays.zarr/zarr.json", "manifest.json", "normalization.json"):
+        (precious / name).parent.mkdir(parents=True, exist_ok=True)
+        (precious / name).write_text("{}")
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield precious, f"http://127.0.0.1:{server.server_address[1]}/store/tiles", asked
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize("kind", ["folder", "web"])
+def test_commands__follow_no_note_of_a_received_folder(pair, elsewhere, kind):
+    folder, settings = pair
+    precious, url, asked = elsewhere
+    noted = url if kind == "web" else str(precious)
+    out = folder / "batch" / "out"
+    images = folder / "left.tif", folder / "right.tif"
+    (out / "tiles").mkdir(parents=True)
+    (out / "tiles" / "store.json").write_text(json.dumps(noted))
+    before = contents(precious)
+    command = ["match", *images, out, "--config", folder / "settings.yaml", "--quiet"]
+    says = f"places the tiles of the run in {noted}", f"give --store {noted.rpartition('/')[0]}"
+    refused(command, *says)
+    refused(["status", out], *says)
+    result = invoke(*command, "--overwrite")
+    assert (result.exit_code, result.stderr.count("\n")) == (0, 1)
+    assert f"places the tiles of the run in {noted}: they are kept" in result.stderr
+    (out / "tiles").mkdir()
+    (out / "tiles" / "store.json").write_text(json.dumps(noted))
+    report = match_batch([PairOfBatch("out", *map(str, images))], folder / "batch", settings)
+    assert report["out"]["state"] == "done before"
+    (out / "run.json").unlink()
+    report = match_batch([PairOfBatch("out", *map(str, images))], folder / "batch", settings)
+    assert says[0] in report["out"]["error"]
+    assert invoke("status", folder / "batch").exit_code == 0
+    assert contents(precious) == before
+    assert asked == []
+
+
+def test_match__with_the_noted_store_deletes_only_what_its_manifest_names(pair, elsewhere):
+    folder, settings = pair
+    precious, _, _ = elsewhere
+    (folder / "out" / "tiles").mkdir(parents=True)
+    (folder / "out" / "tiles" / "store.json").write_text(json.dumps(str(precious)))
+    before = contents(precious)
+    settings["cluster"]["store"] = str(precious.parent)
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, overwrite=True)
+    assert contents(precious) == before
+
+
+def test_status__looks_into_the_store_that_is_named(pair):
+    folder, settings = pair
+    settings["cluster"]["store"] = str(folder / "store")
+    job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    job.begin()
+    refused(
+        ["status", folder / "out"],
+        f"places the tiles of the run in {job.store.elsewhere}",
+        f"give --store {folder / 'store'}",
+    )
+    result = invoke("status", folder / "out", "--store", folder / "store")
+    assert (result.exit_code, "0 of 9 tiles done" in result.output) == (0, True), result.output
+
+
+# A good run
+
+
+def fail(*arguments, **options):
+    raise OSError(5, "Input/output error")
+
+
+def test_demo__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    command = ["demo", str(out), "--size", "120", "140", "--quiet"]
+    assert invoke(*command).exit_code == 0
+    names = ["left.tif", "right.tif", "truth.tif", "intervals.tif", "validity.tif", "run.json"]
+    before = {name: (out / name).read_bytes() for name in names}
+    with monkeypatch.context() as patch:
+        patch.setattr(assemble, "postprocess_strips", fail)
+        assert invoke(*command, "--seed", "1", "--overwrite").exit_code == 1
+    assert {name: (out / name).read_bytes() for name in names} == before
+    assert sorted(path.name for path in out.iterdir()) == sorted([*names, "tiles"])
+    assert invoke(*command, "--seed", "1").exit_code == 0
+    assert sorted(path.name for path in out.iterdir()) == sorted(names)
+    assert (out / "left.tif").read_bytes() != before["left.tif"]
+    assert (
+        identity(str(out / "left.tif"))["sha256"]
+        == json.loads((out / "run.json").read_text())["inputs"]["left"]["sha256"]
+    )
+
+
+KILLED = """import os, sys
+from sat_intervals.cli import main
+from sat_intervals.run import pair
+pair.match_pair = lambda *arguments, **options: os.kill(os.getpid(), 9)
+main(sys.argv[1:])"""
+
+
+@pytest.mark.process
+def test_demo__that_was_killed_is_rolled_back_or_replaced_by_the_next(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    command = ["demo", str(out), "--size", "120", "140", "--quiet"]
+    assert invoke(*command).exit_code == 0
+    before = contents(out)
+    killed = [sys.executable, "-c", KILLED, *command, "--seed", "1", "--overwrite"]
+    for _ in range(2):  # of which the second finds what the first left
+        assert subprocess.run(killed, check=False).returncode == -9
+    assert (out / "left.tif").read_bytes() != before[str(out / "left.tif")]
+    assert invoke(*command, "--seed", "2").exit_code == 2  # nothing is replaced unasked
+    with monkeypatch.context() as patch:
+        patch.setattr("sat_intervals.run.pair.match_pair", fail)
+        assert invoke(*command, "--seed", "2", "--overwrite").exit_code == 1
+    assert contents(out) == before
+    assert subprocess.run(killed, check=False).returncode == -9
+    assert invoke(*command, "--seed", "1", "--overwrite").exit_code == 0
+    assert contents(out).keys() == before.keys()
+    assert (out / "left.tif").read_bytes() != before[str(out / "left.tif")]
+
+
+def test_demo__replaces_links_and_does_not_follow_them(tmp_path):
+    precious = tmp_path / "precious.tif"
+    precious.write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "left.tif").symlink_to(precious)
+    (tmp_path / "out" / "right.tif").hardlink_to(precious)
+    command = ["demo", str(tmp_path / "out"), "--size", "120", "140", "--quiet"]
+    assert invoke(*command).exit_code == 2
+    assert invoke(*command, "--overwrite").exit_code == 0
+    assert precious.read_text() == "mine"
+
+
+def test_put_back__leaves_what_is_published(tmp_path):
+    file, report = tmp_path / "left.tif", tmp_path / "run.json"
+    file.write_text("before")
+    report.write_text("before")
+
+    def interrupted():
+        with put_back([file], report):
+            file.unlink()
+            file.write_text("new")
+            (tmp_path / "new").write_text("new")
+            os.replace(tmp_path / "new", report)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert contents(tmp_path) == {str(file): b"new", str(report): b"new"}
+
+
+def test_match_batch__that_fails_to_overwrite_keeps_the_runs(pair, monkeypatch):
+    folder, settings = pair
+    pairs = [PairOfBatch("one", str(folder / "left.tif"), str(folder / "right.tif"))]
+    match_batch(pairs, folder / "out", settings)
+    before = contents(folder / "out" / "one")
+    monkeypatch.setattr(assemble, "postprocess_strips", fail)
+    report = match_batch(pairs, folder / "out", settings | {"median": None}, overwrite=True)
+    assert report["one"]["state"] == "failed"
+    assert {name: content for name, content in contents(folder / "out" / "one").items() if name in before} == before
+
+
+def test_export__that_fails_keeps_the_files_of_before(finished, tmp_path, monkeypatch):
+    export(finished, "otb", tmp_path / "otb")
+    before = contents(tmp_path / "otb")
+    monkeypatch.setattr("sat_intervals.raster.writer.copy", fail)
+    with pytest.raises(OutputError):
+        export(finished, "otb", tmp_path / "otb")
+    assert contents(tmp_path / "otb") == before
+
+
+@pytest.mark.parametrize("name", ["report.html", "overview.png"])
+def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, monkeypatch, name):
+
+    def write():
+        if name == "report.html":
+            write_report(open_results(finished))
+        else:
+            draw_overview(open_results(finished), finished / name, dpi=50)
+
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    (finished / name).symlink_to(precious)
+    write()
+    assert precious.read_text() == "mine"
+    assert not (finished / name).is_symlink()
+    before = contents(finished)
+    whole = Path.write_text
+
+    def half(path, text, **options):
+        whole(path, text[:100], **options)
+        fail()
+
+    monkeypatch.setattr(Path, "write_text", half)
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, path, **options: half(Path(path), "x" * 200))
+    with pytest.raises(SatIntervalsError, match=rf"{name} cannot be written: Input/output error"):
+        write()
+    monkeypatch.undo()
+    assert contents(finished) == before
+
+
+@pytest.mark.parametrize(
+    "words", [["config"], ["status", "out"], ["match", "/a.tif", "/b.tif", "out", "--disparity", "0", "1"]]
+)
+def test_commands__say_that_the_working_directory_is_gone(tmp_path, words):
+    script = 'mkdir gone && cd gone && rmdir ../gone && exec "$@"'
+    done = subprocess.run(
+        ["sh", "-c", script, "sh", COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "sat-intervals: the working directory was deleted: change to another folder"
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,364 @@
+"""Files to files on real workers: the laws of tiles, resume, reports."""
+
+import errno
+import json
+import logging
+import os
+import shutil
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import OUTPUTS, bands, hashes, shares_that_differ, write_pair
+
+from sat_intervals import match_arrays, match_pair
+from sat_intervals.config import Cluster, load_config
+from sat_intervals.demo import make_scene
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.products import INVALID, NO_DATA
+from sat_intervals.raster import open_image, read_window
+from sat_intervals.results import open_run
+from sat_intervals.run import pair as run
+from sat_intervals.run.cluster import connected
+from sat_intervals.run.job import prepare
+from sat_intervals.run.output import is_complete
+from sat_intervals.run.tile import match_tile
+from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.manifest import digest
+from sat_intervals.tiling import Window
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A procedural pair of 300 x 420 pixels on disk, with its settings."""
+    folder = tmp_path_factory.mktemp("pair")
+    settings = write_pair(folder, make_scene(300, 420, seed=3))
+    return folder / "left.tif", folder / "right.tif", settings
+
+
+def in_tiles(settings, size, overlap=100, **more):
+    return settings | {"tiles": {"size": size, "overlap": overlap}} | more
+
+
+@pytest.mark.parametrize("more", [{}, {"cross_check": {"method": "accurate"}}, {"sgm": None}])
+def test_match_pair__equals_match_arrays_in_one_tile(pair, tmp_path, more):
+    left, right, settings = pair
+    settings = settings | more
+    match_pair(left, right, tmp_path / "out", settings)
+    with rasterio.open(left) as first, rasterio.open(right) as second:
+        arrays = [np.ma.masked_equal(file.read(1), 0) for file in (first, second)]
+    whole = match_arrays(*arrays, settings)
+    intervals, validity = bands(tmp_path / "out")
+    np.testing.assert_array_equal(intervals, [whole[name] for name in ("disparity", "lower", "upper", "confidence")])
+    np.testing.assert_array_equal(validity, whole["validity"])
+
+
+def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
+    left, right, settings = pair
+    match_pair(left, right, tmp_path / "textured", settings, window=Window(100, 100, 64, 64))
+    warned = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert not warned
+    with rasterio.open(left) as file:
+        pixels, profile = file.read(1), file.profile
+    pixels[:, 60:] = 900
+    for name in ("left", "right"):
+        with rasterio.open(tmp_path / f"{name}.tif", "w", **profile) as file:
+            file.write(pixels, 1)
+    flat = {"disparity": {"minimum": -4, "maximum": 4}}
+    counts = match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "out", flat)["counts"]
+    _, lower, upper, _ = bands(tmp_path / "out")[0]
+    assert counts["ambiguous"] == ((lower == -4) & (upper == 4)).sum() > counts["valid"] / 2
+    (record,) = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert f"left.tif: the interval of {counts['ambiguous']} of {counts['valid']} valid pixels" in record.getMessage()
+
+
+@pytest.mark.parametrize("more", [{}, {"cross_check": {"method": "accurate"}}])
+def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, tmp_path, more):
+    left, right, settings = pair
+    match_pair(left, right, tmp_path / "whole", in_tiles(settings, 512, **more))
+    match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 128, **more))
+    disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.002
+    assert interval <= 0.005
+
+
+def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path):
+    left, right, settings = pair
+    for name, size in (("whole", 512), ("tiles", 64)):
+        match_pair(left, right, tmp_path / name, in_tiles(settings, size, overlap=3, sgm=None))
+    np.testing.assert_array_equal(bands(tmp_path / "whole")[0], bands(tmp_path / "tiles")[0])
+    np.testing.assert_array_equal(bands(tmp_path / "whole")[1], bands(tmp_path / "tiles")[1])
+
+
+@pytest.mark.parametrize("kind", ["threads", pytest.param("processes", marks=pytest.mark.process)])
+def test_match_pair__gives_the_same_bytes_whatever_the_workers(pair, tmp_path, kind):
+    left, right, settings = pair
+    settings = in_tiles(settings, 128, overlap=20)
+    match_pair(left, right, tmp_path / "one", settings | {"cluster": {"workers": 1}})
+    match_pair(left, right, tmp_path / "more", settings | {"cluster": {"kind": kind, "workers": 2}})
+    assert hashes(tmp_path / "one") == hashes(tmp_path / "more")
+
+
+def test_match_pair__reports_what_a_small_overlap_left(pair, tmp_path):
+    left, right, settings = pair
+    wide = match_pair(left, right, tmp_path / "wide", in_tiles(settings, 128, overlap=100))["overlap_left"]
+    narrow = match_pair(left, right, tmp_path / "narrow", in_tiles(settings, 128, overlap=3))["overlap_left"]
+    # 3 x 4 tiles: 3 * 3 borders between columns and 2 * 4 between rows
+    assert wide["borders"] == narrow["borders"] == 17
+    assert wide["bounds_share"] < narrow["bounds_share"] <= narrow["worst"]["bounds_share"]
+    assert narrow["winner_share"] > 0.01
+
+
+def test_match_pair__writes_a_complete_report(pair, tmp_path):
+    left, right, settings = pair
+    report = match_pair(left, right, tmp_path / "out", settings)
+    assert report == json.loads((tmp_path / "out" / "run.json").read_text())
+    counts, validity = report["counts"], bands(tmp_path / "out")[1]
+    assert counts["pixels"] == validity.size
+    assert counts["valid"] == (validity & INVALID == 0).sum()
+    for name, flag in report["validity_bits"].items():
+        assert counts["flags"][name] == np.count_nonzero(validity & (1 << flag["bit"]))
+    assert counts["valid"] + sum(counts["causes"].values()) == counts["pixels"]
+    assert report["inputs"]["left"]["bytes"] == left.stat().st_size
+    assert report["cost_span"] == 448
+    assert load_config(report["settings"]) == load_config(settings)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == OUTPUTS
+
+
+def test_match_pair__window_is_the_crop_of_the_whole(pair, tmp_path):
+    left, right, settings = pair
+    window = Window(90, 120, 128, 150)
+    settings = settings | {"ambiguity": {"normalization": "range"}, "cross_check": None, "regularization": None}
+    match_pair(left, right, tmp_path / "whole", settings)
+    match_pair(left, right, tmp_path / "part", settings, window=window)
+    whole, part = bands(tmp_path / "whole")[0][(slice(None), *window.slices)], bands(tmp_path / "part")[0]
+    inner = np.s_[:, 1:-1, 1:-1]  # the median sees beyond the region's border
+    assert np.mean((whole[inner] != part[inner]) & ~(np.isnan(whole[inner]) & np.isnan(part[inner]))) < 0.001
+    with rasterio.open(tmp_path / "part" / "intervals.tif") as file, rasterio.open(left) as image:
+        assert file.transform == image.transform @ rasterio.Affine.translation(window.column, window.row)
+        assert file.crs == image.crs
+
+
+def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkeypatch):
+    left, right, settings = pair
+    settings = in_tiles(settings, 128, overlap=20)
+    match_pair(left, right, tmp_path / "undisturbed", settings)
+    log = tmp_path / "log"
+
+    def fail_once(job, tile):
+        with log.open("a") as file:
+            print(tile.name, file=file)
+        if tile.name == "1_2" and log.read_text().split().count("1_2") <= 3:
+            raise OSError("disk gone")
+        return match_tile(job, tile)
+
+    monkeypatch.setattr(run, "match_tile", fail_once)
+    with pytest.raises(RunError, match=r"1 of 12 tiles failed.*\n.*tile 1_2: disk gone"):
+        match_pair(left, right, tmp_path / "out", settings)
+    assert not list((tmp_path / "out").glob("*.*"))
+    match_pair(left, right, tmp_path / "out", settings)
+    assert sorted(log.read_text().split()) == sorted(
+        [*(f"{row}_{column}" for row, column in np.ndindex(3, 4)), *3 * ["1_2"]]  # tried three times
+    )
+    assert hashes(tmp_path / "undisturbed") == hashes(tmp_path / "out")
+
+
+def test_match_pair__never_mixes_runs(pair, tmp_path):
+    left, right, settings = pair
+    out = tmp_path / "out"
+    match_pair(left, right, out, in_tiles(settings, 128), keep_tiles=True)
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(left, right, out, in_tiles(settings, 128))
+    for name in ("intervals.tif", "validity.tif", "run.json"):
+        (out / name).unlink()
+    with pytest.raises(SatIntervalsError, match=r"settings\.sgm\.p1 was 8, now 7"):
+        match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}))
+    match_pair(left, right, out, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}), overwrite=True)
+
+
+def test_match_pair__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(pair, tmp_path, monkeypatch):
+    left, right, settings = pair
+    out, old, new = tmp_path / "out", in_tiles(settings, 128), in_tiles(settings, 128, sgm={"p1": 7, "p2": 32})
+    match_pair(left, right, out, old, keep_tiles=True)
+    before = {name: (out / name).read_bytes() for name in ("intervals.tif", "validity.tif", "run.json")}
+
+    def fail(job, tile):
+        if tile.name == "1_2":
+            raise OSError("disk gone")
+        return match_tile(job, tile)
+
+    for settings in (old, new):
+        with monkeypatch.context() as patch:
+            patch.setattr(run, "match_tile", fail)
+            with pytest.raises(RunError, match="tile 1_2: disk gone"):
+                match_pair(left, right, out, settings, overwrite=True)
+        assert {name: (out / name).read_bytes() for name in before} == before
+        assert open_run(out).report == json.loads(before["run.json"])
+        assert not is_complete(out)
+    done = {file: file.stat().st_mtime_ns for file in (out / "tiles" / "records").glob("[0-9]*.json")}
+    assert len(done) == 11
+    match_pair(left, right, out, new, keep_tiles=True)
+    assert {file: file.stat().st_mtime_ns for file in done} == done, "tiles done twice"
+    assert open_run(out).config.sgm.p1 == 7
+    assert is_complete(out)
+    with pytest.raises(SatIntervalsError, match="already holds a run"):
+        match_pair(left, right, out, new)
+    match_pair(left, right, tmp_path / "alone", new)
+    assert hashes(out) == hashes(tmp_path / "alone")
+
+
+def test_match_pair__ends_where_another_run_of_the_same_removes_the_tiles(pair, tmp_path):
+    left, right, settings = pair
+    store = tmp_path / "store"
+    settings = in_tiles(settings, 128) | {"cluster": {"store": str(store), "workers": 1}}
+
+    def progress(stage, done, total):
+        if (stage, done) == ("tiles", 3):
+            assert len(list(store.glob("*/records/*.json"))) >= 3
+            match_pair(left, right, tmp_path / "other", settings)
+            assert not list(store.iterdir())
+
+    with pytest.raises(RunError, match=rf"^the tiles in {store}/\w{{32}} are gone: .*: rerun the same command.*$"):
+        match_pair(left, right, tmp_path / "out", settings, progress=progress)
+    assert not list((tmp_path / "out").glob("*.*"))
+    assert not list(store.iterdir())
+    match_pair(left, right, tmp_path / "out", settings)
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "other")
+
+
+def test_match_pair__names_what_differs_from_the_tiles_elsewhere_and_removes_only_its_own(pair, tmp_path):
+    left, right, settings = pair
+    store, out = tmp_path / "store", tmp_path / "out"
+    settings = in_tiles(settings, 128) | {"cluster": {"store": str(store)}}
+    match_pair(left, right, out, settings, keep_tiles=True)
+    (place,) = store.iterdir()
+    (out / "run.json").unlink()
+    other = settings | {"sgm": {"p1": 7, "p2": 32}}
+    with pytest.raises(
+        SatIntervalsError, match=rf"{place} holds the tiles of another run: settings\.sgm\.p1 was 8, now 7"
+    ):
+        match_pair(left, right, out, other)
+    assert list(store.iterdir()) == [place]
+    (place / "notes.txt").write_text("mine")
+    match_pair(left, right, out, other, overwrite=True)
+    assert [str(path.relative_to(store)) for path in store.rglob("*")] == [place.name, f"{place.name}/notes.txt"]
+
+
+def test_digest__tells_what_differences_tell(tmp_path):
+    manifest = {"settings": {"p": 1}, "inputs": {"left": {"sha256": "a", "modified": "today"}, "files": [{"bytes": 3}]}}
+    later = {"inputs": {"files": [{"bytes": 3}], "left": {"modified": "now", "sha256": "a"}}, "settings": {"p": 1}}
+    other = {"settings": {"p": 1}, "inputs": {"left": {"sha256": "a", "modified": "today"}, "files": [{"bytes": 4}]}}
+    assert digest(later) == digest(manifest)
+    assert digest(other) != digest(manifest)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_create__writes_a_file_once(tmp_path, monkeypatch, links):
+    def refuse(*places):
+        raise PermissionError(errno.EPERM, "no links here")
+
+    if not links:
+        monkeypatch.setattr(os, "link", refuse)
+    folder = LocalFolder(tmp_path)
+    with ThreadPoolExecutor(8 if links else 1) as threads:
+        created = list(threads.map(lambda number: folder.create("manifest.json", str(number)), range(8)))
+    assert created.count(True) == 1
+    assert created[int(folder.read("manifest.json"))]
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
+def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_path):
+    left, right, settings = pair
+    before = prepare(left, right, tmp_path, in_tiles(settings, 128))
+    before.begin()
+    tile = next(iter(before.store.grid))
+    match_tile(before, tile)
+    now = prepare(left, right, tmp_path, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}))
+    now.begin(overwrite=True)
+    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: settings\.sgm\.p1 was 7, now 8"):
+        match_tile(before, tile)
+    assert now.store.done() == set()
+    assert not list((tmp_path / "tiles" / "arrays.zarr" / "int16").glob("c/*/*/*"))
+    now.store.remove()
+    with pytest.raises(RunError, match=r"the tiles in .*tiles are gone"):
+        match_tile(before, tile)
+    assert not (tmp_path / "tiles" / "arrays.zarr").exists()
+
+
+@pytest.mark.parametrize("array", ["int16/c/0", "uint32/c/0", "right/c", "seams/c", "histogram/c"])
+def test_match_pair__matches_a_tile_again_of_which_a_part_is_gone(pair, tmp_path, array):
+    left, right, settings = pair
+    once = match_pair(left, right, tmp_path, in_tiles(settings, 128), keep_tiles=True)
+    expected = hashes(tmp_path)
+    (tmp_path / "run.json").unlink()
+    gone = tmp_path / "tiles" / "arrays.zarr" / array / "0" / "1"
+    shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
+    other = tmp_path / "tiles" / "arrays.zarr" / "int16" / "c" / "0" / "1" / "1"  # as a power loss leaves it
+    other.write_bytes(other.read_bytes()[:-100])
+    (tmp_path / "tiles" / "records" / "1_1.json").unlink()
+    kept = (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns
+    again = match_pair(left, right, tmp_path, in_tiles(settings, 128), keep_tiles=True)
+    assert hashes(tmp_path) == expected
+    assert again["overlap_left"] == once["overlap_left"]
+    assert (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns == kept
+
+
+@pytest.mark.parametrize("store", ["elsewhere", "memory://tiles"])
+def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path, store):
+    left, right, settings = pair
+    settings = in_tiles(settings, 128)
+    match_pair(left, right, tmp_path / "here", settings)
+    store = store if "://" in store else f"file://{tmp_path}/{store}"
+    match_pair(left, right, tmp_path / "out", settings | {"cluster": {"store": store}})
+    assert hashes(tmp_path / "here") == hashes(tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == OUTPUTS
+    assert not list(tmp_path.glob("elsewhere/*"))
+
+
+def test_match_pair__says_which_image_is_empty(pair, tmp_path):
+    left, _, settings = pair
+    empty = tmp_path / "empty.tif"
+    shutil.copy(left, empty)
+    with rasterio.open(empty, "r+") as file:
+        file.write(np.zeros(file.shape, "uint16"), 1)
+    with pytest.raises(SatIntervalsError, match=r"empty\.tif are no data"):
+        match_pair(left, empty, tmp_path / "out", settings)
+    assert not list((tmp_path / "out").glob("*.*"))
+
+
+def test_read_window__of_an_opened_image_gives_states(pair):
+    image = open_image(pair[0])
+    pixels, state = read_window(image, Window(-2, -2, 4, 4))
+    assert pixels.shape == state.shape == (4, 4)
+    assert (state[:2] == NO_DATA).all()
+
+
+def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
+    left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
+    settings = {"disparity": {"minimum": -13, "maximum": 33}}
+    match_pair(left, right, tmp_path / "whole", in_tiles(settings, 1216))
+    match_pair(left, right, tmp_path / "tiles", in_tiles(settings, 256))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
+    assert disparity <= 0.001
+    assert interval <= 0.0025
+
+
+def test_connected__asyncio_is_heard_again_afterwards(tmp_path, caplog):
+    def forget_a_wait():
+        try:
+            raise TimeoutError
+        except TimeoutError:
+            logging.getLogger("asyncio").exception("Task exception was never retrieved")
+
+    with connected(Cluster(workers=1), tmp_path):
+        with connected(Cluster(workers=1), tmp_path):
+            forget_a_wait()
+        forget_a_wait()
+        logging.getLogger("asyncio").error("news")
+        assert [record.getMessage() for record in caplog.records if record.name == "asyncio"] == ["news"]
+    forget_a_wait()
+    assert caplog.records[-1].getMessage() == "Task exception was never retrieved"

@@ -1,0 +1,446 @@
+"""What dies in the middle of a run costs time and nothing else: real processes, killed for real."""
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import rasterio
+import yaml
+from distributed import Client, LocalCluster
+from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, wait_until, write_pair
+
+from sat_intervals import match_pair
+from sat_intervals.demo import make_scene
+from sat_intervals.raster import write_layer
+from sat_intervals.run import pair as run
+from sat_intervals.run.job import prepare
+from sat_intervals.store.folder import LocalFolder
+
+pytestmark = pytest.mark.process
+
+TILES = 56
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A folder with left.tif, right.tif, settings.yaml of 7 x 8 tiles, and the run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("pair")
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory):
+    """The same of four tiles: one takes 290 MB for its volume of costs, three take 12 MB at most."""
+    folder = tmp_path_factory.mktemp("uneven")
+    disparity = {"minimum": -260, "maximum": 260}
+    write_pair(folder, make_scene(528, 528, seed=3), disparity=disparity, tiles={"size": 512, "overlap": 3})
+    return folder
+
+
+def done_tiles(out: Path) -> set[str]:
+    return {file.stem for file in (out / "tiles" / "records").glob("[0-9]*.json")}
+
+
+class Command:
+    """``sat-intervals match`` as a process of its own."""
+
+    def __init__(self, pair: Path, out: Path, *options: str, left: Path | None = None) -> None:
+        self.out = out
+        self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by `started`)
+        command = [COMMAND, "match", left or pair / "left.tif", pair / "right.tif", out]
+        command += ["--config", pair / "settings.yaml", "--quiet", *options]
+        self.process = subprocess.Popen(list(map(str, command)), stdout=self.log, stderr=subprocess.STDOUT)
+
+    def wait_for_tiles(self, count: int) -> None:
+        wait_until(lambda: len(done_tiles(self.out)) >= count or self.ended, f"{count} tiles")
+        assert not self.ended, self.output
+
+    def end(self, seconds: float = PATIENCE) -> int:
+        return self.process.wait(seconds)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    @property
+    def ended(self) -> bool:
+        return self.process.poll() is not None
+
+    @property
+    def output(self) -> str:
+        self.log.seek(0)
+        return self.log.read()
+
+    def workers(self) -> list[psutil.Process]:
+        """The processes of a local cluster."""
+        return [child for child in psutil.Process(self.process.pid).children() if is_worker(child)]
+
+
+def is_worker(process: psutil.Process) -> bool:
+    with suppress(psutil.NoSuchProcess):
+        return process.status() != psutil.STATUS_ZOMBIE and "spawn_main" in " ".join(process.cmdline())
+    return False
+
+
+@contextmanager
+def started(*args: object, **options) -> Iterator[Command]:
+    """A command that does not outlive the test."""
+    command = Command(*args, **options)
+    workers: list[psutil.Process] = []
+    try:
+        yield command
+        workers = [] if command.ended else command.workers()
+    finally:
+        command.kill()
+        command.log.close()
+        psutil.wait_procs(workers, 10)
+
+
+def kill(process: psutil.Process) -> None:
+    with suppress(psutil.NoSuchProcess):
+        process.kill()
+        process.wait(10)
+
+
+def assert_complete(pair: Path, out: Path) -> None:
+    """The same bytes, band by band, as the run that nothing disturbed, and nothing else left behind."""
+    for name in ("intervals.tif", "validity.tif"):
+        with rasterio.open(pair / "undisturbed" / name) as expected, rasterio.open(out / name) as found:
+            for band in range(1, expected.count + 1):
+                np.testing.assert_array_equal(found.read(band), expected.read(band), err_msg=f"{name}, band {band}")
+        assert (out / name).read_bytes() == (pair / "undisturbed" / name).read_bytes(), name
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+def assert_nothing_final(out: Path) -> None:
+    assert not {path.name for path in out.iterdir()} & set(OUTPUTS)
+
+
+def half_written(out: Path) -> bool:
+    """Whether a tile's first array lies in the store and its record does not."""
+    first = {f"{file.parent.name}_{file.name}" for file in (out / "tiles/arrays.zarr/int16/c/0").glob("*/[0-9]*")}
+    return bool({name for name in first if name.replace("_", "").isdigit()} - done_tiles(out))
+
+
+def test_match__survives_kill_9_of_workers_at_random_moments(pair, tmp_path):
+    chance = random.Random(1)
+    with started(pair, tmp_path / "out", "--cluster", "processes", "--workers", "2") as command:
+        for count in sorted(chance.sample(range(1, 40), 4)):
+            command.wait_for_tiles(count)
+            kill(chance.choice(command.workers()))
+        command.wait_for_tiles(40)
+        kill_while_writing(command)
+        assert command.end() == 0, command.output
+        assert (
+            re.sub(r".*resource_tracker.*\n.*\n", "", command.output) == ""
+        )  # Python's word on what a killed one held
+    assert_complete(pair, tmp_path / "out")
+
+
+def kill_while_writing(command: Command) -> None:
+    """Kill the workers in the middle of what a tile writes."""
+    while True:
+        wait_until(lambda: half_written(command.out) or command.ended, "a tile half written")
+        assert not command.ended, command.output
+        workers = command.workers()
+        for worker in workers:
+            worker.suspend()
+        if half_written(command.out):
+            break
+        for worker in workers:
+            worker.resume()
+    for worker in workers:
+        kill(worker)
+
+
+def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):
+    chance, out = random.Random(2), tmp_path / "out"
+    for count, cluster in zip(sorted(chance.sample(range(2, 45), 2)), ("processes", "threads"), strict=True):
+        with started(pair, out, "--cluster", cluster, "--workers", "2") as command:
+            command.wait_for_tiles(count)
+            workers = command.workers()
+            command.kill()
+            _, alive = psutil.wait_procs(workers, 10)
+            assert not alive, "workers outlive the command"
+        assert_nothing_final(out)
+    before = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done_tiles(out)}
+    with started(pair, out, "--keep-tiles") as command:  # while it writes the files
+        wait_until(lambda: list(out.glob(".*/files/strips-*")) or command.ended, "strips")
+        command.kill()
+    assert_nothing_final(out)
+    after = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in before}
+    assert after == before, "tiles done twice"
+    assert len(done_tiles(out)) == TILES
+    with started(pair, out, "--keep-tiles") as command:
+        assert command.end() == 0, command.output
+    for name in ("validity.tif", "run.json"):  # as if it were killed between the names of its files
+        (out / name).unlink()
+    with started(pair, out) as command:
+        assert command.end() == 0, command.output
+    assert_complete(pair, out)
+
+
+def test_batch__goes_on_after_kill_9_and_does_only_what_is_missing(pair, tmp_path):
+    names = ("one", "two", "three")
+    (pair / "pairs.json").write_text(json.dumps([{"name": n, "left": "left.tif", "right": "right.tif"} for n in names]))
+    command = [COMMAND, "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml"]
+    command += ["--keep-tiles", "--quiet"]
+
+    def done() -> dict[Path, int]:
+        """What is done of tiles and pairs, and when it was."""
+        files = [*tmp_path.glob("*/tiles/records/[0-9]*.json"), *tmp_path.glob("*/run.json")]
+        return {file: file.stat().st_mtime_ns for file in files}
+
+    chance = random.Random(3)
+    before: dict[Path, int] = {}
+    for count in (chance.randrange(5, TILES), chance.randrange(TILES, 3 * TILES)):
+        with subprocess.Popen(command) as batch:
+            wait_until(lambda: len(done()) >= count or batch.poll() is not None, f"{count} tiles")  # noqa: B023
+            assert batch.poll() is None
+            batch.kill()
+        assert set(json.loads((tmp_path / "batch.json").read_text())) == set(names)
+        before |= done()
+    assert subprocess.run(command, check=False).returncode == 0
+    after = done()
+    assert {file: after[file] for file in before} == before, "done twice"
+    assert len(after) == 3 * (TILES + 1)
+    for name in names:
+        shutil.rmtree(tmp_path / name / "tiles")
+        assert_complete(pair, tmp_path / name)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_match__asked_to_end_leaves_no_worker_and_says_how_to_go_on(pair, tmp_path, number, status):
+    with started(pair, tmp_path / "out", "--cluster", "processes", "--workers", "2") as command:
+        command.wait_for_tiles(3)
+        workers = command.workers()
+        command.process.send_signal(number)
+        assert command.end(20) == status
+        assert "rerun the same command: it resumes" in command.output
+        assert len(command.output.splitlines()) == 1, command.output
+        _, alive = psutil.wait_procs(workers, 10)
+        assert not alive
+    assert len(done_tiles(tmp_path / "out")) >= 3
+
+
+@contextmanager
+def dask_process(*args: object) -> Iterator[psutil.Popen]:
+    """``dask scheduler`` or ``dask worker``; killed with its children at the end."""
+    process = psutil.Popen(
+        [sys.executable, "-m", "dask", *map(str, args)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        # deaths of workers that dask has a tile survive, by default 3
+        env=os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"},
+    )
+    try:
+        yield process
+    finally:
+        kill_tree(process)
+
+
+def kill_tree(process: psutil.Popen) -> None:
+    with suppress(psutil.NoSuchProcess):
+        family = [process, *process.children(recursive=True)]  # the parent first: it starts its children again
+        for member in family:
+            with suppress(psutil.NoSuchProcess):
+                member.kill()
+        psutil.wait_procs(family, 10)
+
+
+@contextmanager
+def scheduler(folder: Path) -> Iterator[tuple[str, psutil.Popen]]:
+    """A scheduler on loopback: its address, its process."""
+    file = folder / "scheduler.json"
+    options = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--no-show", "--scheduler-file", file)
+    with dask_process("scheduler", *options) as process:
+        wait_until(lambda: file.exists() and file.read_text().endswith("}"), "scheduler")
+        yield yaml.safe_load(file.read_text())["address"], process
+
+
+def worker(address: str, folder: Path, *options: object):
+    fixed = ("--host", "127.0.0.1", "--nthreads", 1, "--no-dashboard", "--local-directory", folder)
+    return dask_process("worker", address, *fixed, *options)
+
+
+def test_match__goes_on_while_workers_join_and_leave(pair, tmp_path):
+    out = tmp_path / "out"
+    with scheduler(tmp_path) as (address, process):
+        with worker(address, tmp_path) as first, worker(address, tmp_path), Client(address) as client:
+            client.wait_for_workers(2, PATIENCE)
+            with started(pair, out, "--cluster", address) as command:
+                command.wait_for_tiles(5)
+                with worker(address, tmp_path):
+                    client.wait_for_workers(3, PATIENCE)
+                    kill_tree(first)
+                    assert command.end() == 0, command.output
+        assert process.is_running()
+        assert_complete(pair, out)
+
+
+def test_match__shares_a_scheduler_with_another_run(pair, tmp_path):
+    with (
+        scheduler(tmp_path) as (address, _),
+        worker(address, tmp_path),
+        started(pair, tmp_path / "a", "--cluster", address) as first,
+        started(pair, tmp_path / "b", "--cluster", address) as second,
+    ):
+        assert first.end() == 0, first.output
+        assert second.end() == 0, second.output
+    assert_complete(pair, tmp_path / "a")
+    assert_complete(pair, tmp_path / "b")
+
+
+def test_match__ends_when_the_scheduler_dies_and_goes_on_elsewhere(pair, tmp_path):
+    out = tmp_path / "out"
+    with (
+        scheduler(tmp_path) as (address, process),
+        worker(address, tmp_path),
+        started(pair, out, "--cluster", address) as command,
+    ):
+        command.wait_for_tiles(3)
+        kill_tree(process)
+        assert command.end() == 1, command.output
+        assert "the dask scheduler is gone; rerun the same command" in command.output
+        assert len(command.output.splitlines()) == 1, command.output
+    assert_nothing_final(out)
+    with started(pair, out) as command:
+        assert command.end() == 0, command.output
+    assert_complete(pair, out)
+
+
+def test_match__names_the_tiles_of_a_truncated_input_and_refuses_it_mended(pair, tmp_path):
+    out, left = tmp_path / "out", tmp_path / "left.tif"
+    shutil.copy(pair / "left.tif", left)
+    whole = left.read_bytes()
+    with left.open("r+b") as file:
+        file.truncate(len(whole) * 17 // 20)
+    with started(pair, out, left=left) as command:
+        assert command.end() == 1, command.output
+        failed = set(re.findall(r"tile (\d+_\d+): .*left\.tif cannot be read at rows", command.output))
+        assert f"{len(failed)} of {TILES} tiles failed" in command.output
+        assert len(command.output.splitlines()) == 1 + len(failed)
+    done = done_tiles(out)
+    assert failed
+    assert not failed & done
+    assert len(failed | done) == TILES
+    assert_nothing_final(out)
+    status = subprocess.run([COMMAND, "status", out], capture_output=True, text=True, check=True)
+    assert f"{len(done)} of {TILES} tiles done, {len(failed)} failed, 0 left" in status.stdout
+
+    left.write_bytes(whole)
+    with started(pair, out, left=left) as command:
+        assert command.end() == 2
+        assert "inputs.left.sha256 was" in command.output
+        assert "--overwrite" in command.output
+    with started(pair, out, "--overwrite", left=left) as command:
+        assert command.end() == 0, command.output
+    assert_complete(pair, out)
+
+
+def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tmp_path):
+    out, log = tmp_path / "out", tmp_path / "log"
+    with scheduler(tmp_path) as (address, _):
+        # of which dask leaves 95 %; a worker takes 270 MiB between tiles
+        with (
+            worker(address, tmp_path, "--memory-limit", "430MiB"),
+            started(uneven, out, "--cluster", address, "--log-file", str(log)) as command,
+        ):
+            assert command.end() == 1, command.output
+            alone = (
+                r"match_tile of \(0, Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried again, alone"
+            )
+            assert re.search(alone, log.read_text())
+            assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
+            assert "give workers more memory, or choose smaller tiles" in command.output
+        assert_nothing_final(out)
+        assert done_tiles(out) == {"0_1", "1_0", "1_1"}
+        with worker(address, tmp_path), started(uneven, out, "--cluster", address) as command:
+            assert command.end() == 0, command.output
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+def test_match__is_not_stalled_by_a_tile_at_which_dask_pauses_its_worker(uneven, tmp_path, monkeypatch):
+    # above 80 % of the memory while the large tile is matched, below it before and after; dask would kill it at 95 %
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE", "False")
+    with (
+        scheduler(tmp_path) as (address, _),
+        worker(address, tmp_path, "--memory-limit", "450MiB"),
+        started(uneven, tmp_path / "out", "--cluster", address) as command,
+    ):
+        assert command.end() == 0, command.output
+
+
+def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, disk):
+    place = disk(8 << 20)
+    out, ballast = place / "out", place / "ballast"
+    with started(pair, out) as command:
+        command.wait_for_tiles(5)
+        free = shutil.disk_usage(place).free
+        with suppress(OSError):
+            ballast.write_bytes(bytes(free))
+        assert command.end() == 1, command.output
+        assert "No space left on device: free disk space and rerun the same command" in command.output
+        assert len(command.output.splitlines()) == 1, command.output
+    assert_nothing_final(out)
+    assert len(done_tiles(out)) >= 5
+    ballast.unlink()
+    disk(100 << 20)
+    with started(pair, out) as command:
+        assert command.end() == 0, command.output
+    assert_complete(pair, out)
+
+
+def test_match__refuses_a_folder_where_another_run_is_at_work(pair, tmp_path):
+    with started(pair, tmp_path / "out") as first:
+        first.wait_for_tiles(1)
+        first.process.send_signal(signal.SIGSTOP)
+        with started(pair, tmp_path / "out", "--overwrite") as second:
+            assert second.end() == 2
+            assert "another run is active in" in second.output
+        first.process.send_signal(signal.SIGCONT)
+        assert first.end() == 0, first.output
+    assert_complete(pair, tmp_path / "out")
+
+
+def test_matched__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_path, monkeypatch):
+    def record_only(job, tile):
+        job.store.write_record(tile, {})
+
+    monkeypatch.setattr(run, "match_tile", record_only)
+    futures, known = [], []
+    image = tmp_path / "wide.tif"
+    write_layer(image, np.ones((64 * 20, 64 * 25), np.uint16), 0, PLACE)
+    job = prepare(image, image, tmp_path / "out", yaml.safe_load((pair / "settings.yaml").read_text()))
+    with LocalFolder(job.store.home).locked():
+        job.begin()
+        with (
+            LocalCluster(
+                n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
+            ) as cluster,
+            Client(cluster) as client,
+        ):
+
+            def progress(stage, done, total):
+                futures.append(len(client.futures))
+                known.append(len(cluster.scheduler.tasks))
+
+            for _, failures in run.matched(client, [job], progress):
+                assert not failures
+    assert len(futures) == 501  # one before the first ends
+    assert max(futures) <= 6  # two a core, and those that are just being released
+    assert max(known) <= 12

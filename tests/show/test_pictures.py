@@ -1,0 +1,536 @@
+"""Pictures: made, of the right size, not blank, showing what they claim, whatever the results."""
+
+import json
+import os
+import re
+import shutil
+import sys
+import tracemalloc
+from functools import reduce
+from operator import getitem
+
+import numpy as np
+import pytest
+from finished import FINISHED, PLACE, no_bands, random_bands, without_intervals, write_run
+from helpers import invoke, write_pair
+from matplotlib import colormaps
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+
+from sat_intervals import match_pair
+from sat_intervals.cli.console import Console
+from sat_intervals.demo import make_scene
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import FLAGS, INVALID, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED, Bands
+from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
+from sat_intervals.results import open_results
+from sat_intervals.run.statistics import Tally
+from sat_intervals.show.canvas import widest
+from sat_intervals.show.cost_curve import read_curve
+from sat_intervals.show.dsm import _relief, draw_surface
+from sat_intervals.show.legend import FIRST_INVALID, ORANGE, PIXEL_CLASSES, SKY, VERMILION, class_counts, classify
+from sat_intervals.show.maps import draw_errors, draw_overview
+from sat_intervals.show.profile import draw_curve, draw_profile
+from sat_intervals.tiling import Window
+
+WHITE, GREY = (255, 255, 255), (222, 222, 222)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A matched procedural pair of 130 x 170 pixels, with its truth; settings without whole-image steps."""
+    folder = tmp_path_factory.mktemp("run")
+    return matched(folder, {"cross_check": None, "median": None, "regularization": None})
+
+
+def matched(folder, settings, window=None):
+    settings = write_pair(folder, make_scene(130, 170, seed=2), **settings)
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, window=window)
+    return folder / "out"
+
+
+def pixels_of(path):
+    """A PNG file as ``(rows, columns, 3)``."""
+    with Image.open(path) as image:
+        assert image.format == "PNG"
+        return np.asarray(image.convert("RGB"))
+
+
+def share_of(picture, colour):
+    """Share of the pixels of a picture that have a colour, ``#rrggbb`` or three numbers."""
+    if isinstance(colour, str):
+        colour = tuple(bytes.fromhex(colour[1:]))
+    return (picture == colour).all(axis=-1).mean()
+
+
+def test_plot__makes_every_picture_and_names_it(run):
+    arguments = ["plot", str(run), "--row", "60", "--columns", "20", "150", "--pixel", "60", "90", "--dpi", "50"]
+    done = invoke(*arguments)
+    assert done.exit_code == 0, done.output
+    names = ["overview.png", "errors.png", "profile.png", "curve.png"]
+    assert done.output.split() == [str(run / name) for name in names]
+    for name in names:
+        picture = pixels_of(run / name)
+        assert picture.shape[0] > 200
+        assert share_of(picture, WHITE) < 0.95
+        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_plot__without_truth_or_options_makes_the_overview_alone(tmp_path):
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    done = invoke("plot", out)
+    assert done.exit_code == 0, done.output
+    assert sorted(path.name for path in out.glob("*.png")) == ["overview.png"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--columns", "1", "5"], "give --row too"),
+        (["--row", "99"], "row 99, column 0 is outside the results in .*: rows are 0 to 39, columns 0 to 49"),
+        (["--row", "3", "--columns", "7", "4"], "columns 7 to 4 are in the wrong order"),
+        (["--row", "3", "--columns", "7", "50"], "column 50 is outside"),
+        (["--pixel", "0", "-1"], "column -1 is outside"),
+        (["--truth", "nowhere.tif"], "nowhere.tif cannot be read"),
+    ],
+)
+def test_plot__says_in_one_line_what_is_wrong(tmp_path, arguments, message):
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    done = invoke("plot", out, *arguments)
+    assert done.exit_code == 2
+    assert re.fullmatch(f"sat-intervals: .*{message}.*\n", done.output)
+    assert list(out.glob("*.png")) == []  # nothing is drawn before
+
+
+def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    for name in [name for name in sys.modules if name.startswith("sat_intervals.show")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    done = invoke("plot", out)
+    assert done.exit_code == 2
+    assert done.output == "sat-intervals: pictures need matplotlib: pip install 'sat-intervals[plot]'\n"
+
+
+@pytest.mark.parametrize(
+    ("bands", "shape"),
+    [(random_bands, (1, 1)), (random_bands, (2, 300)), (no_bands, (90, 40)), (random_bands, (500, 600))],
+)
+def test_pictures__of_any_size_and_of_no_valid_pixel(tmp_path, bands, shape):
+    made = bands(*shape)
+    results = open_results(write_run(tmp_path, *made[:2], truth=np.full(shape, -3.0)))
+    draw_overview(results, tmp_path / "overview.png", dpi=60)
+    draw_errors(results, tmp_path / "errors.png", dpi=60)
+    draw_profile(results, tmp_path / "profile.png", shape[0] // 2, dpi=60)
+    for name in ("overview.png", "errors.png", "profile.png"):
+        picture = pixels_of(tmp_path / name)
+        assert min(picture.shape[:2]) >= 60 * 3
+        assert max(picture.shape[:2]) <= 60 * 30
+        assert 0.1 < share_of(picture, WHITE) < 0.97
+    if bands is no_bands:
+        assert share_of(pixels_of(tmp_path / "overview.png"), GREY) > 0.1
+        assert share_of(pixels_of(tmp_path / "overview.png"), PIXEL_CLASSES[6].colour) > 0.03
+
+
+def test_draw_overview__reads_no_more_than_it_draws(tmp_path, monkeypatch):
+    results = open_results(write_run(tmp_path, *random_bands(1500, 900)[:2]))
+    read, shapes = type(results).read_small, []
+
+    def noting(self, shape):
+        shapes.append(shape)
+        return read(self, shape)
+
+    monkeypatch.setattr(type(results), "read_small", noting)
+    monkeypatch.setattr(type(results), "read", None)
+    draw_overview(results, tmp_path / "overview.png", dpi=100)
+    assert shapes == [(420, 252)]
+
+
+def test_draw_overview__shows_every_kind_in_its_colour(tmp_path):
+    validity = np.array([[kind.flag for kind in PIXEL_CLASSES]], np.uint16).repeat(40, axis=0).repeat(5, axis=1)
+    bands = no_bands(*validity.shape)[0]
+    draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
+    picture = pixels_of(tmp_path / "overview.png")
+    shares = [share_of(picture, kind.colour) for kind in PIXEL_CLASSES if kind.colour != "#000000"]
+    assert min(shares) > 0.005
+
+
+def with_several_flags(height, width):
+    """Bands and a validity band in which pixels have several flags."""
+    bands, validity, _ = random_bands(height, width)
+    validity |= np.random.default_rng(1).choice([0, *(flag.value for flag in FLAGS)], validity.shape).astype(np.uint16)
+    bands[:3, validity & INVALID != 0] = np.nan
+    return bands, validity
+
+
+def test_class_counts__agree_with_the_map():
+    bands, validity = with_several_flags(70, 90)
+    tally = Tally(31)
+    tally.add(Bands(*bands, validity))
+    counts = tally.report()
+    assert class_counts(counts) == np.bincount(classify(validity).ravel(), minlength=len(PIXEL_CLASSES)).tolist()
+    assert counts["valid"] + sum(counts["causes"].values()) == validity.size < sum(counts["flags"].values())
+
+
+def test_draw_overview__shows_the_shares_of_the_terminal(tmp_path, words, capsys):
+    out = write_run(tmp_path, *with_several_flags(900, 1000))
+    results = open_results(out)
+    draw_overview(results, tmp_path / "overview.png", dpi=40)  # of fewer pixels than it counts
+    Console(quiet=False).summary(results.report | {"seconds": {"total": 1}}, out)
+    printed = re.findall(r"^(valid pixels|  .*?) +(\d+\.\d) %$", capsys.readouterr().out, re.MULTILINE)
+    shares = [float(word.split("(")[-1].split()[0]) for word in words if re.search(r"\(\d+\.\d\s%\)$", word)]
+    assert shares[FIRST_INVALID:] == [float(share) for _, share in printed[1:]]
+    assert sum(float(share) for _, share in printed) == pytest.approx(100, abs=0.4)
+
+
+def test_draw_errors__colours_the_misses(tmp_path):
+    bands, validity = no_bands(100, 100)
+    bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
+    truth = np.zeros((100, 100))
+    truth[10:20, 10:30] = 5  # 2 % above the interval
+    truth[50:60, 50:60] = -5  # 1 % below it
+    truth[80:, 80:] = np.nan
+    results = open_results(write_run(tmp_path, bands, validity, truth))
+    draw_errors(results, tmp_path / "errors.png")
+    picture = pixels_of(tmp_path / "errors.png")[:-60]  # without its legend
+    above, below = share_of(picture, VERMILION), share_of(picture, SKY)
+    assert above / below == pytest.approx(2, rel=0.05)
+    assert 0.015 < above < 0.02  # of a picture that is mostly map
+
+
+def test_draw_errors__judges_every_pixel_of_a_thinned_map(tmp_path, monkeypatch):
+    bands, validity, truth = random_bands(1300, 700)
+    results = open_results(write_run(tmp_path, bands, validity, truth))
+    titles = []
+    monkeypatch.setattr("matplotlib.axes.Axes.set_title", lambda self, title: titles.append(title))
+    draw_errors(results, tmp_path / "errors.png", dpi=50)
+    valid = (classify(validity) < 2) & np.isfinite(truth)
+    missed = valid & ((truth < bands[1]) | (truth > bands[2]))
+    share = 100 * missed.sum() / valid.sum()
+    assert titles[-1] == f"The interval misses the truth at {share:.1f} % of {valid.sum():,} valid pixels"
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The arrays that pictures draw as images, in their order."""
+    arrays = []
+    show = Axes.imshow
+    monkeypatch.setattr(Axes, "imshow", lambda self, x, **options: arrays.append(x) or show(self, x, **options))
+    return arrays
+
+
+def test_draw_errors__holds_a_strip_at_a_time(tmp_path):
+    height, width = 6_000, 200
+    results = open_results(write_run(tmp_path, *random_bands(height, width)))
+    tracemalloc.start()
+    draw_errors(results, tmp_path / "errors.png", dpi=50)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * height * width  # less than the left image in floats, or where it is missed
+
+
+def test_maps__of_a_thin_image_show_every_pixel_of_its_short_side(tmp_path, drawn):
+    results = open_results(write_run(tmp_path, *random_bands(12, 3000)))
+    draw_errors(results, tmp_path / "errors.png")
+    draw_overview(results, tmp_path / "overview.png")
+    assert len(drawn) == 2 + 5
+    assert all(array.shape[0] == 12 and 400 < array.shape[1] < 900 for array in drawn)
+
+
+def test_draw_errors__without_truth_asks_for_it(tmp_path):
+    results = open_results(write_run(tmp_path, *random_bands(40, 50)[:2]))
+    with pytest.raises(SatIntervalsError, match="give --truth"):
+        draw_errors(results, tmp_path / "errors.png")
+
+
+def test_draw_profile__shows_a_pixel_that_stands_alone(tmp_path):
+    bands, validity = no_bands(9, 60)
+    bands[:, 4, 30], validity[4, 30] = (0, -4, 4, 1), 0
+    results = open_results(write_run(tmp_path, bands, validity))
+    pictures = []
+    for row in (4, 5):
+        draw_profile(results, tmp_path / "profile.png", row, (20, 40))
+        pictures.append(pixels_of(tmp_path / "profile.png"))
+    difference = (pictures[0] != pictures[1]).any(axis=-1).mean()
+    assert 1 / 21 / 3 < difference < 0.4
+
+
+@pytest.fixture
+def words(monkeypatch):
+    """Labels of legends, titles of pages and maps, and names of axes, as they are given."""
+    told = []
+
+    def noting(thing, name):
+        told_to = getattr(thing, name)
+        monkeypatch.setattr(thing, name, lambda self, *a, **more: told.append(str(a[0])) or told_to(self, *a, **more))
+
+    for thing, name in (
+        (Artist, "set_label"),
+        (Figure, "suptitle"),
+        *((Axes, name) for name in ("set_title", "set_xlabel", "set_ylabel")),
+    ):
+        noting(thing, name)
+    return told
+
+
+def test_plot__without_intervals_claims_none(tmp_path, words):
+    out = without_intervals(tmp_path)
+    done = invoke("plot", out, "--row", "20")
+    assert done.output.split() == [str(out / "overview.png"), str(out / "profile.png")]
+    assert {"truth", "disparity"} < set(words)
+    assert "interval" not in words
+    assert "Row 20, columns 0 to 49; no black line: no valid pixel" in words
+    with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: errors need them"):
+        draw_errors(open_results(out), tmp_path / "errors.png")
+
+
+def write_surface(out, height, agreement=np.nan, runs=FINISHED):
+    """A surface of intervals 3 m wide beside a run, whose confidence is one half."""
+    ones = np.ones_like(height)
+    bands = np.stack([height, height - 1, height + 2, ones, 0.5 * ones, agreement * ones]).astype(np.float32)
+    with OutputWriter(out, [surface_file("dsm.tif")], *height.shape, PLACE, {"RUNS": runs}) as writer:
+        writer.write(0, bands)
+        writer.publish()
+
+
+@pytest.mark.parametrize(
+    ("shape", "agreement", "last"),
+    [((40, 60), np.nan, "Confidence"), ((700, 30), 1.0, "Agreement of runs"), ((1, 5), 1.0, "Agreement of runs")],
+)
+def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, last):
+    out = write_run(tmp_path, *random_bands(20, 20)[:2])
+    height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])) / 10
+    height[:, 3] = np.nan
+    write_surface(out, height, agreement)
+    done = invoke("plot", out, "--dpi", "40")
+    assert done.output.split() == [str(out / "overview.png"), str(out / "dsm.png")]
+    titles = ["Hillshade, sun in the north-west", "Height", "Interval width", last]
+    assert [word for word in words if word in titles][-4:] == titles
+    assert len(np.unique(pixels_of(out / "dsm.png").reshape(-1, 3), axis=0)) > 20
+
+
+def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tmp_path):
+    out = write_run(tmp_path, *random_bands(20, 20)[:2])
+    write_surface(out, np.ones((20, 20)), runs="earlier")
+    done = invoke("plot", out, "--dpi", "40")
+    assert done.exit_code == 0, done.output
+    assert done.stderr == f"{out / 'dsm.tif'} belongs to an earlier run and is not drawn: rerun sat-intervals dsm\n"
+    assert not (out / "dsm.png").exists()
+    shutil.copy(out / "validity.tif", tmp_path / "dsm.tif")
+    with pytest.raises(SatIntervalsError, match=r"dsm\.tif is not a surface model of sat-intervals dsm"):
+        draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png")
+
+
+def test_draw_surface__without_bounds(tmp_path, words):
+    height = np.add.outer(np.arange(20.0), np.arange(30.0))
+    bands = np.stack([height, *[np.full(height.shape, np.nan)] * 2, *[np.ones(height.shape)] * 3]).astype(np.float32)
+    with OutputWriter(tmp_path, [surface_file("dsm.tif")], *height.shape, PLACE, {}) as writer:
+        writer.write(0, bands)
+        writer.publish()
+    draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png", 40)
+    assert "Height" in words
+
+
+def test_relief__is_bright_where_it_faces_the_sun():
+    rows, columns = np.indices((9, 9)) - 4.0
+    pyramid = 4 - np.maximum(abs(rows), abs(columns))
+    relief = _relief(pyramid, 1.0, 1.0)
+    north_west, south_east = relief[[1, 4], [4, 1]], relief[[7, 4], [4, 7]]
+    flat = _relief(np.zeros((9, 9)), 1.0, 1.0)
+    assert np.allclose(flat, np.sqrt(0.5))
+    assert (north_west > flat[0, 0]).all()
+    assert (south_east < flat[0, 0]).all()
+
+
+def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run, tmp_path, words):
+    out = shutil.copytree(run, tmp_path / "out")
+    bands = read_layers(out / "intervals.tif")
+    bands[1:3, 60, 90] = 1.0
+    with OutputWriter(out, RUN_FILES, 130, 170, PLACE, {}) as writer:
+        writer.write(0, bands, read_layers(out / "validity.tif")[0])
+        report = json.loads((out / "run.json").read_text())
+        del report["files"]
+        writer.publish(("run.json", json.dumps(report)))
+    write_layer(tmp_path / "far.tif", np.full((130, 170), 999.5, np.float32), np.nan, PLACE)
+    draw_curve(open_results(out, tmp_path / "far.tif"), tmp_path / "curve.png", 60, 90)
+    assert "truth 999.50 px, outside the range shown" in words
+    assert "interval written, 1 to 1 px" in words
+    orange = (pixels_of(tmp_path / "curve.png") == tuple(bytes.fromhex(ORANGE[1:]))).all(axis=-1)
+    assert orange[400:].sum() > 5  # in the lower chart, not only in its legend
+
+
+def test_draw_overview__of_a_few_wide_intervals_is_not_dark(tmp_path, words):
+    bands, validity = no_bands(200, 200)
+    bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
+    bands[1, :10] = -20  # 5 % of the rows
+    draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
+    assert "px, square-root scale" in words
+    assert {"row", "column"} < set(words)
+    dark = colormaps["magma"](2 / 21, bytes=True)[:3]
+    assert share_of(pixels_of(tmp_path / "overview.png"), tuple(dark)) < 0.01
+
+
+def test_draw_overview__scales_widths_to_a_percentile_beside_their_histogram(tmp_path, monkeypatch):
+    bands, validity = no_bands(100, 100)
+    bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
+    bands[2, 60:85], bands[2, 95:] = 3, 10  # 70 % 2 px wide, 25 % 4 px, 5 % 11 px
+    drawn = []
+    stairs = Axes.stairs
+    monkeypatch.setattr(Axes, "stairs", lambda self, *a, **more: drawn.append(a) or stairs(self, *a, **more))
+    draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
+    assert widest(bands[2] - bands[1]) == 4
+    ((shares, edges),) = drawn
+    np.testing.assert_allclose(shares, [0.001, 0.001, 0.7, 0.001, 0.25])  # 0 to 1 px, 1 to 2 px and so on
+    np.testing.assert_allclose(edges[:5], np.sqrt(np.arange(5) / 4))
+    brightest = colormaps["magma"](1.0, bytes=True)[:3]
+    assert share_of(pixels_of(tmp_path / "overview.png"), brightest) > 0.02
+
+
+def test_draw_curve__says_why_the_interval_is_wider_than_the_cut(run, tmp_path, words):
+    curve = read_curve(open_results(run), 60, 90)
+    inside = curve.disparities[curve.cut]
+    assert (curve.lower, curve.upper) != (inside.min(), inside.max())
+    draw_curve(open_results(run), tmp_path / "curve.png", 60, 90, dpi=50)
+    assert f"interval, {curve.lower} to {curve.upper} px:\ncut pushed out by refinement" in words
+
+
+def test_read_curve__is_the_curve_of_the_run(run):
+    results = open_results(run)
+    bands = results.read(Window(0, 0, *results.shape))
+    # the overlap of 100 pixels around these holds the whole image, as the run's one tile did
+    for row, column in [(60, 90), (30, 80), (99, 71), (64, 100)]:
+        curve = read_curve(results, row, column)
+        assert curve.lower == bands.lower[row, column]
+        assert curve.upper == bands.upper[row, column]
+        assert np.float32(curve.disparity) == bands.disparity[row, column]
+        assert np.nanmax(curve.possibilities) == 1
+        inside = (curve.disparities >= curve.lower) & (curve.disparities <= curve.upper)
+        assert curve.cut.any()
+        assert inside[curve.cut].all()
+
+
+def test_read_curve__of_a_window_of_the_images(tmp_path, run):
+    window = Window(20, 30, 100, 120)
+    part = open_results(matched(tmp_path, {"median": None, "regularization": None}, window))
+    whole = read_curve(open_results(run), 64, 90)
+    curve = read_curve(part, 64 - window.row, 90 - window.column)
+    np.testing.assert_array_equal(curve.costs, whole.costs)
+    pixel, same = part.read_pixel(44, 60), open_results(run).read_pixel(64, 90)
+    assert (pixel.image, pixel.truth) == (same.image, same.truth)
+
+
+def test_draw_curve__without_sgm_interval_and_truth(tmp_path):
+    settings = {"sgm": None, "interval": None, "regularization": None, "ambiguity": None}
+    out = matched(tmp_path, settings)
+    (tmp_path / "truth.tif").unlink()
+    draw_curve(open_results(out), tmp_path / "curve.png", 60, 90, dpi=50)
+    assert share_of(pixels_of(tmp_path / "curve.png"), WHITE) < 0.99
+
+
+def test_draw_curve__of_a_pixel_without_candidate_says_why(run, tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"row 0, column 0 has no cost curve: .*border.*: choose a pixel"):
+        draw_curve(open_results(run), tmp_path / "curve.png", 0, 0)
+
+
+def test_pictures__that_cannot_be_written_say_so(run, tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"nowhere/overview.png cannot be written: No such file"):
+        draw_overview(open_results(run), tmp_path / "nowhere" / "overview.png", dpi=50)
+
+
+def test_open_results__says_what_is_not_a_finished_run(tmp_path):
+    with pytest.raises(SatIntervalsError, match="No such file or directory: give the folder of a finished run"):
+        open_results(tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(SatIntervalsError, match="is not the report of a run"):
+        open_results(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (["inputs"], None),
+        (["inputs"], {}),
+        (["inputs"], []),
+        (["inputs", "left", "mask"], {}),
+        (["inputs", "left", "nodata"], "x"),
+        (["inputs", "right", "height"], "x"),
+        (["inputs", "right", "path"], 3),
+        (["tiles", "region", "height"], "x"),
+        (["tiles", "region", "row"], 0.5),
+        (["settings"], 3),
+    ],
+)
+@pytest.mark.parametrize("command", ["plot", "report", "evaluate"])
+def test_commands__refuse_a_report_that_is_none(tmp_path, command, place, value):
+    out = write_run(tmp_path, *random_bands(4, 5))
+    report = json.loads((out / "run.json").read_text())
+    *sections, last = place
+    reduce(getitem, sections, report)[last] = value
+    (out / "run.json").write_text(json.dumps(report))
+    done = invoke(command, out, "--debug")
+    assert done.exit_code == 2
+    assert re.match(rf"sat-intervals: {out}/run.json(:| is not the report of a run)", done.output.splitlines()[-1])
+
+
+def test_open_results__refuses_what_is_no_report(tmp_path):
+    out = write_run(tmp_path, *random_bands(4, 5))
+    for content in (b'{"\xff": 1}', b"[]", b"3", b"{"):
+        (out / "run.json").write_bytes(content)
+        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: rerun match"):
+            open_results(out)
+
+
+def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
+    bands, validity, _ = random_bands(4, 5)
+    out = write_run(tmp_path, bands, validity)
+    report = json.loads((out / "run.json").read_text())
+    report["tiles"]["region"]["height"] = 99999
+    (out / "run.json").write_text(json.dumps(report))
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 of 99999 x 5: rerun"):
+        open_results(out)
+    write_run(tmp_path, bands, validity)
+    write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of .* run.json says 4 of 4 x 5"):
+        open_results(out)
+    write_run(tmp_path, bands, validity)
+    (out / "validity.tif").unlink()
+    with pytest.raises(SatIntervalsError, match=r"validity.tif is missing: "):
+        open_results(out)
+
+
+def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
+    bands, validity, truth = random_bands(40, 50)
+    out = write_run(tmp_path, bands, validity)
+    write_layer(tmp_path / "truth.tif", truth[1:], np.nan, PLACE)
+    with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 40 x 50, the run 40 x 50"):
+        open_results(out)
+    write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
+    with pytest.raises(SatIntervalsError, match="41 x 50 pixels, but had 40 x 50 when it was matched"):
+        open_results(out)
+
+
+@pytest.mark.parametrize("name", ["right.tif", "mask.tif"])
+def test_open_results__refuses_other_pixels_than_those_of_the_run(tmp_path, name):
+    random = np.random.default_rng(0)
+    for image, largest in (("left", 99), ("right", 99), ("mask", 1)):
+        write_layer(tmp_path / f"{image}.tif", random.integers(0, largest, (40, 50)).astype(np.uint16), 99, PLACE)
+    right = open_image(tmp_path / "right.tif", mask=tmp_path / "mask.tif")
+    match_pair(tmp_path / "left.tif", right, tmp_path / "out", {"disparity": {"minimum": -3, "maximum": 3}})
+    file, kept = tmp_path / name, (tmp_path / name).read_bytes()
+    os.utime(file, (0, 0))
+    open_results(tmp_path / "out")  # the same file, copied
+    write_layer(file, np.ones((40, 50), np.uint16), 0, PLACE)
+    with pytest.raises(SatIntervalsError, match=f"{name} has changed since it was matched: restore it"):
+        open_results(tmp_path / "out")
+    file.write_bytes(kept[:-1] + b"x")  # of the same size
+    with pytest.raises(SatIntervalsError, match=f"{name} has changed since it was matched: restore it"):
+        open_results(tmp_path / "out")
+
+
+def test_classify__takes_the_first_reason():
+    validity = np.array([0, NOT_REFINED, REGULARIZED, MISMATCH | REGULARIZED, LEFT_WINDOW | OCCLUSION], np.uint16)
+    meanings = [PIXEL_CLASSES[place].meaning for place in classify(validity)]
+    assert meanings[:2] == ["valid", "valid"]
+    assert meanings[2:] == ["valid, interval regularised", FLAGS[7].meaning, FLAGS[0].meaning]

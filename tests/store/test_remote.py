@@ -1,0 +1,215 @@
+"""Tiles in a bucket of a real S3 server: the same bytes, nothing lost when something dies."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+
+import boto3
+import psutil
+import pytest
+from helpers import COMMAND, OUTPUTS, PATIENCE, hashes, wait_until, write_pair
+
+from sat_intervals import match_pair
+from sat_intervals.demo import make_scene
+
+TILES = 16
+
+
+def s3():
+    """A client other than the one that is tried."""
+    return boto3.client("s3")
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory) -> Path:
+    """A folder with left.tif, right.tif, settings.yaml of 4 x 4 tiles, and the run with its tiles on the disk."""
+    folder = tmp_path_factory.mktemp("pair")
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 128, "overlap": 20})
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    return folder
+
+
+@contextmanager
+def started(pair: Path, out: Path, store: str | Path, *options: str) -> Iterator[subprocess.Popen]:
+    """``match`` as a process of its own that does not outlive the test."""
+    command = [COMMAND, "match", pair / "left.tif", pair / "right.tif", out, "--config", pair / "settings.yaml"]
+    command += ["--store", store, "--quiet", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended(process: subprocess.Popen) -> tuple[int, str]:
+    output, _ = process.communicate(timeout=PATIENCE)
+    return process.returncode, output
+
+
+def objects(store: str) -> dict[str, datetime]:
+    """Names under a store, and when they were written."""
+    prefix = store.removeprefix("s3://bucket/") + "/"
+    pages = s3().get_paginator("list_objects_v2").paginate(Bucket="bucket", Prefix=prefix)
+    found = (item for page in pages for item in page.get("Contents", []))
+    return {item["Key"].removeprefix(prefix): item["LastModified"] for item in found}
+
+
+def records(store: str) -> dict[str, datetime]:
+    return {name: when for name, when in objects(store).items() if "/records/" in name}
+
+
+def wait_for_tiles(process: subprocess.Popen, store: str, count: int) -> None:
+    wait_until(lambda: len(records(store)) >= count or process.poll() is not None, f"{count} tiles")
+    assert process.poll() is None, process.stdout.read()
+
+
+@contextmanager
+def halted(process: subprocess.Popen) -> Iterator[list[psutil.Process]]:
+    """The run alive, its two workers halted, and all killed at the end."""
+    workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+    for worker in workers:
+        worker.suspend()
+    try:
+        yield workers
+    finally:
+        process.kill()
+        for worker in workers:
+            with suppress(psutil.NoSuchProcess):
+                worker.kill()
+        psutil.wait_procs(workers, 10)
+
+
+def assert_complete(pair: Path, out: Path, *others: str) -> None:
+    assert hashes(out) == hashes(pair / "undisturbed")
+    assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, *others])
+
+
+def status_of(out: Path, store: str) -> str:
+    command = [COMMAND, "status", out, "--store", store]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
+    store, out = f"{bucket}/killed", tmp_path / "out"
+    with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
+        wait_for_tiles(first, store, 3)
+        with halted(first):
+            assert "a run is active" in status_of(out, store)
+    done = records(store)
+    assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out, store)
+    with started(pair, out, store, "--keep-tiles") as again:
+        assert ended(again) == (0, "")
+    after = records(store)
+    assert {name: after[name] for name in done} == done, "tiles done twice"
+    assert len(after) == TILES
+    assert_complete(pair, out, "tiles")
+
+
+def test_match__shares_a_bucket_with_the_same_run_and_ends_when_that_removes_the_tiles(bucket, pair, tmp_path):
+    store, out, other = f"{bucket}/shared", tmp_path / "out", tmp_path / "other"
+    with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
+        wait_for_tiles(first, store, 3)
+        with halted(first) as workers:
+            with started(pair, other, store) as second:
+                assert ended(second) == (0, "")
+            assert_complete(pair, other)
+            assert objects(store) == {}
+            for worker in workers:
+                worker.resume()
+            status, output = ended(first)
+    assert status == 1
+    assert re.search(rf"^sat-intervals: the tiles in {store}/\w{{32}} are gone: .*: rerun the same", output, re.M)
+    assert [path.name for path in out.iterdir()] == ["tiles"]
+    assert objects(store) == {}
+
+
+def test_match__never_forgets_where_tiles_lie(bucket, pair, tmp_path):
+    first, second, out = f"{bucket}/first", tmp_path / "second", tmp_path / "out"
+    with started(pair, out, first) as run:
+        wait_for_tiles(run, first, 2)
+        run.terminate()
+        assert ended(run)[0] == 143
+    with started(pair, out, second) as run:
+        status, output = ended(run)
+    assert status == 2
+    assert re.search(
+        rf"places the tiles of the run in {first}/(\w+), not in {second}: if that is your store, give --store {first}",
+        output,
+    )
+    with started(pair, out, second, "--overwrite") as run:
+        wait_until(lambda: list(second.glob("*/records/[0-9]*")) or run.poll() is not None, "tiles")
+        run.terminate()
+        assert ended(run)[0] == 143
+    assert objects(first), "a store that is not named stays as it is"
+    with started(pair, out, second) as run:
+        assert ended(run) == (0, "")
+    assert not list(second.iterdir())
+    assert_complete(pair, out)
+    with started(pair, out, first, "--overwrite") as run:
+        assert ended(run) == (0, "")
+    assert objects(first) == {}, "the same run in the same store"
+    assert_complete(pair, out)
+
+
+def test_batch__keeps_the_tiles_of_equal_pairs_in_folders_of_their_own(bucket, pair, tmp_path):
+    rows = [{"name": name, "left": "left.tif", "right": "right.tif"} for name in ("one", "two")]
+    (pair / "pairs.json").write_text(json.dumps(rows))
+    command = [COMMAND, "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml", "--quiet"]
+    command += ["--store", f"{bucket}/batch/", "--keep-tiles", "--tile-size", "512"]
+    subprocess.run(command, check=True)
+    names = sorted(re.sub(r"-\w{32}/", "/", name) for name in records(f"{bucket}/batch"))
+    assert names == ["one/records/0_0.json", "two/records/0_0.json"]
+    for name in ("one", "two"):
+        assert sorted(path.name for path in (tmp_path / name).iterdir()) == sorted([*OUTPUTS, "tiles"])
+
+
+def test_match__reads_images_in_a_bucket_and_knows_them_by_size_and_etag(bucket, pair, tmp_path, monkeypatch):
+    # what GDAL calls the address of the service
+    monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
+    monkeypatch.setenv("AWS_HTTPS", "NO")
+    monkeypatch.setenv("AWS_VIRTUAL_HOSTING", "FALSE")
+    for side in ("left", "right"):
+        s3().upload_file(str(pair / f"{side}.tif"), "bucket", f"images/{side}.tif")
+    command = [COMMAND, "match", f"{bucket}/images/left.tif", "/vsis3/bucket/images/right.tif", tmp_path / "out"]
+    subprocess.run([*command, "--config", pair / "settings.yaml", "--quiet"], check=True)
+    assert_complete(pair, tmp_path / "out")
+    inputs = json.loads((tmp_path / "out" / "run.json").read_text())["inputs"]
+    for side in ("left", "right"):
+        told = s3().head_object(Bucket="bucket", Key=f"images/{side}.tif")
+        assert (inputs[side]["bytes"], inputs[side]["etag"]) == (told["ContentLength"], told["ETag"])
+
+
+@pytest.mark.parametrize(
+    ("store", "says"),
+    [
+        ("s3://no-such-bucket/tiles", "The specified bucket does not exist"),
+        ("nothing://bucket/tiles", "Protocol not known: nothing"),
+    ],
+)
+def test_match__refuses_a_store_that_cannot_be_used(bucket, pair, tmp_path, store, says):
+    with started(pair, tmp_path / "out", store) as process:
+        status, output = ended(process)
+    assert status == 2
+    assert re.match(rf"sat-intervals: {store}/\w{{32}} cannot be used: {says}", output)
+    assert len(output.splitlines()) == 1
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_create__writes_an_object_once(bucket):
+    code = """if True:
+        from concurrent.futures import ThreadPoolExecutor
+        from sat_intervals.store.folder import RemoteFolder
+        folder = RemoteFolder("s3://bucket/contested")
+        with ThreadPoolExecutor(8) as threads:
+            created = list(threads.map(lambda number: folder.create("manifest.json", str(number)), range(8)))
+        print(*created, folder.read("manifest.json"))
+    """
+    *created, first = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
+    assert created.count("True") == 1
+    assert created[int(first)] == "True"

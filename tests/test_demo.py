@@ -1,0 +1,134 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sat_intervals.demo import DATUM, GAIN, OFFSET, VIEWS, Scene, look, make_scene, profiles
+
+ROWS, COLUMNS = 300, 420  # with a river, houses, blocks, wood and fields
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(ROWS, COLUMNS)
+
+
+def equal(one: Scene, other: Scene) -> bool:
+    names = [field.name for field in dataclasses.fields(Scene)]
+    return all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=n == "truth") for n in names)
+
+
+def warp_errors(scene: Scene) -> np.ndarray:
+    """What the right image, sampled linearly at x + truth, differs from the left on visible pixels, as a share of
+    the left's dynamic range; the radiometry of both views undone."""
+    left, right = ((image - o) / g for image, o, g in zip((scene.left, scene.right), OFFSET, GAIN, strict=True))
+    x = np.arange(scene.left.shape[1])
+    warped = np.stack([np.interp(x + d, x, line) for d, line in zip(scene.truth, right, strict=True)])
+    low, high = np.percentile(left[scene.left > 0], [1, 99])
+    return np.abs(warped - left)[scene.visible] / (high - low)
+
+
+def test_look__shows_the_highest_of_all_crossings():
+    x = np.arange(40, 90) + 0.3
+    for profile in list(profiles(60, 120))[::15]:
+        _, u, height, _ = profile
+        for view, a in enumerate(VIEWS):
+            nodes = u + a * (height - DATUM)
+            start, stop, h0, h1 = nodes[:-1], nodes[1:], height[:-1], height[1:]
+            shown = look(profile, view, x)[0]
+            for column, high in zip(x, shown, strict=True):
+                k = np.flatnonzero((start - column) * (stop - column) <= 0)
+                crossings = h0[k] + (column - start[k]) / (stop[k] - start[k]) * (h1[k] - h0[k])
+                assert high == pytest.approx(crossings.max(), abs=1e-9)
+
+
+def test_look__the_other_view_shows_the_same_point_or_a_higher_one():
+    x, hidden = np.arange(COLUMNS), 0
+    for profile in list(profiles(ROWS, COLUMNS))[::10]:
+        for view in (0, 1):
+            height, radiance, seen = look(profile, view, x)
+            partner = x + (VIEWS[1 - view] - VIEWS[view]) * (height - DATUM)
+            there, other_radiance, seen_back = look(profile, 1 - view, partner)
+            np.testing.assert_allclose(there[seen], height[seen], atol=1e-5)
+            np.testing.assert_allclose(other_radiance[seen], radiance[seen], atol=1e-4)
+            assert seen_back[seen].all()
+            assert (there[~seen] > height[~seen]).all()
+            hidden += np.count_nonzero(~seen)
+    assert hidden > 1000
+
+
+def test_make_scene__truth_warps_the_right_image_onto_the_left():
+    # the rest is what linear interpolation of point samples costs in texture
+    errors = warp_errors(make_scene(ROWS, COLUMNS, psf=0, snr=np.inf))
+    assert errors.mean() < 0.01
+    assert np.median(errors) < 0.004
+
+
+def test_make_scene__truth_is_right_beyond_a_tenth_of_a_pixel(scene):
+    errors = {}
+    for shift in (-0.1, 0.0, 0.1):
+        moved = dataclasses.replace(scene, truth=scene.truth + np.float32(shift))
+        errors[shift] = np.square(warp_errors(moved)).mean()
+    assert errors[0.0] < min(errors[-0.1], errors[0.1])
+
+
+def test_make_scene__arrays_are_as_declared(scene):
+    for image in (scene.left, scene.right):
+        assert image.shape == (ROWS, COLUMNS)
+        assert image.dtype == np.uint16
+        assert 1000 < image.max() <= 4095
+    assert (scene.truth.dtype, scene.visible.dtype) == (np.float32, np.bool_)
+    assert (scene.truth.shape, scene.visible.shape) == ((ROWS, COLUMNS), (ROWS, COLUMNS))
+
+
+def test_make_scene__range_encloses_the_truth_with_3_px_to_spare(scene):
+    assert scene.minimum + 3 == np.floor(np.nanmin(scene.truth))
+    assert scene.maximum - 3 == np.ceil(np.nanmax(scene.truth))
+    assert scene.minimum < 0 < scene.maximum
+
+
+def test_make_scene__default_range_is_that_of_a_city():
+    default = make_scene(snr=np.inf, psf=0)
+    assert 40 <= default.maximum - default.minimum <= 60
+
+
+def test_make_scene__the_empty_corner_has_no_truth(scene):
+    empty = scene.left == 0
+    assert 0.01 < empty.mean() < 0.04
+    assert empty[0, 0]
+    np.testing.assert_array_equal(np.isnan(scene.truth), empty)
+    np.testing.assert_array_equal(scene.right == 0, empty)
+    assert not scene.visible[empty].any()
+
+
+def test_make_scene__visible_pixels_have_a_partner_with_data(scene):
+    row, x = np.nonzero(scene.visible)
+    partner = x + scene.truth[row, x]
+    assert partner.min() >= 0
+    assert partner.max() <= COLUMNS - 1
+    assert (scene.right[row, np.floor(partner).astype(int)] > 0).all()
+    assert (scene.right[row, np.ceil(partner).astype(int)] > 0).all()
+
+
+def test_make_scene__a_city_hides_a_tenth_of_itself(scene):
+    assert 0.05 < 1 - scene.visible[np.isfinite(scene.truth)].mean() < 0.2
+
+
+def test_make_scene__noise_is_that_of_the_sensor(scene):
+    clean = make_scene(ROWS, COLUMNS, snr=np.inf)
+    for noisy, exact in ((scene.left, clean.left), (scene.right, clean.right)):
+        middle = (exact > 550) & (exact < 650)
+        noise = np.std(noisy[middle].astype(float) - exact[middle])
+        assert 85 < 600 / noise < 105
+
+
+@pytest.mark.parametrize("block", [7, 1000])
+def test_make_scene__does_not_depend_on_the_block(block):
+    assert equal(make_scene(50, 90, block=block), make_scene(50, 90))
+
+
+def test_make_scene__seed_decides():
+    first, again, second = (make_scene(80, 120, seed) for seed in (1, 1, 2))
+    assert equal(first, again)
+    assert not np.array_equal(first.left, second.left)
+    assert not np.array_equal(first.truth, second.truth, equal_nan=True)
