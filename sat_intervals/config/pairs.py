@@ -112,7 +112,7 @@ def _without_name(pair: Pair) -> Pair:
 
 
 def group_beside(image: str | Path) -> str:
-    """Return the group in the ``meta.json`` beside an image, NO_GROUP if there is none."""
+    """Return the group in the ``meta.json`` beside an image, NO_GROUP without one."""
     meta = Path(image).parent / "meta.json"
     return str(_meta(meta).get("group", NO_GROUP)) if meta.exists() else NO_GROUP
 

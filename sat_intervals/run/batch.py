@@ -56,9 +56,9 @@ def match_batch(
     out
         Folder with a subfolder for each pair, and ``batch.json`` with their states.
     config, overrides
-        Settings of all pairs, as of `load_config`; a pair's own settings win. ``cluster`` is shared by all.
+        Settings of all pairs, see `load_config`; a pair's own settings win. ``cluster`` is shared by all.
     overwrite, keep_tiles, progress
-        As of `match_pair`.
+        See `match_pair`.
 
     Returns
     -------

@@ -107,7 +107,7 @@ def prepare(
     overwrite: bool = False,
     pair: str = "",
 ) -> Job:
-    """Check all that can be checked before reading pixels; parameters as of `match_pair`.
+    """Check all that can be checked before reading pixels; parameters as in `match_pair`.
 
     ``pair`` distinguishes otherwise equal pairs of a batch in an external store.
     """
@@ -149,7 +149,7 @@ def fitted_to_jobs(config: Config) -> Config:
     Raises
     ------
     ConfigError
-        As of `fitted` and `parse_memory`.
+        See `fitted` and `parse_memory`.
     """
     if config.cluster.memory is None:
         return config

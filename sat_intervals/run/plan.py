@@ -69,7 +69,7 @@ def plan(
     Parameters
     ----------
     left, right, config, window
-        As of `match_pair`.
+        See `match_pair`.
     memory
         Memory of a worker in bytes; tiles are made smaller to fit. By default the memory of a job in the settings.
     workers
@@ -148,7 +148,7 @@ def _sampled(left: Image, right: Image, out: Path, config: Config, region: Windo
         sample = Window(row, column, height, width)
         try:
             return sample, match_pair(left, right, out, config, window=sample, overwrite=True)["seconds"]
-        except RunError as error:  # a sample cannot be resumed, unlike its message says
+        except RunError as error:  # its advice to resume does not apply to a sample
             raise RunError(f"a sample of the pair cannot be matched: {reason(error.__cause__ or error)}") from error
         except SatIntervalsError as error:
             last = error

@@ -1,4 +1,4 @@
-"""What a run says of itself in figures, gathered from the final bands strip by strip."""
+"""Count pixels of the final bands, strip by strip, for run.json."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ class Tally:
 
     def __init__(self, count: int) -> None:
         """``count``: number of disparities, so one more than the widest interval."""
-        # How often each sum of flags occurs tells all that is asked of them.
+        # Histogram of the sums of flags, from which all counts follow.
         self._sums = np.zeros(1 << (max(flag.bit for flag in FLAGS) + 1), np.int64)
         self._widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
         self._whole = round((count - 1) / _WIDTH_STEP)

@@ -15,11 +15,11 @@ PLACE = "store.json"
 
 
 class ElsewhereError(StoreError):
-    """Tiles in a store that the user did not name; the message is ``said`` and the way out."""
+    """Tiles in a store that the user did not name; the message is ``problem`` and the way out."""
 
-    def __init__(self, said: str, way_out: str) -> None:
-        super().__init__(f"{said}: {way_out}")
-        self.said = said
+    def __init__(self, problem: str, way_out: str) -> None:
+        super().__init__(f"{problem}: {way_out}")
+        self.problem = problem
 
 
 def place_of(home: Path, store: str | None) -> Folder:

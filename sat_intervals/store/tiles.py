@@ -143,7 +143,7 @@ class Store:
         except ElsewhereError as error:
             if not overwrite:
                 raise
-            _LOG.warning("%s: they are kept", error.said)
+            _LOG.warning("%s: they are kept", error.problem)
             return None
         except StoreError:  # the place file is damaged: the user's --store replaces it
             if overwrite or self.elsewhere:
@@ -238,12 +238,12 @@ class Store:
         return found
 
     def histogram(self, records: Records) -> np.ndarray:
-        """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as of `strips`."""
+        """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as in `strips`."""
         with self._damage_handled():
             return self._arrays.histogram(_checksums(records))
 
     def seams(self, records: Records) -> np.ndarray:
-        """Return the lines along the tiles' borders, see `TileArrays.seams`; errors as of `strips`."""
+        """Return the lines along the tiles' borders, see `TileArrays.seams`; errors as in `strips`."""
         with self._damage_handled():
             return self._arrays.seams(_checksums(records))
 
@@ -342,7 +342,7 @@ def store_of(home: Path, store: str | None = None) -> Store:
     Parameters
     ----------
     home, store
-        As of `place_of`.
+        See `place_of`.
 
     Raises
     ------

@@ -142,7 +142,7 @@ class TileArrays:
         return all(checksum(self.folder.read_bytes(name) or b"") == list(file) for name, file in checksums.items())
 
     def histogram(self, checksums: Checksums) -> np.ndarray:
-        """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as of `strips`."""
+        """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as in `strips`."""
         stored = self._array("histogram", _CheckedStore(self._store(), checksums))
         rows = (np.asarray(stored[row]).sum(axis=0, dtype=np.int64) for row in range(self.grid.rows))
         return sum(rows, np.zeros(self.ambiguities + 1, np.int64))
@@ -150,7 +150,7 @@ class TileArrays:
     def seams(self, checksums: Checksums) -> np.ndarray:
         """Return the lines along tile borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size).
 
-        Errors as of `strips`.
+        Errors as in `strips`.
         """
         return np.asarray(self._array("seams", _CheckedStore(self._store(), checksums))[:])
 
