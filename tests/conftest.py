@@ -8,6 +8,10 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from helpers import write_pair
+
+from sat_intervals import match_pair
+from sat_intervals.demo import make_scene
 
 pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
 
@@ -51,6 +55,15 @@ def shared_data() -> Path:
     folder = Path(os.environ.get("SAT_INTERVALS_SHARED", "../shared")) / "data"
     if not folder.is_dir():
         pytest.skip(f"no real pairs in {folder}: SAT_INTERVALS_SHARED names the folder that holds data/")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with left.tif, right.tif, settings.yaml of 7 x 8 tiles, and the run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("pair")
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
     return folder
 
 

@@ -13,22 +13,12 @@ from types import SimpleNamespace
 import psutil
 import pytest
 import yaml
-from helpers import COMMAND, hashes, wait_until, write_pair
+from helpers import COMMAND, hashes, wait_until
 
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.config import Cluster
-from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
 from sat_intervals.run.batch_system import current_workers, job_script
-
-
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory):
-    """A folder with left.tif, right.tif and the run in threads that nothing disturbed; its settings."""
-    folder = tmp_path_factory.mktemp("pair")
-    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
-    return folder, settings
 
 
 @contextmanager
@@ -46,7 +36,7 @@ def submitted(
 
     ``constants`` are those of `run.batch_system`; where it ends well and ``is_quiet`` it must say nothing.
     """
-    images, settings = pair
+    settings = yaml.safe_load((pair / "settings.yaml").read_text())
     folder.mkdir(exist_ok=True)
     job = {"jobs": 1, "cores": 1, "memory": "2GB", "walltime": "00:05:00"} | cluster
     (folder / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": job}))
@@ -57,7 +47,7 @@ def submitted(
     } | (own or {})
     code = "from sat_intervals import cli; from sat_intervals.run import batch_system; "
     code += f"vars(batch_system).update({constants or {}}); cli.main()"
-    command = [sys.executable, "-c", code, "match", images / "left.tif", images / "right.tif", folder / "out"]
+    command = [sys.executable, "-c", code, "match", pair / "left.tif", pair / "right.tif", folder / "out"]
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
     with (folder / "log").open("w") as log:
         environment = os.environ | {f"DASK_{name}": str(value) for name, value in own.items()}
@@ -97,7 +87,7 @@ def workers(folder: Path) -> list[psutil.Process]:
 
 
 def assert_complete(pair, out: Path) -> None:
-    assert hashes(out) == hashes(pair[0] / "undisturbed")
+    assert hashes(out) == hashes(pair / "undisturbed")
     assert {path.name for path in out.iterdir()} - {"logs"} == {"intervals.tif", "run.json", "validity.tif"}
 
 
@@ -137,9 +127,9 @@ def test_match__goes_on_with_the_jobs_that_the_batch_system_took(slurm, pair, tm
 
 @pytest.mark.peer("dask_jobqueue")
 def test_match__prints_the_job_script_and_submits_nothing(pair, tmp_path):
-    images, settings = pair
+    settings = yaml.safe_load((pair / "settings.yaml").read_text())
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings | {"cluster": {"cores": 2, "memory": "3GB"}}))
-    command = [COMMAND, "match", images / "left.tif", images / "right.tif", tmp_path / "out"]
+    command = [COMMAND, "match", pair / "left.tif", pair / "right.tif", tmp_path / "out"]
     command += ["--config", tmp_path / "settings.yaml", "--cluster", "slurm", "--dry-run"]
     script = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert {"#SBATCH --cpus-per-task=2", "#SBATCH --mem=3G"} <= set(script)
@@ -197,8 +187,7 @@ def test_match__ends_when_the_last_worker_has_gone_and_goes_on_after(slurm, pair
     assert "the last worker ended and none has started for 5 s" in line
     assert str(tmp_path / "out" / "logs") in line
     assert "rerun the same command: it resumes" in line
-    images, settings = pair
-    match_pair(images / "left.tif", images / "right.tif", tmp_path / "out", settings)
+    match_pair(pair / "left.tif", pair / "right.tif", tmp_path / "out", pair / "settings.yaml")
     assert_complete(pair, tmp_path / "out")
 
 

@@ -21,7 +21,6 @@ import yaml
 from distributed import Client, LocalCluster
 from helpers import COMMAND, OUTPUTS, PATIENCE, PLACE, wait_until, write_pair
 
-from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
@@ -34,17 +33,8 @@ TILES = 56
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory):
-    """A folder with left.tif, right.tif, settings.yaml of 7 x 8 tiles, and the run that nothing disturbed."""
-    folder = tmp_path_factory.mktemp("pair")
-    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def uneven(tmp_path_factory):
-    """The same of four tiles: one takes 290 MB for its volume of costs, three take 12 MB at most."""
+    """A pair of four tiles: one takes 290 MB for its volume of costs, three take 12 MB at most."""
     folder = tmp_path_factory.mktemp("uneven")
     disparity = {"minimum": -260, "maximum": 260}
     write_pair(folder, make_scene(528, 528, seed=3), disparity=disparity, tiles={"size": 512, "overlap": 3})
