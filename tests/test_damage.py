@@ -206,7 +206,7 @@ def test_match__finds_its_tiles_where_the_note_of_their_place_is_damaged(scene, 
     store = ("--store", tmp_path / "store", "--keep-tiles")
     match(scene, tmp_path / "out", *store)
     (tmp_path / "out" / "run.json").unlink()
-    note = tmp_path / "out" / "tiles" / "store.json"
+    note = tmp_path / "out" / "tiles" / ".sat-intervals.store"
     note.write_text(text, encoding="latin-1")
     said = match(scene, tmp_path / "out", status=2)
     assert f"{note} cannot be read: give the --store of before to go on, or --overwrite" in said
@@ -287,7 +287,7 @@ def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tm
 MARKS = [".sat-intervals.finished", ".sat-intervals.replacing"]
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "store.json", *MARKS, "arrays.zarr/zarr.json"])
+@pytest.mark.parametrize("name", ["manifest.json", ".sat-intervals.store", *MARKS, "arrays.zarr/zarr.json"])
 def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
     tiles = unfinished(scene, tmp_path / "out")
     (tiles / name).unlink(missing_ok=True)
@@ -314,7 +314,14 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
     shutil.rmtree(tiles)
     shutil.rmtree(out)
-    names = ["notes.txt", "records/notes.json", "failures/all.json", "arrays.zarr/int16/table", "arrays.zarr/.zattrs"]
+    names = [
+        "notes.txt",
+        "store.json",
+        "records/notes.json",
+        "failures/all.json",
+        "arrays.zarr/int16/table",
+        "arrays.zarr/.zattrs",
+    ]
     mine = with_files(tiles, names)
     top = [
         "records/0_0.json", "failures/0_0.json", "arrays.zarr/zarr.json", "normalization.json", "manifest.json"

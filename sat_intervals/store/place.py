@@ -11,7 +11,7 @@ from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, digest, parsed
 
 # In the folder of the run where its tiles are elsewhere: it says where.
-PLACE = "store.json"
+PLACE = ".sat-intervals.store"
 
 
 class ElsewhereError(StoreError):
