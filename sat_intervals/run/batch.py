@@ -131,7 +131,6 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
-    run.check_whole()
     return {name: run.report[name] for name in ("counts", "seconds")}
 
 

@@ -11,7 +11,7 @@ from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, digest, parsed
 
 # File in the folder of a run that names the location of its tiles, if they are elsewhere.
-PLACE = "store.json"
+PLACE = ".sat-intervals.store"
 
 
 class ElsewhereError(StoreError):

@@ -212,7 +212,7 @@ def test_match__finds_its_tiles_where_the_note_of_their_place_is_damaged(scene, 
     store = ("--store", tmp_path / "store", "--keep-tiles")
     match(scene, tmp_path / "out", *store)
     (tmp_path / "out" / "run.json").unlink()
-    note = tmp_path / "out" / "tiles" / "store.json"
+    note = tmp_path / "out" / "tiles" / ".sat-intervals.store"
     note.write_text(text, encoding="latin-1")
     said = match(scene, tmp_path / "out", status=2)
     assert f"{note} cannot be read: give the same --store as before to resume, or --overwrite" in said
@@ -295,7 +295,7 @@ def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tm
 MARKS = [".sat-intervals.finished", ".sat-intervals.replacing"]
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "store.json", *MARKS, "arrays.zarr/zarr.json"])
+@pytest.mark.parametrize("name", ["manifest.json", ".sat-intervals.store", *MARKS, "arrays.zarr/zarr.json"])
 def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
     tiles = unfinished(scene, tmp_path / "out")
     (tiles / name).unlink(missing_ok=True)
@@ -322,7 +322,14 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
     shutil.rmtree(tiles)
     shutil.rmtree(out)
-    names = ["notes.txt", "records/notes.json", "failures/all.json", "arrays.zarr/int16/table", "arrays.zarr/.zattrs"]
+    names = [
+        "notes.txt",
+        "store.json",
+        "records/notes.json",
+        "failures/all.json",
+        "arrays.zarr/int16/table",
+        "arrays.zarr/.zattrs",
+    ]
     mine = with_files(tiles, names)
     top = [
         "records/0_0.json", "failures/0_0.json", "arrays.zarr/zarr.json", "normalization.json", "manifest.json"
@@ -406,7 +413,7 @@ def test_open_run__of_a_report_without_sizes_opens(scene, tmp_path):
     report = json.loads((tmp_path / "out" / "run.json").read_text())
     del report["files"]
     (tmp_path / "out" / "run.json").write_text(json.dumps(report))
-    open_run(tmp_path / "out").check_whole()
+    open_run(tmp_path / "out")
 
 
 def test_match__keeps_empty_files_in_a_folder_without_signs_of_a_run(scene, tmp_path):
@@ -426,3 +433,13 @@ def test_match__names_a_folder_where_a_file_of_a_tile_must_be(scene, tmp_path, n
     result = invoke(*command, "--quiet")
     assert result.exit_code == 1
     assert f"tile 1_0: {tmp_path}/out/tiles/{name}: Is a directory" in result.stderr.splitlines()[1]
+
+
+@pytest.mark.parametrize("command", ["evaluate OUT", "report OUT", "plot OUT", "export OUT TARGET --to otb"])
+def test_commands__refuse_a_result_of_which_a_bit_flipped(scene, tmp_path, command):
+    shutil.copytree(scene / "kept", tmp_path / "OUT")
+    damage(tmp_path / "OUT" / "intervals.tif", "bit")
+    result = invoke(*(tmp_path / word if word.isupper() else word for word in command.split()))
+    assert f"{tmp_path}/OUT/intervals.tif is not what the run published; it is damaged" in result.stderr
+    assert result.exit_code == 2
+    assert not (tmp_path / "TARGET").exists()

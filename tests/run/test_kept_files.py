@@ -498,7 +498,7 @@ def test_commands__follow_no_note_of_a_received_folder(pair, elsewhere, kind):
     out = folder / "batch" / "out"
     images = folder / "left.tif", folder / "right.tif"
     (out / "tiles").mkdir(parents=True)
-    (out / "tiles" / "store.json").write_text(json.dumps(noted))
+    (out / "tiles" / ".sat-intervals.store").write_text(json.dumps(noted))
     before = contents(precious)
     command = ["match", *images, out, "--config", folder / "settings.yaml", "--quiet"]
     says = f"places the tiles of the run in {noted}", f"give --store {noted.rpartition('/')[0]}"
@@ -508,7 +508,7 @@ def test_commands__follow_no_note_of_a_received_folder(pair, elsewhere, kind):
     assert (result.exit_code, result.stderr.count("\n")) == (0, 1)
     assert f"places the tiles of the run in {noted}: they are kept" in result.stderr
     (out / "tiles").mkdir()
-    (out / "tiles" / "store.json").write_text(json.dumps(noted))
+    (out / "tiles" / ".sat-intervals.store").write_text(json.dumps(noted))
     report = match_batch([PairOfBatch("out", *map(str, images))], folder / "batch", settings)
     assert report["out"]["state"] == "done before"
     (out / "run.json").unlink()
@@ -523,7 +523,7 @@ def test_match__with_the_noted_store_deletes_only_what_its_manifest_names(pair, 
     folder, settings = pair
     precious, _, _ = elsewhere
     (folder / "out" / "tiles").mkdir(parents=True)
-    (folder / "out" / "tiles" / "store.json").write_text(json.dumps(str(precious)))
+    (folder / "out" / "tiles" / ".sat-intervals.store").write_text(json.dumps(str(precious)))
     before = contents(precious)
     settings["cluster"]["store"] = str(precious.parent)
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, overwrite=True)
