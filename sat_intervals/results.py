@@ -257,7 +257,7 @@ def _nodata(record: dict[str, Any]) -> float | None:
 def _check_raster(file: Path, bands: int, region: Window, published: dict[str, int] | None) -> None:
     """Raise if a raster is missing, or differs in shape or bytes from the report of its run.
 
-    GDAL decodes most flipped bits of a compressed block without an error. Reports of earlier versions have no checksums.
+    GDAL decodes most flipped bits of a compressed block without an error. Earlier versions wrote no checksums.
     """
     if not file.exists():
         raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or rerun match")
