@@ -36,6 +36,7 @@ _NARROW_RANGE = 3
 _COUNTS_MEANING = {
     "ambiguous": "valid pixels whose interval is the whole search range",
     "low_confidence": "valid pixels with the flag regularized; flags.regularized also counts invalid ones",
+    "causes": "invalid pixels, each under its first flag that makes it invalid; with valid they add up to pixels",
     "flags": "pixels with the flag, valid or not; a pixel may have several flags",
 }
 
