@@ -68,6 +68,12 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     return {"path": path}
 
 
+def stamp_of(path: str) -> str | None:
+    """The stamp that `identity` tells of a file; None where it tells none."""
+    file = _local_file(path)
+    return _stamp(file) if file else None
+
+
 def _local_file(path: str) -> Path | None:
     """The local file that a name of GDAL is read from, such as the archive of ``/vsizip/{a.zip}/left.tif``."""
     name = path

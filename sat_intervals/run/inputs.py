@@ -42,10 +42,18 @@ def _known(inputs: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _described(image: Image, told: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
-    """What run.json and the manifest say of an input."""
-    crs = image.georeferencing.crs
+    """What run.json and the manifest say of an input.
+
+    Raises
+    ------
+    ChangedInputError
+        A file that is not the one that was opened, of which band and no-data value are.
+    """
+    files, crs = _with_others(image.path, told), image.georeferencing.crs
+    if files.get("stamp") != image.stamp:
+        raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: run the command again")
     return {
-        **_with_others(image.path, told),
+        **files,
         "height": image.height,
         "width": image.width,
         "band": image.band,
