@@ -268,3 +268,15 @@ def test_connected__ends_when_worker_processes_do_not_start(tmp_path, monkeypatc
         connected(Cluster(kind="processes", workers=1), tmp_path),
     ):
         pass
+
+
+def test_connected__names_the_settings_with_which_dask_cannot_start(tmp_path):
+    (tmp_path / "file").touch()
+    with (
+        dask.config.set({"temporary-directory": str(tmp_path / "file" / "inside")}),
+        pytest.raises(
+            RunError, match=r"^dask cannot start here: .*Not a directory.*: check its settings, such as DASK_"
+        ),
+        connected(Cluster(), tmp_path),
+    ):
+        pass
