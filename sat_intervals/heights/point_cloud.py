@@ -3,6 +3,7 @@
 import math
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -68,6 +69,21 @@ class Cells:
         )
 
 
+def read_points(path: Path, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """The bands of ``points.tif`` in a window, and where there are points.
+
+    Raises
+    ------
+    SatIntervalsError
+        Longitudes, latitudes and heights that are not those of the same pixels.
+    """
+    bands = read_layers(path, window)
+    known = np.isfinite(bands[: _POINT["height"] + 1])
+    if (known != known[0]).any():
+        raise SatIntervalsError(f"{path} is damaged, some of its pixels have parts of a point only: triangulate again")
+    return bands, known[0]
+
+
 class PointCloud:
     """The points of one run, read by windows, with the extent of each on the map."""
 
@@ -81,9 +97,8 @@ class PointCloud:
             self._look(tile.core)
 
     def _look(self, window: Window) -> None:
-        bands = read_layers(self._path, window)
+        bands, known = read_points(self._path, window)
         longitude, latitude = bands[_POINT["longitude"]], bands[_POINT["latitude"]]
-        known = np.isfinite(longitude)
         self.points += int(known.sum())
         if known.any():
             longitude, latitude = longitude[known], latitude[known]
@@ -119,8 +134,7 @@ class PointCloud:
             if ended.is_set():
                 break
             if extent.grown(radius).meets(place):
-                bands = read_layers(self._path, source)
-                known = np.isfinite(bands[_POINT["height"]])
+                bands, known = read_points(self._path, source)
                 longitude, latitude, height, lower, upper = (
                     bands[_POINT[name]][known]
                     for name in ("longitude", "latitude", "height", "height_lower", "height_upper")
