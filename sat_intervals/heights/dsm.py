@@ -17,7 +17,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.fusion import cells_of_run, fused
-from sat_intervals.heights.point_cloud import WINDOW, Cells, Extent, PointCloud
+from sat_intervals.heights.point_cloud import WINDOW, Cells, Extent, PointCloud, read_points
 from sat_intervals.products import POINTS
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
@@ -25,7 +25,6 @@ from sat_intervals.raster import (
     Projection,
     is_surface,
     north_up,
-    read_layers,
     read_shape,
     read_tags,
     surface_file,
@@ -177,8 +176,7 @@ def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
         tiles = Grid(Window(0, 0, *run.shape), WINDOW)
         middle = tiles.rows / 2 - 0.5, tiles.columns / 2 - 0.5
         for tile in sorted(tiles, key=lambda tile: math.dist((tile.grid_row, tile.grid_column), middle)):
-            bands = read_layers(run.out / "points.tif", tile.core)
-            known = np.isfinite(bands[0])
+            bands, known = read_points(run.out / "points.tif", tile.core)
             if known.any():
                 return float(np.median(bands[0][known])), float(np.median(bands[1][known]))
     raise SatIntervalsError(f"no valid pixel in {', '.join(str(run.out) for run in runs)}: give runs with points")

@@ -3,6 +3,7 @@
 import math
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -68,6 +69,21 @@ class Cells:
         )
 
 
+def read_points(path: Path, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Read the bands of ``points.tif`` in a window and the mask of its points.
+
+    Raises
+    ------
+    SatIntervalsError
+        A pixel has some of longitude, latitude and height, but not all.
+    """
+    bands = read_layers(path, window)
+    known = np.isfinite(bands[: _POINT["height"] + 1])
+    if (known != known[0]).any():
+        raise SatIntervalsError(f"{path} is damaged, some pixels have only part of a point: triangulate again")
+    return bands, known[0]
+
+
 class PointCloud:
     """The points of one run, read by windows, and the map extent of each window."""
 
@@ -82,9 +98,8 @@ class PointCloud:
 
     def _scan(self, window: Window) -> None:
         """Count the points of a window and find their extent."""
-        bands = read_layers(self._path, window)
+        bands, known = read_points(self._path, window)
         longitude, latitude = bands[_POINT["longitude"]], bands[_POINT["latitude"]]
-        known = np.isfinite(longitude)
         self.points += int(known.sum())
         if known.any():
             longitude, latitude = longitude[known], latitude[known]
@@ -120,8 +135,7 @@ class PointCloud:
             if ended.is_set():
                 break
             if extent.grown(radius).intersects(place):
-                bands = read_layers(self._path, source)
-                known = np.isfinite(bands[_POINT["height"]])
+                bands, known = read_points(self._path, source)
                 longitude, latitude, height, lower, upper = (
                     bands[_POINT[name]][known]
                     for name in ("longitude", "latitude", "height", "height_lower", "height_upper")

@@ -67,6 +67,12 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     return {"path": path}
 
 
+def stamp_of(path: str) -> str | None:
+    """The stamp that `identity` tells of a file; None where it tells none."""
+    file = _local_file(path)
+    return _stamp(file) if file else None
+
+
 def _local_file(path: str) -> Path | None:
     """Return the local file behind a GDAL name, such as the archive in ``/vsizip/{a.zip}/left.tif``; None if remote."""
     name = path

@@ -3,7 +3,7 @@
 import logging
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from rasterio.io import DatasetReader
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.identity import stamp_of
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
@@ -52,6 +53,8 @@ class Image:
         The user's mask: a file of the same size, not 0 where the image must not be used; None without one.
     georeferencing
         Georeferencing of the file.
+    stamp
+        Stamp of the file when it was opened, see `identity`; None if the file is not local.
     """
 
     path: str
@@ -64,6 +67,7 @@ class Image:
     alpha: int | None
     mask: str | None
     georeferencing: Georeferencing
+    stamp: str | None
 
 
 def open_image(
@@ -93,6 +97,7 @@ def open_image(
         The file has no usable band, or the mask has another size.
     """
     name = _absolute(path)
+    stamp = stamp_of(name)
     with opened(name) as dataset:
         bands, alphas = _kinds(dataset)
         band = _chosen(name, bands, band)
@@ -109,6 +114,7 @@ def open_image(
             alpha=alphas[0] if alphas else None,
             mask=None if mask is None else _absolute(mask),
             georeferencing=Georeferencing.of(dataset),
+            stamp=stamp,
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
             raise InputError(
@@ -156,6 +162,8 @@ def check_pair(left: Image, right: Image, count: int) -> None:
 @contextmanager
 def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
     """Open a raster for reading and turn GDAL's errors into `InputError`; ``window`` is for the message."""
+    if window is None:
+        _check_beside(path)
     check_regular(path)
     try:
         with gdal.reading(path) as dataset:
@@ -170,6 +178,16 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
             f"{path} cannot be read at rows {window.row} to {window.row_stop - 1}, columns {window.column} to "
             f"{window.column_stop - 1}: {reason}: the file may be truncated, give a complete copy"
         ) from error
+
+
+def _check_beside(path: str) -> None:
+    """Raise if a file beside a raster, such as a mask, is a pipe: GDAL would wait for it."""
+    folder, name = os.path.split(path)
+    stem = os.path.splitext(name)[0].lower()
+    with suppress(OSError), os.scandir(folder or ".") as files:
+        for file in files:
+            if file.name.lower().startswith((f"{stem}.", f"{stem}_rpc.")):
+                check_regular(file.path)
 
 
 def _absolute(path: str | os.PathLike[str]) -> str:
@@ -211,6 +229,7 @@ def other_files(name: str) -> list[str]:
     waiting = [name]
     while waiting:
         path = waiting.pop()
+        _check_beside(path)
         try:
             with gdal.reading(path) as dataset:
                 files = dataset.files

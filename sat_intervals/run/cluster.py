@@ -140,13 +140,15 @@ def _local(settings: Cluster) -> LocalCluster:
                 silence_logs=logging.CRITICAL,
                 **({"death_timeout": STARTING} if processes else {}),
             )
-        except Exception as error:  # any error at the start of processes, such as a full /dev/shm
-            if not processes:
-                raise
+        except Exception as error:  # any error at the start, such as a full /dev/shm
             cause: BaseException = error
             while cause.__cause__ is not None:
                 cause = cause.__cause__
             why = " ".join(str(cause).split()) or type(cause).__name__
+            if not processes:
+                raise RunError(
+                    f"dask cannot start here: {why}: check its settings, such as DASK_TEMPORARY_DIRECTORY"
+                ) from error
             raise RunError(
                 f"the {workers} worker processes did not start within {STARTING:.0f} s ({why}): give fewer --workers "
                 "or more room in /dev/shm, or use --cluster threads"

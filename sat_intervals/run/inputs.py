@@ -42,10 +42,18 @@ def _known(inputs: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
-    """Describe an image for run.json and the manifest."""
-    crs = image.georeferencing.crs
+    """Describe an image for run.json and the manifest.
+
+    Raises
+    ------
+    ChangedInputError
+        The file was replaced after it was opened, so its band and no-data value may be wrong.
+    """
+    files, crs = _with_others(image.path, identified), image.georeferencing.crs
+    if files.get("stamp") != image.stamp:
+        raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: rerun the command")
     return {
-        **_with_others(image.path, identified),
+        **files,
         "height": image.height,
         "width": image.width,
         "band": image.band,

@@ -202,6 +202,15 @@ def test_make_surface__refuses_a_radius_of_many_cells(tmp_path):
         surface_of([out], tmp_path, radius=500.0)
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_make_surface__refuses_damaged_points(tmp_path):
+    out = write_points(tmp_path / "a", [0.5, 1.5], [-0.5, -0.5], [10.0, 20.0])
+    with rasterio.open(out / "points.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as points:
+        points.write(np.array([[43.6, np.nan]]), 2)
+    with pytest.raises(SatIntervalsError, match=r"points.tif is damaged, some of its pixels have parts of a point"):
+        surface_of([out], tmp_path, crs=None)
+
+
 def test_make_surface__ends_at_once_when_it_is_interrupted(tmp_path, monkeypatch):
     out = write_points(tmp_path / "a", [0.5] * 20, [-0.5] * 20, [10.0] * 20)
     cloud = PointCloud(open_run(out), Projection("EPSG:32631"))

@@ -170,6 +170,15 @@ def test_match_pair__goes_on_where_an_input_is_touched_and_not_changed(pair):
     assert report["inputs"]["right"]["sha256"] == identity(str(folder / "right.tif"))["sha256"]
 
 
+def test_prepare__refuses_an_image_that_was_replaced_since_it_was_opened(pair):
+    folder, settings = pair
+    left, right = open_image(folder / "left.tif"), open_image(folder / "right.tif")
+    scene = make_scene(150, 180, seed=2)
+    write_layer(folder / "left.tif", scene.left, int(scene.left[70, 80]), PLACE)  # another no-data value
+    with pytest.raises(ChangedInputError, match=r"left.tif was replaced or changed since it was opened: run the"):
+        prepare(left, right, folder / "out", settings)
+
+
 def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
     folder, settings = pair
     job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)

@@ -21,7 +21,7 @@ from sat_intervals.config import Cluster, ConfigError, Mccnn
 from sat_intervals.config.pairs import find_pairs, read_batch
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.match.mccnn import weights_file
-from sat_intervals.raster import read_place
+from sat_intervals.raster import other_files, read_place
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_run
 from sat_intervals.run import cluster, submit
@@ -67,6 +67,19 @@ def test_open_image__refuses_a_virtual_raster_of_a_pipe(tmp_path, read):
     )
     with pytest.raises(SatIntervalsError, match="pipe is a named pipe: give a regular file"):
         read(tmp_path / "image.vrt")
+
+
+@pytest.mark.parametrize("ending", [".tif.msk", ".tif.ovr", ".tif.aux.xml", ".RPB", "_RPC.TXT"])
+@pytest.mark.parametrize("name", ["image.tif", "image.vrt"])
+def test_open_image__does_not_wait_for_a_pipe_beside_a_raster(tmp_path, name, ending):
+    write(tmp_path / "image.tif")
+    (tmp_path / "image.vrt").write_text(
+        '<VRTDataset rasterXSize="9" rasterYSize="9"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+        '<SourceFilename relativeToVRT="1">image.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>'
+    )
+    os.mkfifo(tmp_path / f"image{ending}")
+    with pytest.raises(SatIntervalsError, match=f"image{ending} is a named pipe: give a regular file"):
+        other_files(open_image(tmp_path / name).path)
 
 
 def test_log_file__does_not_wait_for_who_reads_a_pipe(tmp_path):
@@ -259,5 +272,17 @@ def test_connected__ends_when_worker_processes_do_not_start(tmp_path, monkeypatc
     with (
         pytest.raises(RunError, match=r"the 1 worker processes did not start within 0 s \(.*\): give fewer --workers"),
         connected(Cluster(kind="processes", workers=1), tmp_path),
+    ):
+        pass
+
+
+def test_connected__names_the_settings_with_which_dask_cannot_start(tmp_path):
+    (tmp_path / "file").touch()
+    with (
+        dask.config.set({"temporary-directory": str(tmp_path / "file" / "inside")}),
+        pytest.raises(
+            RunError, match=r"^dask cannot start here: .*Not a directory.*: check its settings, such as DASK_"
+        ),
+        connected(Cluster(), tmp_path),
     ):
         pass
