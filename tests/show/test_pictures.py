@@ -191,7 +191,7 @@ def drawn(monkeypatch):
 
 
 def test_draw_errors__holds_a_strip_at_a_time(tmp_path):
-    height, width = 6_000, 200
+    height, width = 12_000, 200
     results = open_results(write_run(tmp_path, *random_bands(height, width)))
     tracemalloc.start()
     draw_errors(results, tmp_path / "errors.png", dpi=50)
