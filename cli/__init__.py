@@ -1,4 +1,4 @@
-"""The command ``sat-intervals``: click only; every command is one call of the library."""
+"""The command ``sat-intervals``, written with click; every command is one call of the library."""
 
 from sat_intervals.cli.app import main
 

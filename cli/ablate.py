@@ -1,4 +1,4 @@
-"""``sat-intervals ablate``: what each part of the method is worth, on pairs of known truth."""
+"""``sat-intervals ablate``: compare parts of the method on pairs with known truth."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from sat_intervals.cli.options import cost_option
 from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 
-@click.command(short_help="Compare the method's parts on pairs of known truth.")
+@click.command(short_help="Compare parts of the method on pairs with known truth.")
 @click.argument("pairs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @cost_option
 @judging_options
@@ -23,12 +23,12 @@ def ablate(
 ) -> None:
     """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS (the paper's table 2).
 
-    Every pair is matched once, in memory. Printed is the accuracy, the share of valid pixels whose interval holds the
-    truth, as means over the scenes of each group; the last column is the method itself, with regularisation.
+    Every pair is matched once, in memory. The table shows the accuracy (share of valid pixels whose interval contains
+    the truth), averaged over the scenes of each group. The last column is the whole method, with regularisation.
 
-    A pair is a folder of left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum],
-    `group`), or a row of a CSV file of the columns left, right, truth, minimum, maximum and, if you like,
-    name and group, its paths relative to it.
+    A pair is a folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum], optionally
+    `group`), or a row of a CSV file with the columns left, right, truth, minimum, maximum and optionally name and
+    group. Paths in the file are relative to it.
     """
     from sat_intervals.cli.tables import show_groups
     from sat_intervals.config import load_config

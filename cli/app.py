@@ -1,6 +1,6 @@
-"""The group of commands, and what a person sees when one of them fails.
+"""The group of commands, and how errors are shown.
 
-The library is imported by the command that needs it: help and usage errors do not wait for numba.
+Each command imports the library itself, so that help and usage errors do not wait for numba.
 """
 
 import atexit
@@ -9,7 +9,7 @@ import gc
 import os
 import sys
 from contextlib import suppress
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
@@ -32,32 +32,39 @@ from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2
 _ITEM = "\n  "
-# As of a process that SIGPIPE ends.
+# Exit status of a process ended by SIGPIPE.
 READER_GONE = 141
 _NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
 RESUMED = ("match", "demo", "batch")
 
 
 class _Commands(click.Group):
-    """Turns whatever goes wrong in a command into one line and an exit status."""
+    """Group of commands; turns every error into one line and an exit status."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         try:
             return super().main(*args, **kwargs)
-        except OSError as error:  # of --help and --version, which print before a command is invoked
+        except OSError as error:  # --help and --version print before a command is invoked
             if not _is_of_stdout(error):
                 raise
-            _forget_stdout()
+            _discard(sys.stdout)
             click.echo(f"sat-intervals: stdout cannot be written: {error.strerror}", err=True)
             sys.exit(FAILED)
+
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        try:
+            return super().make_context(*args, **kwargs)
+        except BrokenPipeError:  # of --help and --version; click would exit with 1
+            _discard(sys.stdout)
+            raise click.exceptions.Exit(READER_GONE) from None
 
     def invoke(self, context: click.Context) -> Any:
         try:
             os.getcwd()
         except OSError:
-            _end(USER_ERROR, "the working directory is gone: change to a folder that is there")
-        # The libraries make two hundred thousand objects that live as long as the process. To look for garbage among
-        # them takes a fifth of a second while they are imported, and half a second at the end.
+            _end(USER_ERROR, "the working directory was deleted: change to another folder")
+        # The libraries create two hundred thousand permanent objects. Garbage collection among them takes 0.2 s during
+        # imports and 0.5 s at the end.
         gc.set_threshold(5000)
         atexit.register(gc.freeze)
         try:
@@ -72,11 +79,11 @@ class _Commands(click.Group):
             return _end(USER_ERROR, f"{error.format_message()}{where}")
         except Ended as ended:
             resumed = context.invoked_subcommand in RESUMED
-            again = "; the same command goes on from the tiles that are done" if resumed else ""
+            again = "; rerun the same command: it resumes" if resumed else ""
             return _end(ended.status, f"{ended}{again}")
         except Exception as error:
             if isinstance(error, OSError) and _is_of_stdout(error):
-                _forget_stdout()
+                _discard(sys.stdout)
                 if isinstance(error, BrokenPipeError):
                     raise click.exceptions.Exit(READER_GONE) from None
                 return _end(FAILED, f"stdout cannot be written: {error.strerror}")
@@ -84,7 +91,7 @@ class _Commands(click.Group):
 
 
 def _is_of_stdout(error: OSError) -> bool:
-    """Whether what is printed failed to be written: it has no file name, and comes from those who print."""
+    """Return whether printing failed: the error has no file name and was raised by code that prints."""
     trace = error.__traceback__
     while trace and trace.tb_next:
         trace = trace.tb_next
@@ -92,10 +99,10 @@ def _is_of_stdout(error: OSError) -> bool:
     return error.filename is None and place.startswith(("click.", "rich.", "sat_intervals.cli."))
 
 
-def _forget_stdout() -> None:
-    """Let nobody complain at the end of the process of what stdout did not take."""
+def _discard(stream: TextIO) -> None:
+    """Redirect a stream to the null device, so that flushing it at exit does not fail."""
     with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _explained(error: Exception) -> tuple[int, str]:
@@ -112,23 +119,26 @@ def _explained(error: Exception) -> tuple[int, str]:
     if isinstance(error, MemoryError):
         return FAILED, f"{_NO_MEMORY} ({error})"
     line = " ".join(str(error).split())
-    if isinstance(error, SystemError):  # Python's word for a library that failed and did not say why
-        return FAILED, f"a library failed without a reason, as they do out of memory: {_NO_MEMORY} ({line})"
+    if isinstance(error, SystemError):  # raised by Python for a library that fails without an exception
+        return FAILED, f"a library failed without a reason, probably for lack of memory: {_NO_MEMORY} ({line})"
     if isinstance(error, ValueError) and line.startswith("A dask config file"):
-        return USER_ERROR, f"{line}: mend it, or point DASK_CONFIG elsewhere"
+        return USER_ERROR, f"{line}: fix it, or set DASK_CONFIG to another"
     return FAILED, f"{type(error).__name__}: {line} (this should not happen; --debug shows where)"
 
 
 def _end(status: int, message: str) -> None:
-    lines = map(printable, message.split(_ITEM))  # of a list, such as of tiles, a line an item
-    click.echo(f"sat-intervals: {_ITEM.join(lines)}", err=True)
+    lines = map(printable, message.split(_ITEM))  # one line for each item of a list
+    try:
+        click.echo(f"sat-intervals: {_ITEM.join(lines)}", err=True)
+    except BrokenPipeError:
+        _discard(sys.stderr)
     raise click.exceptions.Exit(status)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="sat-intervals")
 def main() -> None:
-    """Dense matching of epipolar satellite images: for every pixel a disparity and the interval around it."""
+    """Match epipolar satellite images: a disparity for every pixel, with its interval."""
 
 
 main.add_command(match)

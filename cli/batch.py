@@ -1,4 +1,4 @@
-"""``sat-intervals batch``: many pairs, one cluster."""
+"""``sat-intervals batch``: match many pairs on one cluster."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ import click
 from sat_intervals.cli.options import path, run_options, settings_options
 
 
-@click.command(short_help="Match many pairs; run again, it does what is missing.")
+@click.command(short_help="Match many pairs; a rerun does what is missing.")
 @click.argument("pairs", callback=path)
 @click.argument("out", callback=path)
 @settings_options
@@ -22,10 +22,10 @@ def batch(
     overwrite: bool,
     quiet: bool,
 ) -> None:
-    """Match the pairs of a CSV, YAML or JSON file, each into its own folder of OUT.
+    """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
-    Columns: name, left, right, minimum, maximum, left_mask, right_mask, and any setting such as sgm.p2. A pair that
-    fails does not stop the others; OUT/batch.json says how each ended, and the status is 1 if any failed.
+    Columns: name, left, right, minimum, maximum, left_mask, right_mask, and any setting such as sgm.p2. A failed pair
+    does not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.config.pairs import REPORT, read_batch
@@ -52,5 +52,5 @@ def batch(
 
         lines = "\n".join(f"  {name}: {error}" for name, error in failed.items())
         raise RunError(
-            f"{len(failed)} of {len(report)} pairs failed; the same command does only what is missing:\n{lines}"
+            f"{len(failed)} of {len(report)} pairs failed; rerun the same command: it does what is missing:\n{lines}"
         )

@@ -1,4 +1,4 @@
-"""What a person reads while a run goes on, and at its end."""
+"""Progress of a command, and the tables at its end."""
 
 import time
 from pathlib import Path
@@ -13,9 +13,9 @@ from sat_intervals.cli import signals
 
 STAGES = {
     "scene": "making a scene",
-    "pairs": "looking at pairs",
+    "pairs": "checking pairs",
     "pairs.files": "writing files of pairs",
-    "kernels": "preparing kernels (compiled once a machine, then about a second)",
+    "kernels": "preparing kernels (compiled once per machine, then about a second)",
     "images": "measuring images",
     "tiles": "matching tiles",
     "bands": "postprocessing rows",
@@ -27,19 +27,19 @@ STAGES = {
 
 
 class _Terminal(Terminal):
-    """A terminal whose reader may go: rich would end the process with status 1."""
+    """A terminal that raises BrokenPipeError; rich would end the process with status 1."""
 
     def on_broken_pipe(self) -> None:
-        """Called inside the handler of a BrokenPipeError."""
+        """Raise again; rich calls this in the handler of a BrokenPipeError."""
         self.quiet = True
         raise BrokenPipeError
 
 
 class Console:
-    """Progress as a bar on a terminal, as plain lines elsewhere, not at all when quiet."""
+    """Shows progress: a bar on a terminal, plain lines elsewhere, nothing with ``--quiet``."""
 
     def __init__(self, quiet: bool) -> None:
-        # A path is no markup: square brackets and colons in it are its own.
+        # Paths may have square brackets and colons, which are not markup.
         self._terminal = _Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
@@ -51,7 +51,7 @@ class Console:
         )
         self._task: tuple[str, TaskID] | None = None
         self._began: dict[str, tuple[float, int]] = {}
-        self._told: dict[str, int] = {}
+        self._printed: dict[str, int] = {}
 
     def __enter__(self) -> Self:
         self._bar.__enter__()
@@ -63,31 +63,31 @@ class Console:
         self._bar.__exit__(kind, error, trace)
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Take note of how far a stage is; what is done in one step has no figures."""
+        """Show the progress of a stage; a stage of one step has no figures."""
         signals.check()
         began, before = self._began.setdefault(stage, (time.monotonic(), done))
         elapsed = time.monotonic() - began
         rate = (done - before) / elapsed if elapsed > 0 else 0.0
         state = _state(done, total, rate) if total > 1 else ""
         if self._bar.disable:
-            self._tell(stage, done, total, state)
+            self._print_line(stage, done, total, state)
         else:
             self._draw(stage, done, total, state)
 
     def _draw(self, stage: str, done: int, total: int, state: str) -> None:
-        """The bar of a stage, in place of that of the stage before."""
+        """Draw the bar of a stage in place of the previous one."""
         if self._task is None or self._task[0] != stage:
             if self._task:
                 self._bar.remove_task(self._task[1])
             self._task = stage, self._bar.add_task(STAGES[stage], state="")
         self._bar.update(self._task[1], completed=done, total=total if total > 1 else None, state=state)
 
-    def _tell(self, stage: str, done: int, total: int, state: str) -> None:
-        """A plain line when a stage begins and at every tenth of it."""
+    def _print_line(self, stage: str, done: int, total: int, state: str) -> None:
+        """Print a line at the start of a stage and at every tenth of it."""
         tenth = 10 * done // max(total, 1)
-        if self._told.get(stage) == tenth or (stage in self._told and not state):
+        if self._printed.get(stage) == tenth or (stage in self._printed and not state):
             return
-        self._told[stage] = tenth
+        self._printed[stage] = tenth
         self._terminal.print(f"{STAGES[stage]}: {state}" if state else STAGES[stage], soft_wrap=True)
 
     def say(self, text: str) -> None:
@@ -95,15 +95,15 @@ class Console:
         self._terminal.print(text, soft_wrap=True)
 
     def summary(self, report: dict[str, Any], out: Path) -> None:
-        """The table at the end of a run."""
+        """Print the table at the end of a run."""
         counts = report["counts"]
         table = Table(show_header=False, box=None, pad_edge=False)
         table.add_column(style="bold")
         table.add_column(justify="right")
         pixels = counts["pixels"]
         table.add_row("valid pixels", _share(counts["valid"], pixels))
-        for flag, count in counts["flags"].items():
-            if count and report["validity_bits"][flag]["invalid"]:
+        for flag, count in counts["causes"].items():
+            if count:
                 table.add_row(f"  {flag.replace('_', ' ')}", _share(count, pixels))
         width = counts["median_interval_width"]
         table.add_row("median interval width", "none" if width is None else f"{width:.2f} px")
@@ -114,7 +114,7 @@ class Console:
             self._terminal.print(str(out / name), soft_wrap=True)
 
     def batch_summary(self, report: dict[str, dict[str, Any]]) -> None:
-        """The table at the end of a batch: how each pair ended."""
+        """Print the table at the end of a batch: the state of each pair."""
         table = Table("pair", "state", "valid", "median width", box=None, pad_edge=False)
         for name, end in report.items():
             counts = end.get("counts")
@@ -129,7 +129,7 @@ def _share(part: int, whole: int) -> str:
 
 
 def _state(done: int, total: int, rate: float) -> str:
-    """How much of a stage is done, how fast, and the time left: ``12/30, 5/s, 4 s left``."""
+    """Format the progress of a stage: done, speed and time left, such as ``12/30, 5/s, 4 s left``."""
     if rate <= 0 or done >= total:
         return f"{done}/{total}"
     left = round((total - done) / rate)

@@ -1,4 +1,4 @@
-"""``sat-intervals demo``: a procedural scene of exact truth through the main job."""
+"""``sat-intervals demo``: match a procedural scene with exact truth."""
 
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,10 @@ import click
 from sat_intervals.cli.options import path, run_options, settings_options, with_range
 
 
-@click.command(short_help="Make a scene of known truth, match it, compare.")
+@click.command(short_help="Make a scene with exact truth, match it and compare.")
 @click.argument("out", callback=path)
 @click.option("--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True)
-@click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another scene.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the scene.")
 @settings_options
 @run_options
 def demo(
@@ -23,13 +23,13 @@ def demo(
     quiet: bool,
     **run: Any,
 ) -> None:
-    """Make a procedural satellite scene, match it and say how often the interval holds the truth.
+    """Make a procedural satellite scene, match it and print how often the interval contains the truth.
 
     \b
     OUT/left.tif, OUT/right.tif   the pair, georeferenced, no data in a corner
     OUT/truth.tif                 the exact disparity
-    and what `match` writes.
-    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
+    and the files of `match`.
+    """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
     from sat_intervals.demo import PIXEL, make_scene
@@ -58,6 +58,6 @@ def demo(
     figures = evaluate_run(out, out / "truth.tif")["all"]
     if figures["count"]:
         console.say(
-            f"The interval holds the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
+            f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
             f"at a mean width of {figures['mean_width']:.2f} px."
         )

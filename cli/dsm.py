@@ -1,4 +1,4 @@
-"""``sat-intervals dsm``: a surface model whose cells carry intervals."""
+"""``sat-intervals dsm``: make a surface model with height intervals."""
 
 from pathlib import Path
 from typing import Literal
@@ -8,24 +8,24 @@ import click
 from sat_intervals.cli.options import log_options, path, quiet_option
 
 
-@click.command(short_help="A surface model with an interval for every cell, of one or several runs.")
+@click.command(short_help="Make a surface model with height intervals from one or several runs.")
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--resolution", type=float, required=True, metavar="METRES", help="Side of a cell.")
 @click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points.")
-@click.option("--radius", type=float, metavar="METRES", help="How far a point reaches; default the side of a cell.")
+@click.option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell.")
 @click.option(
     "--interval",
     type=click.Choice(["envelope", "mean"]),
     default="envelope",
     show_default=True,
-    help="A cell's interval: all of its points' intervals, or the weighted mean of their bounds.",
+    help="Interval of a cell: envelope of its points' intervals, or weighted mean of their bounds.",
 )
-@click.option("--geoid", callback=path, metavar="FILE", help="Grid of geoid heights (GTX, GeoTIFF) to count from.")
+@click.option("--geoid", callback=path, metavar="FILE", help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
 @click.option(
     "--output",
     callback=path,
     metavar="FILE",
-    help="The file to write; default dsm.tif in the first OUT. A surface model there is replaced.",
+    help="File to write; default dsm.tif in the first OUT. An existing surface model is replaced.",
 )
 @quiet_option
 @log_options
@@ -39,13 +39,14 @@ def dsm(
     output: Path | None,
     quiet: bool,
 ) -> None:
-    """Make a surface model of the points in the folders OUT, which `triangulate` wrote.
+    """Make a surface model from the points that `triangulate` wrote to the folders OUT.
 
-    Bands: height, height_lower, height_upper, count, confidence, agreement. Heights count from the ellipsoid of WGS 84
-    unless --geoid is given. A point reaches its cell and those whose centre lies within --radius; the others stay no
-    data.
-    Where several OUT overlap, their intervals are intersected if they meet; else their hull is taken, and agreement is
-    0.
+    Bands: height, height_lower, height_upper, count, confidence, agreement. Heights refer to the WGS 84 ellipsoid
+    unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells
+    are no data.
+
+    Where several OUT overlap, the intervals are intersected if they overlap. Else their hull is written and agreement
+    is 0.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.dsm import make_surface
@@ -63,13 +64,11 @@ def dsm(
             progress=console.progress,
         )
     console.say(
-        f"{report['rows']} x {report['columns']} cells in {report['crs']} of {report['points']} points, "
+        f"{report['rows']} x {report['columns']} cells in {report['crs']} from {report['points']} points, "
         f"{100 * report['filled']:.1f} % with a height"
     )
     if report["disagreeing"] is not None:
-        console.say(f"where runs overlap, {100 * report['disagreeing']:.1f} % of the cells do not agree")
+        console.say(f"where runs overlap, {100 * report['disagreeing']:.1f} % of the cells disagree")
     for out in report["without_intervals"]:
-        click.echo(
-            f"{out} was matched without intervals: where no other run reaches, cells have heights alone", err=True
-        )
+        click.echo(f"{out} was matched without intervals: cells without another run have no height bounds", err=True)
     console.say(str(output))

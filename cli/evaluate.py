@@ -1,4 +1,4 @@
-"""``sat-intervals evaluate``: how often intervals hold the truth, and how wide they are for it."""
+"""``sat-intervals evaluate``: how often intervals contain the truth, and how wide they are."""
 
 import json
 from collections import Counter
@@ -17,13 +17,14 @@ from sat_intervals.cli.pairs import judging_options, overrides, say_json
 if TYPE_CHECKING:
     from sat_intervals.config import Config
     from sat_intervals.config.pairs import Pair
+    from sat_intervals.evaluate.paper import SceneMetrics
 
 _FILE = click.Path(path_type=Path)
 
 
 @dataclass(frozen=True)
 class _Source:
-    """A run in a folder, or a pair to be matched first with a cost, and what it is judged by."""
+    """A finished run, or a pair to match first with a cost; with its truth and mask."""
 
     name: str
     pair: "Pair | None"
@@ -32,16 +33,16 @@ class _Source:
     mask: Path | None
 
 
-@click.command(short_help="Judge intervals by a known truth.")
+@click.command(short_help="Evaluate intervals against a known truth.")
 @click.argument("folders", metavar="OUT...", nargs=-1, type=_FILE)
-@click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each OUT, in their order.")
-@click.option("--mask", type=_FILE, multiple=True, help="Pixels to judge: not 0; one for each OUT, in their order.")
+@click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each OUT, in that order.")
+@click.option("--mask", type=_FILE, multiple=True, help="Pixels to evaluate (not 0); one for each OUT, in that order.")
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
-@click.option("--group", metavar="LABEL", help="Count all as one group, whatever meta.json says.")
-@click.option("--dsm", type=_FILE, help="Instead of runs, judge this surface model by --reference.")
+@click.option("--group", metavar="LABEL", help="Put all scenes in this group; ignore meta.json.")
+@click.option("--dsm", type=_FILE, help="Evaluate this surface model against --reference, instead of runs.")
 @click.option("--reference", type=_FILE, help="Reference heights above the same datum, in any CRS.")
 @click.option(
-    "--cost", type=click.Choice(COSTS), multiple=True, help="Matching cost of pairs; given twice, both are compared."
+    "--cost", type=click.Choice(COSTS), multiple=True, help="Matching cost of pairs; give it twice to compare both."
 )
 @judging_options
 def evaluate(
@@ -59,19 +60,20 @@ def evaluate(
     tolerance: float,
     as_json: bool,
 ) -> None:
-    """Judge the intervals of the runs in the folders OUT by the truth of their left images.
+    """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
 
-    Printed are accuracy (the share of intervals that hold the truth), relative size (the median width over the width of
-    the search range) and, for low confidence, relative overestimation (the median of 1 - largest error of the area /
-    width), over valid pixels; where a run kept rejected pixels, over all with an interval as well. Of several OUT, the
-    means over the scenes of each group (the paper's table 1): `group` of the meta.json beside the left image.
+    Prints figures over valid pixels: accuracy (share of intervals that contain the truth), relative size (median width
+    / width of the search range) and, for low confidence, relative overestimation (median of 1 - largest error of the
+    area / width). If a run kept rejected pixels, also prints figures over all pixels with an interval. For several OUT,
+    prints means over the scenes of each group (the paper's table 1); `group` is read from meta.json beside the left
+    image.
 
-    The truth is truth.tif beside the left image where --truth is not given. Instead of a run OUT may be a
-    pair, which is matched first: a folder of left.tif, right.tif, truth.tif and meta.json (`disparity`:
-    [minimum, maximum], `group`), or a CSV file of the columns left, right, truth, minimum, maximum and, if
-    you like, name and group, its paths relative to it.
+    Without --truth, the truth is truth.tif beside the left image. OUT may also be a pair, which is matched first: a
+    folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum], `group`), or a CSV file
+    with the columns left, right, truth, minimum, maximum and optionally name and group. Its paths are relative to the
+    file.
 
-    Of a surface model (--dsm) printed are the share of reference heights inside the cells' intervals, the median width,
+    For a surface model (--dsm), prints the share of reference heights inside the cells' intervals, the median width,
     the median of height - reference and its NMAD (1.4826 times the median distance from the median), by slope of the
     reference and by width of the interval.
     """
@@ -81,7 +83,7 @@ def evaluate(
             ("--config", config_file), ("--preset", preset), ("--accurate", accurate), ("--tolerance", tolerance),
         ):  # fmt: skip
             if value:
-                raise click.UsageError(f"{name} is for runs and pairs, not for --dsm: leave it out.")
+                raise click.UsageError(f"{name} applies to runs and pairs, not to --dsm: leave it out.")
         _evaluate_surface(folders, dsm, reference, as_json)
         return
     if not folders:
@@ -94,9 +96,10 @@ def evaluate(
     configs = _configs(sources, config_file, preset, accurate, cost)
     judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
     scenes = [
-        SceneMetrics(source.name, group or _group(source), _judged(judge, source, config))
+        SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config))
         for source, config in zip(sources, configs, strict=True)
     ]
+    _warn_of_whole_truth(scenes, tolerance)
     if as_json:
         say_json(scenes)
     elif len(scenes) == 1:
@@ -106,11 +109,18 @@ def evaluate(
         show_missed(scenes)
 
 
+def _warn_of_whole_truth(scenes: "list[SceneMetrics]", tolerance: float) -> None:
+    """Suggest a tolerance for truths of whole pixels, which may be wrong by half a pixel."""
+    names = [scene.name for scene in scenes if scene.report["truth_is_whole"]]
+    if names and not tolerance:
+        click.echo(f"warning: the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5", err=True)
+
+
 def _evaluate_surface(folders: tuple[Path, ...], dsm: Path | None, reference: Path | None, as_json: bool) -> None:
     if not (dsm and reference):
         raise click.UsageError("--dsm and --reference go together: give both.")
     if folders:
-        raise click.UsageError(f"{folders[0]} is a run, --dsm a surface model: judge one kind at a time.")
+        raise click.UsageError(f"{folders[0]} is a run and --dsm a surface model: evaluate one of them at a time.")
     from sat_intervals.cli.tables import show_surface
     from sat_intervals.evaluate.dsm import evaluate_surface
 
@@ -124,12 +134,12 @@ def _evaluate_surface(folders: tuple[Path, ...], dsm: Path | None, reference: Pa
 def _sources(
     folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...], costs: tuple[str, ...]
 ) -> list[_Source]:
-    """What the arguments name, in their order; pairs once for each cost."""
+    """Return the sources named by the arguments, in their order; pairs once per cost."""
     from sat_intervals.config.pairs import check_names, find_pairs, is_pair
     from sat_intervals.errors import SatIntervalsError
 
     pairs = [folder for folder in folders if is_pair(folder) and not (folder / "run.json").exists()]
-    find_pairs(pairs)  # all at once, so that none is given twice
+    find_pairs(pairs)  # raises if a pair is given twice
     runs = [folder.resolve() for folder in folders if folder not in pairs]
     for run, count in Counter(runs).items():
         if count > 1:
@@ -157,7 +167,7 @@ def _sources(
 def _configs(
     sources: list[_Source], config_file: Path | None, preset: str | None, accurate: bool, costs: tuple[str, ...]
 ) -> "list[Config | None]":
-    """The settings to match each pair with, None for a run, which has its own."""
+    """Return the settings to match each pair with; None for a run."""
     from sat_intervals.config import load_config
     from sat_intervals.errors import SatIntervalsError
 
@@ -169,7 +179,7 @@ def _configs(
     }
     option = next((name for name, value in given.items() if value), None)
     if option and not any(source.pair for source in sources):
-        raise SatIntervalsError(f"{option} is for pairs to be matched, every OUT is a run that was: leave it out")
+        raise SatIntervalsError(f"{option} applies to pairs, but every OUT is a finished run: leave it out")
     configs: list[Config | None] = []
     for source in sources:
         config = None
@@ -177,13 +187,13 @@ def _configs(
             more = overrides(source.pair.minimum, source.pair.maximum, accurate, preset, source.cost)
             config = load_config(config_file, more | {"products": {"keep_rejected": True}})
             if config.interval is None:
-                raise SatIntervalsError(f"{config_file}: interval is null, but intervals are to be judged: leave it on")
+                raise SatIntervalsError(f"{config_file}: interval is null, but evaluate needs intervals: leave it on")
         configs.append(config)
     return configs
 
 
-def _judged(judge: Callable[..., dict[str, Any]], source: _Source, config: "Config | None") -> dict[str, Any]:
-    """Judge a run; match a pair to files first, as anyone would."""
+def _evaluated(judge: Callable[..., dict[str, Any]], source: _Source, config: "Config | None") -> dict[str, Any]:
+    """Evaluate a run; match a pair to files first."""
     if source.pair is None or config is None:
         return judge(source.name, source.truth, source.mask)
     from sat_intervals.run.pair import match_pair

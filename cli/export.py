@@ -1,4 +1,4 @@
-"""``sat-intervals export``: a run as the files of another tool."""
+"""``sat-intervals export``: export a run to the files of another tool."""
 
 from pathlib import Path
 
@@ -7,13 +7,13 @@ import click
 from sat_intervals.cli.options import log_options, path
 
 
-@click.command(short_help="Write a run as the files of CARS, ASP, s2p or OTB.")
+@click.command(short_help="Export a run to the files of CARS, ASP, s2p or OTB.")
 @click.argument("out", callback=path)
 @click.argument("target", callback=path)
-@click.option("--to", "form", type=click.Choice(["cars", "asp", "s2p", "otb"]), required=True, help="Whose files.")
+@click.option("--to", "form", type=click.Choice(["cars", "asp", "s2p", "otb"]), required=True, help="Target tool.")
 @log_options
 def export(out: Path, target: Path, form: str) -> None:
-    """Write the finished run in the folder OUT to the folder TARGET in the form of another tool.
+    """Export the finished run in the folder OUT to the folder TARGET in the format of another tool.
 
     \b
     cars   epi_disp.tif, epi_disp_interval_bounds_inf.tif and _sup.tif,
@@ -24,8 +24,8 @@ def export(out: Path, target: Path, form: str) -> None:
            rectified_disp_confidence.tif
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
 
-    All have the size of the left image. Files of these names that are there are replaced.
-    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
+    All have the size of the left image. Existing files of these names are replaced.
+    """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.interop.export import export
 
     for file in export(out, form, target):

@@ -1,4 +1,4 @@
-"""``--debug`` and ``--log-file``: what the library logs, on stderr and in a file, for the time of one command."""
+"""``--debug`` and ``--log-file``: show the log of a command on stderr and append it to a file."""
 
 import logging
 import os
@@ -12,7 +12,7 @@ import click
 
 from sat_intervals.cli.signals import Ended
 
-# Files in the folders that commands are given, to which no log is added.
+# Output files of commands, which must not be log files.
 _OF_RUNS = ("intervals.tif", "validity.tif", "run.json", "points.tif", "dsm.tif", "batch.json")
 
 _LOG = logging.getLogger(__name__)
@@ -20,7 +20,7 @@ _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 
 def printable(text: str) -> str:
-    """A message as terminals show it in one line, whatever names it holds: line breaks and the like as escapes."""
+    """Return a message in one printable line: line breaks and control characters are escaped."""
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
@@ -30,9 +30,9 @@ class _Warnings(logging.Formatter):
 
 
 class _Handler(logging.Handler):
-    """Writes lines to a file, or to what stderr is at the time: a progress bar takes its place to stay whole.
+    """Writes lines to a file or to the current stderr, which a progress bar may replace.
 
-    It is no StreamHandler: dask silences those of its own loggers.
+    It is not a StreamHandler, since dask silences these on its own loggers.
     """
 
     def __init__(self, lines: logging.Formatter, file: IO[str] | None = None) -> None:
@@ -44,21 +44,21 @@ class _Handler(logging.Handler):
         try:
             click.echo(self.format(record), file=self._file, err=True)
         except OSError as error:
-            if self._file:  # such as a full disk: the run goes on without its log
+            if self._file:  # such as a full disk: continue without the log
                 click.echo(f"sat-intervals: {self._file.name}: {error.strerror}: the log ends here", err=True)
             self.setLevel(logging.CRITICAL + 1)
-        except Exception:  # as of any handler: a log stops nobody
+        except Exception:  # an error in the log must not end the command
             self.handleError(record)
 
 
 @contextmanager
 def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
-    """For the time of the block: warnings on stderr, or all there is with ``debug``; and all of it in a file.
+    """Log during the block: warnings on stderr, or everything with ``debug``; everything in a file.
 
     Raises
     ------
     SatIntervalsError
-        For a file that cannot be written.
+        The file cannot be written.
     """
     ours = logging.getLogger("sat_intervals")
     with ExitStack() as stack:
@@ -69,7 +69,7 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
             warnings = _Handler(_Warnings())
             warnings.setLevel(logging.WARNING)
             stack.enter_context(_added(warnings, ours))
-        # dask gives its logger a handler of its own, and keeps the root's from it, unless the root has some by then
+        # dask's logger gets a handler of its own and does not propagate, unless the root logger already has handlers
         dasks = logging.getLogger("distributed")
         for handler in everything:
             stack.enter_context(_added(handler, logging.root))
@@ -113,26 +113,26 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
     check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
     try:
         if log_file.is_file() and not _is_text(log_file):
-            raise SatIntervalsError(f"{log_file} is there and is no log: choose another --log-file")
+            raise SatIntervalsError(f"{log_file} exists and is not a log: choose another --log-file")
         file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1, opener=_at_once)  # noqa: SIM115
     except OSError as error:
         raise SatIntervalsError(f"{log_file} cannot be written: {error.strerror}: choose another --log-file") from error
     try:
         yield file
     finally:
-        with suppress(OSError):  # of a full disk, which was told
+        with suppress(OSError):  # a full disk, already reported
             file.close()
 
 
 def _is_text(file: Path) -> bool:
-    """Whether lines may be added to a file: it is no raster, nor JSON, HTML or XML such as a run writes."""
+    """Return whether a file may be a log: not a raster, nor JSON, HTML or XML as commands write."""
     with file.open("rb") as stream:
         head = stream.read(4096).lstrip()
     return b"\0" not in head and not head.startswith((b"{", b"[", b"<"))
 
 
 def _at_once(path: str, flags: int) -> int:
-    """The descriptor of a file to write; an OSError of a pipe that nobody reads, for which `open` waits without end."""
+    """Open a file for writing; raises OSError for a pipe without a reader, on which `open` would block."""
     descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
     os.set_blocking(descriptor, True)
     return descriptor

@@ -1,4 +1,4 @@
-"""``sat-intervals match``: two epipolar GeoTIFFs and a search range in, georeferenced bands out."""
+"""``sat-intervals match``: match two epipolar GeoTIFFs over a search range."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.argument("out", callback=path)
 @disparity_option
 @image_options
-@click.option("--dry-run", is_flag=True, help="Print the job script of the cluster, submit and match nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
 @settings_options
 @run_options
 def match(
@@ -47,17 +47,17 @@ def match(
     """Match the epipolar images LEFT and RIGHT over a search range and write to the folder OUT.
 
     \b
-    OUT/intervals.tif   disparity, lower, upper (pixels), confidence
-    OUT/validity.tif    flags: why a pixel is invalid, what was done to it
-    OUT/run.json        settings, inputs, figures
+    OUT/intervals.tif   disparity, lower and upper bound (pixels), confidence
+    OUT/validity.tif    flags: why a pixel is invalid, how it was processed
+    OUT/run.json        settings, inputs, statistics
 
-    Disparity is x_right - x_left. An interrupted run goes on where it was with the same command.
-    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
+    The disparity is x_right - x_left. To resume an interrupted run, rerun the same command.
+    """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
 
     if disparity is None and config_file is None:
-        raise click.UsageError("Missing search range: give --disparity MIN MAX, or a --config with it.")
+        raise click.UsageError("Missing search range: give --disparity MIN MAX, or --config with a file that has it.")
     config = load_config(config_file, with_range(given, disparity))
     if dry_run:
         from sat_intervals.run.batch_system import job_script

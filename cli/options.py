@@ -1,4 +1,4 @@
-"""Options that many commands have, and how names of files are taken."""
+"""Options shared by commands, and checks of file names."""
 
 from collections.abc import Callable, Mapping
 from functools import wraps
@@ -13,38 +13,38 @@ if TYPE_CHECKING:
     from sat_intervals.raster import Image
 
 COSTS = ("census", "mccnn")
-# As of `sat_intervals.config`, which help does not wait for.
+# Copied from `sat_intervals.config`, which --help must not import.
 PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homogeneous", "mccnn")
 
 Command = Callable[..., Any]
 
 
 def named(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
-    """Refuse names that the shell makes of a variable that is not set, and those that GDAL cannot be told."""
+    """Raise if a file name is empty, as from an unset shell variable, or not UTF-8, which GDAL needs."""
     if value == "":
-        raise click.BadParameter("it is empty: name a file or folder")
+        raise click.BadParameter("it is empty: give a file or folder")
     try:
         (value or "").encode()
     except UnicodeEncodeError as error:
-        raise click.BadParameter(f"{value!r} is no UTF-8: rename it") from error
+        raise click.BadParameter(f"{value!r} is not UTF-8: rename it") from error
     return value
 
 
 def path(context: click.Context, parameter: click.Parameter, value: str | None) -> Path | None:
-    """Make a path of a name: one of an empty name would be the current folder."""
+    """Convert a name to a path; an empty name, which would be the current folder, is refused."""
     return None if value is None else Path(str(named(context, parameter, value)))
 
 
-quiet_option = click.option("--quiet", is_flag=True, help="Print errors only.")
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
 preset_option = click.option(
     "--preset",
     type=click.Choice(PRESETS),
-    help="Settings that fill in what is left out: satellite for satellite images, satellite-mccnn for different dates "
-    "or little texture, paper (default) for the paper's figures.",
+    help="Settings for what is left out: satellite for satellite images, satellite-mccnn for different dates or little "
+    "texture, paper (default) for the paper's figures.",
 )
-cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost; its penalties come with it.")
+cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost, with its default penalties.")
 store_option = click.option(
-    "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles until the run is finished."
+    "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles during the run."
 )
 disparity_option = click.option(
     "--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched."
@@ -52,19 +52,19 @@ disparity_option = click.option(
 
 
 _IMAGE_OPTIONS = (
-    click.option("--left-mask", callback=named, metavar="FILE", help="Left pixels to leave out: non-zero = masked."),
-    click.option("--right-mask", callback=named, metavar="FILE", help="Right pixels to leave out."),
-    click.option("--nodata", type=float, metavar="V", help="No-data value of both images, in place of their own."),
+    click.option("--left-mask", callback=named, metavar="FILE", help="Mask of the left image: non-zero = masked."),
+    click.option("--right-mask", callback=named, metavar="FILE", help="Mask of the right image."),
+    click.option("--nodata", type=float, metavar="V", help="No-data value of both images, replaces that of the files."),
     click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image."),
     click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image."),
-    click.option("--band", type=int, metavar="N", help="Band to match of both images, needed where they have several."),
+    click.option("--band", type=int, metavar="N", help="Band to match in both images, required if they have several."),
     click.option("--left-band", type=int, metavar="N", help="Band of the left image."),
     click.option("--right-band", type=int, metavar="N", help="Band of the right image."),
     click.option(
         "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
     ),
 )
-# What they give beside the window.
+# Their parameters without the window.
 _OF_IMAGES = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
 _OF_IMAGES += ("left_mask", "right_mask")
 _SETTINGS_OPTIONS = (
@@ -75,7 +75,7 @@ _SETTINGS_OPTIONS = (
     cost_option,
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
     click.option("--overlap", type=int, help="Pixels read around a core."),
-    click.option("--workers", type=click.IntRange(min=1), help="Tiles in work at once; default one a core."),
+    click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     click.option(
         "--cluster",
         metavar="SPEC",
@@ -86,9 +86,10 @@ _SETTINGS_OPTIONS = (
 
 
 def image_options(command: Command) -> Command:
-    """Options that say how the images of a pair are read; a command gets ``images``, which opens both of them.
+    """Add options for reading the images of a pair.
 
-    It gets ``window`` as well, the region of the left image, or None.
+    The command gets ``images``, a function that opens both images, and ``window``, the region of the left image or
+    None.
     """
 
     @wraps(command)
@@ -106,7 +107,7 @@ def image_options(command: Command) -> Command:
 
 
 def _opened(file: str, side: str, given: Mapping[str, Any]) -> "Image":
-    """The image of one side; an option of the side wins over that of both."""
+    """Open the image of one side; options of the side win over those of both."""
     from sat_intervals.raster import open_image
 
     own = {name: given[f"{side}_{name}"] for name in ("band", "nodata")}
@@ -115,7 +116,7 @@ def _opened(file: str, side: str, given: Mapping[str, Any]) -> "Image":
 
 
 def settings_options(command: Command) -> Command:
-    """Options that give settings; a command gets ``config_file`` and ``given``, the sections of the command line."""
+    """Add options for settings; the command gets ``config_file`` and ``given``, the sections of the command line."""
 
     @wraps(command)
     def with_settings(
@@ -151,18 +152,18 @@ def settings_options(command: Command) -> Command:
 
 
 def run_options(command: Command) -> Command:
-    """Options of a command that makes runs."""
+    """Add options of commands that match pairs."""
     return _with(
         command,
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
-        click.option("--overwrite", is_flag=True, help="Replace the run in OUT and drop its tiles."),
+        click.option("--overwrite", is_flag=True, help="Replace the run in OUT and delete its tiles."),
         quiet_option,
         log_options,
     )
 
 
 def log_options(command: Command) -> Command:
-    """Options that show and keep what is logged while the command is at work."""
+    """Add options that show and save the log."""
 
     @wraps(command)
     def with_log(*, debug: bool, log_file: Path | None, **others: Any) -> Any:
@@ -171,13 +172,13 @@ def log_options(command: Command) -> Command:
 
     return _with(
         with_log,
-        click.option("--debug", is_flag=True, help="Show all that is done, and tracebacks of errors."),
-        click.option("--log-file", callback=path, metavar="FILE", help="Add to FILE all that --debug shows."),
+        click.option("--debug", is_flag=True, help="Show the complete log, and tracebacks of errors."),
+        click.option("--log-file", callback=path, metavar="FILE", help="Append the complete log to FILE."),
     )
 
 
 def with_range(given: dict[str, Any], disparity: tuple[int, int] | None) -> dict[str, Any]:
-    """Sections of the command line with its search range, if there is one."""
+    """Add the search range of the command line, if given, to its sections."""
     return (
         given
         if disparity is None

@@ -1,4 +1,4 @@
-"""What the commands that judge pairs of known truth have in common."""
+"""Options and output shared by the commands that evaluate pairs with known truth."""
 
 import json
 import math
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
     if not math.isfinite(value):
-        raise click.BadParameter(f"{value} is no number of pixels")
+        raise click.BadParameter(f"{value} is not a number of pixels")
     return value
 
 
 def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of every command that judges pairs of known truth."""
+    """Add the options of commands that evaluate pairs with known truth."""
     options = [
         click.option(
             "--config", "config_file", type=click.Path(path_type=Path), help="Settings to match pairs with (YAML)."
@@ -30,7 +30,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--accurate",
             is_flag=True,
-            help="Match pairs with cross-checking against a right view of its own, as the paper's implementation does.",
+            help="Cross-check against a right view that is matched on its own, as in the paper's implementation.",
         ),
         click.option(
             "--tolerance",
@@ -38,7 +38,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             default=0.0,
             callback=_finite,
             metavar="PX",
-            help="Truth so far outside an interval still counts as inside; for truth given in steps, half a step.",
+            help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
         ),
         click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
         log_options,
@@ -51,7 +51,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def overrides(
     minimum: int, maximum: int, accurate: bool, preset: str | None, cost: str | None = None
 ) -> dict[str, Any]:
-    """The settings that a pair and the command line give, as sections."""
+    """Return the settings of a pair and of the command line as sections."""
     sections: dict[str, Any] = {"disparity": {"minimum": minimum, "maximum": maximum}}
     if preset is not None:
         sections["preset"] = preset
@@ -61,6 +61,6 @@ def overrides(
 
 
 def say_json(scenes: "list[SceneMetrics]") -> None:
-    """Print the reports of scenes as JSON: of one, the report itself; of several, by name."""
+    """Print reports of scenes as JSON: the report of one scene, or reports by name of several."""
     reports = {scene.name: scene.report for scene in scenes}
     click.echo(json.dumps(scenes[0].report if len(scenes) == 1 else reports, indent=1))

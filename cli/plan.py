@@ -1,4 +1,4 @@
-"""``sat-intervals plan``: what a run will take, before it is run."""
+"""``sat-intervals plan``: estimate tiles, memory, disk and time of a run."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -18,15 +18,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sat_intervals.raster import Image
+    from sat_intervals.run.plan import Plan
     from sat_intervals.tiling import Window
 
 
-@click.command(short_help="Say what a run will take: tiles, memory, disk, time.")
+@click.command(short_help="Estimate tiles, memory, disk and time of a run.")
 @click.argument("left", callback=named)
 @click.argument("right", callback=named)
 @disparity_option
 @image_options
-@click.option("--memory", metavar="SIZE", help="What a worker may take, such as 4GB: tiles get smaller until they fit.")
+@click.option(
+    "--memory", metavar="SIZE", help="Memory of a worker, such as 4GB: tiles are made smaller until one fits."
+)
 @settings_options
 @log_options
 def plan(
@@ -39,22 +42,24 @@ def plan(
     config_file: "Path | None",
     given: dict[str, Any],
 ) -> None:
-    """Say what matching LEFT and RIGHT will take; a small window at the centre is matched to tell the time.
+    """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, from a small window matched at the centre.
 
-    Takes the options of match, and those of its settings that matter, such as the jobs of a batch system.
+    Options and settings are those of match.
     """
     from sat_intervals.config import load_config
     from sat_intervals.run.cluster import parse_memory
     from sat_intervals.run.plan import plan as make_plan
 
     config = load_config(config_file, with_range(given, disparity))
-    made = make_plan(*images(left, right), config, window=window, memory=parse_memory(memory) if memory else None)
+    limit = parse_memory(memory) if memory else None
+    made = make_plan(*images(left, right), config, window=window, memory=limit)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
+    one, together = _verdicts(made, limit, config.cluster.kind)
     lines = {
         "tiles": f"{made.tiles} of {made.tile_size} px{smaller}, overlap {config.tiles.overlap} px",
         "extra work of the overlap": f"{100 * made.extra_work:.0f} %",
-        "memory of a worker": f"{made.worker_bytes / 1e6:.0f} MB",
-        f"  with {made.together} tiles at once": f"{made.together_bytes / 1e6:.0f} MB",
+        "memory of a worker": f"{made.worker_bytes / 1e6:.0f} MB{one}",
+        f"  with {made.together} tiles at once": f"{made.together_bytes / 1e6:.0f} MB{together}",
         "disk in the folder of the run": f"{made.disk_bytes / 1e9:.1f} GB at most",
         f"expected time, {made.workers} tiles at once": f"{_duration(made.seconds)}, with cores such as this machine's",
     }
@@ -62,6 +67,20 @@ def plan(
         del lines["  with 1 tiles at once"]
     for name, value in lines.items():
         click.echo(f"{name + ':':<36}{value}")
+
+
+def _verdicts(plan: "Plan", limit: int | None, kind: str) -> tuple[str, str]:
+    """Say whether one tile at once, and all tiles of a process at once, fit in the memory given, if any."""
+    if limit is None:
+        return "", ""
+    memory = f"{limit / 1e6:.0f} MB"
+    fits = f", fits in {memory}"
+    if plan.together_bytes <= limit:
+        return fits, fits
+    tile = (plan.together_bytes - plan.worker_bytes) / (plan.together - 1)
+    most = 1 + int((limit - plan.worker_bytes) / tile)
+    way_out = f"--workers {most}" if kind == "threads" else f"cluster.cores {most}"
+    return fits, f", does not fit in {memory}: give {way_out}"
 
 
 def _duration(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""``sat-intervals plot``: pictures of a finished run."""
+"""``sat-intervals plot``: draw pictures of a finished run."""
 
 from pathlib import Path
 
@@ -11,11 +11,11 @@ _FILE = click.Path(path_type=Path)
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
 @click.argument("out", type=_FILE)
-@click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if there is one.")
+@click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
 @click.option("--row", type=int, metavar="R", help="Draw the profile of this row.")
 @click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
 @click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
-@click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots an inch: larger files.")
+@click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots per inch.")
 @log_options
 def plot(
     out: Path,
@@ -25,18 +25,18 @@ def plot(
     pixel: tuple[int, int] | None,
     dpi: int,
 ) -> None:
-    """Draw pictures of the finished run in the folder OUT, next to its files.
+    """Draw pictures of the finished run in the folder OUT and write them there.
 
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
-    OUT/errors.png     with a truth and intervals: where these miss it
+    OUT/errors.png     with a truth and intervals: pixels whose interval misses it
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
-    OUT/dsm.png        where there is a dsm.tif: hillshade, height, width
+    OUT/dsm.png        if dsm.tif exists: hillshade, height, width
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
-    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
+    """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
@@ -45,7 +45,7 @@ def plot(
     from sat_intervals.show.profile import draw_curve, draw_profile
 
     if columns is not None and row is None:
-        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} are those of a profile: give its --row too")
+        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
     results = open_results(out, truth)
     if row is not None:
         results.check_part(row, columns)
@@ -66,7 +66,7 @@ def plot(
         click.echo(out / "curve.png")
     surface = out / "dsm.tif"
     if surface.exists() and results.report["finished"] not in read_tags(surface).get("RUNS", ""):
-        click.echo(f"{surface} is of an earlier run and not drawn: run sat-intervals dsm again", err=True)
+        click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
     elif surface.exists():
         draw_surface(surface, out / "dsm.png", dpi)
         click.echo(out / "dsm.png")

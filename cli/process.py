@@ -1,19 +1,19 @@
-"""Limits and variables with which the libraries cannot start."""
+"""Check limits and environment variables before the libraries start."""
 
 import os
 import resource
 
-# Bytes of addresses that the libraries take before the first pixel; with less they abort, or wait without end.
+# Bytes of address space that the libraries need at start; with less they abort or hang.
 _ADDRESSES = 15 * 10**8
 
 
 def check_process() -> None:
-    """Refuse what the libraries would abort of, before any is imported.
+    """Raise if the libraries would abort at import.
 
     Raises
     ------
     SatIntervalsError
-        With what is set and what is needed.
+        Gives the current and the needed value.
     """
     from sat_intervals.errors import SatIntervalsError
 

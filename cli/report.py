@@ -1,4 +1,4 @@
-"""``sat-intervals report``: a finished run as one page for a browser."""
+"""``sat-intervals report``: write an HTML page of a finished run."""
 
 from pathlib import Path
 
@@ -9,15 +9,16 @@ from sat_intervals.cli.options import log_options
 _FILE = click.Path(path_type=Path)
 
 
-@click.command(short_help="Make a page of a finished run to look at in a browser.")
+@click.command(short_help="Write an HTML page of a finished run.")
 @click.argument("out", type=_FILE)
-@click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if there is one.")
+@click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
 @log_options
 def report(out: Path, truth: Path | None) -> None:
-    """Write OUT/report.html: one file for any browser, which needs no network and nothing beside it.
+    """Write OUT/report.html, one self-contained file for any browser.
 
-    Map and interval profile of any row, histograms, validity, tiles and seams, settings and times, and with a truth how
-    often the intervals hold it. Of large images the map and the profiles show every n-th row and column.
+    It shows maps, the interval profile of any row, histograms, validity, tiles and seams, settings and times. With a
+    truth, it also shows how often the intervals contain it. For large images, maps and profiles show every n-th row and
+    column.
     """
     from sat_intervals.results import open_results
     from sat_intervals.show.report import write_report

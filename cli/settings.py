@@ -1,4 +1,4 @@
-"""``sat-intervals config``: a complete, commented file of settings."""
+"""``sat-intervals config``: print a complete, commented file of settings."""
 
 import click
 
@@ -8,7 +8,7 @@ from sat_intervals.cli.options import PRESETS
 @click.command(short_help="Print a complete, commented file of settings.")
 @click.option("--preset", type=click.Choice(PRESETS), default=PRESETS[0], show_default=True, help="Which settings.")
 def config(preset: str) -> None:
-    """Print a complete YAML file of settings, every one commented, to change and give to `match --config`."""
+    """Print a complete, commented YAML file of settings, to edit and use with `match --config`."""
     from sat_intervals.config import preset_text
 
     click.echo(preset_text(preset), nl=False)

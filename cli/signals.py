@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first asks the command to end, the second kills it."""
+"""Handle Ctrl-C and SIGTERM: the first signal ends the command cleanly, the second kills it."""
 
 import logging
 import signal
@@ -11,25 +11,25 @@ _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 class Ended(KeyboardInterrupt):
-    """The process was asked to end by a signal, its only argument."""
+    """A signal, its only argument, asked the process to end."""
 
     @property
     def status(self) -> int:
-        """Exit status by the convention of shells."""
+        """Return the exit status by the convention of shells."""
         return 128 + int(self.args[0])
 
     def __str__(self) -> str:
-        """What happened, in a word."""
+        """Return what happened, in one word."""
         return _WORDS[self.args[0]]
 
 
-_asked: list[Ended] = []
+_received: list[Ended] = []
 
 
 def check() -> None:
-    """End if that was asked for: Python drops what a signal raises inside a destructor."""
-    if _asked:
-        raise _asked[0]
+    """Raise `Ended` if a signal came: Python drops exceptions that handlers raise inside destructors."""
+    if _received:
+        raise _received[0]
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def armed() -> Iterator[None]:
     try:
         yield
     finally:
-        if not _asked:  # else what is left to do may still take a while: the second kills, and nothing is complained of
+        if not _received:  # after a signal, a second one must still kill the cleanup, without messages
             sys.unraisablehook = hook
             for number, handler in before.items():
                 signal.signal(number, handler)
@@ -49,11 +49,11 @@ def armed() -> Iterator[None]:
 def _end(number: int, frame: Any) -> None:
     for other in _WORDS:
         signal.signal(other, signal.SIG_DFL)
-    logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # of what zarr and dask do not bring to an end
-    _asked.append(Ended(number))
-    raise _asked[0]
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # about unfinished tasks of zarr and dask
+    _received.append(Ended(number))
+    raise _received[0]
 
 
 def _report(unraisable: "sys.UnraisableHookArgs") -> None:
-    if not _asked:
+    if not _received:
         sys.__unraisablehook__(unraisable)

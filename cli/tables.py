@@ -1,4 +1,4 @@
-"""Tables for people: drawn on a terminal, plain aligned text elsewhere."""
+"""Print tables: formatted on a terminal, plain aligned text elsewhere."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics,
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
-    """Print a table whose first column holds labels and whose others hold figures."""
+    """Print a table with labels in the first column and figures in the others."""
     terminal = Console(highlight=False)
     if not terminal.is_terminal:
         _show_plainly(header, rows, title)
@@ -35,7 +35,7 @@ def _show_plainly(header: Sequence[str], rows: Sequence[Sequence[str]], title: s
 
 
 def show_groups(rows: Sequence[Row], title: str) -> None:
-    """Print one of the paper's tables: a row a group, and below it what others print for it."""
+    """Print one of the paper's tables: a row per group, followed by published figures for comparison."""
     header = ["", "scenes", f">= {OBJECTIVE}", *rows[0].figures]
     cells = []
     for row in rows:
@@ -44,13 +44,13 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
     show(header, cells, title)
     if any(row.scenes is None for row in rows):
         click.echo(
-            "paper: Malinowski et al. 2024; reference: Pandora, their implementation, measured for this project, which "
-            "cross-checks as --accurate does"
+            "paper: Malinowski et al. 2024; reference: their implementation in Pandora, measured for this project; it "
+            "cross-checks as with --accurate"
         )
 
 
 def show_missed(scenes: Sequence[SceneMetrics]) -> None:
-    """Name the scenes that miss the paper's objective."""
+    """List the scenes below the paper's objective."""
     accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
     missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
     if missed:
@@ -95,7 +95,7 @@ def show_surface(name: str, report: dict[str, Any]) -> None:
 
 
 def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
-    """Rows of all pixels, and of those of high and of low confidence."""
+    """Return rows for all pixels and for those of high and low confidence."""
     columns = ("accuracy", "relative_size", "mean_width", "relative_overestimation")
     names = {"all": "all pixels", "high": "high confidence", "low": "low confidence"}
     return [[name + where, *_measures(report[key], *columns)] for key, name in names.items()]
@@ -106,5 +106,5 @@ def _measures(area: dict[str, float | None], *columns: str) -> list[str]:
 
 
 def _figure(value: float | None) -> str:
-    """A figure with three decimals, a dash for none."""
+    """Format a figure with three decimals, or a dash for None."""
     return "-" if value is None else f"{value:.3f}"

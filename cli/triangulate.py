@@ -1,4 +1,4 @@
-"""``sat-intervals triangulate``: points and heights of a run."""
+"""``sat-intervals triangulate``: compute ground points of a run."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import click
 
 from sat_intervals.cli.options import log_options, path, quiet_option
 
-# Metres between lines of sight.
-_DOUBTFUL = 0.1
+# Metres between lines of sight above which models are suspect.
+_SUSPECT = 0.1
 
 
-@click.command(short_help="Points and heights of a run, with bounds, through sensor models.")
+@click.command(short_help="Compute points and height bounds of a run with sensor models.")
 @click.argument("out", callback=path)
 @click.option("--left-model", required=True, callback=path, metavar="FILE", help="RPC model of the left sensor image.")
 @click.option(
@@ -25,13 +25,13 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
 
     \b
     OUT/points.tif   longitude, latitude, height, its two bounds, residual,
-                     where the points of the bounds lie
+                     positions of the points at both bounds
 
-    Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files; grids hold the sensor column and row (bands 1 and 2) of
-    epipolar positions, as CARS and shareloc write them; all of them local files. Models and grids of left and right
-    that change places together go unnoticed, and turn relief upside down.
+    Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files. Grids contain the sensor column and row (bands 1 and 2)
+    of epipolar positions, as written by CARS and shareloc. All must be local files. Swapping both models and grids of
+    left and right is not detected, and inverts the relief.
     Needs shareloc: pip install 'sat-intervals[dsm]'.
-    """  # noqa: D301 (click's mark of a paragraph to keep as it is)
+    """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.triangulate import triangulate
 
@@ -44,14 +44,14 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
             f"lines of sight at most {residual:.2g} m apart"
         )
     else:
-        console.say("no valid pixel, no points")
+        console.say("no valid pixels, so no points")
     if report["lost"]:
         click.echo(f"{report['lost']} valid pixels have no point: grids or models have no values there", err=True)
-    if report["median_residual"] > _DOUBTFUL:
+    if report["median_residual"] > _SUSPECT:
         click.echo(
-            f"warning: lines of sight pass each other by {report['median_residual']:.2g} m in the median, where models "
-            "and grids of these images leave millimetres: heights may be wrong by many times as much; check that the "
-            "models are those that the grids were made with",
+            f"warning: lines of sight miss each other by {report['median_residual']:.2g} m in the median, where "
+            "matching models and grids give millimetres. Height errors may be many times larger: check that the grids "
+            "were made with these models",
             err=True,
         )
     console.say(str(out / "points.tif"))

@@ -1,1 +1,1 @@
-"""The settings files that come with the package; this file makes them findable however it is installed."""
+"""Settings files of the package; a package of its own so that every kind of installation finds them."""

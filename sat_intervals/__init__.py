@@ -1,17 +1,19 @@
 """Dense stereo matching of epipolar satellite images with confidence intervals on the disparity.
 
-The public names are loaded on first use, so that ``import sat_intervals`` and ``sat-intervals --help`` wait
-for neither numba nor dask.
+Public names are imported on first use, so ``import sat_intervals`` and ``sat-intervals --help`` load neither numba nor
+dask.
 """
 
+import importlib.metadata
 import logging
-from importlib import import_module
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+import typing
 
-if TYPE_CHECKING:
+if typing.TYPE_CHECKING:
     from sat_intervals.config import Config, load_config
     from sat_intervals.errors import RunError, SatIntervalsError
+    from sat_intervals.evaluate.disparity import evaluate_run
+    from sat_intervals.heights.dsm import make_surface
+    from sat_intervals.heights.triangulate import triangulate
     from sat_intervals.match.in_memory import match_arrays
     from sat_intervals.raster import open_image
     from sat_intervals.run.pair import match_pair
@@ -25,33 +27,39 @@ __all__ = [
     "SatIntervalsError",
     "Window",
     "__version__",
+    "evaluate_run",
     "load_config",
+    "make_surface",
     "match_arrays",
     "match_pair",
     "open_image",
+    "triangulate",
 ]
 
-logging.getLogger(__name__).addHandler(logging.NullHandler())  # who uses the library says where its words go
+logging.getLogger(__name__).addHandler(logging.NullHandler())  # the application configures logging
 
 _HOMES = {
     "Config": "config",
     "RunError": "errors",
     "SatIntervalsError": "errors",
     "Window": "tiling",
+    "evaluate_run": "evaluate.disparity",
     "load_config": "config",
+    "make_surface": "heights.dsm",
     "match_arrays": "match.in_memory",
     "match_pair": "run.pair",
     "open_image": "raster",
+    "triangulate": "heights.triangulate",
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> typing.Any:
     if name == "__version__":
-        return version("sat-intervals")
+        return importlib.metadata.version("sat-intervals")
     if name in _HOMES:
-        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

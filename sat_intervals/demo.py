@@ -1,12 +1,12 @@
-"""A procedural satellite scene with exact truth: two epipolar views of one surface, from a seed alone.
+"""Make a procedural satellite scene with exact truth: two epipolar views of one surface, from a seed.
 
-The surface has image rows, ground columns `u` (px of 0.5 m) and heights (m). A row of it is a polyline with
-four nodes a pixel; where it jumps (houses, cars, rims of trees) the two nodes meet halfway: a vertical wall.
-A view puts it at columns `x = u + a (height - DATUM)` and shows the highest point of each ray.
+The surface has image rows, ground columns `u` (px of 0.5 m) and heights (m). Each row is a polyline with four nodes per
+pixel. At a jump (houses, cars, edges of trees) two nodes share one position and form a vertical wall. A view projects
+the polyline to columns `x = u + a (height - DATUM)` and shows the highest point of each ray.
 
-Why the truth is exact: the point at a pixel centre is where a ray crosses that polyline, in closed form. Its
-disparity is `(a_right - a_left) (height - DATUM)`, `x_right = x_left + d`, and the same polyline tells whether
-the right view shows it too. (Beside a step the blur mixes both sides; the truth is that of the centre.)
+The truth is exact: the point at a pixel centre is the intersection of a ray with the polyline, in closed form. Its
+disparity is `(a_right - a_left) (height - DATUM)`, `x_right = x_left + d`. The same polyline decides whether the right
+view shows the point. Beside a step, blur mixes both sides; the truth is that of the pixel centre.
 """
 
 from collections import deque
@@ -21,28 +21,28 @@ Array = NDArray[Any]
 Arrays = Sequence[Array]
 Profile = tuple[int, Array, Array, Array]  # row; ground column (px), height (m) and radiance of its nodes
 
-VIEWS = (-0.4, 0.6)  # a of the left and of the right view, px a metre
+VIEWS = (-0.4, 0.6)  # a of the left and the right view, px per metre
 DATUM, PIXEL = 12.0, 0.5  # m: the height of disparity 0, the size of a pixel
-OVER, FRACTIONS = 4, np.arange(4) / 4  # nodes, and samples, a pixel; where they are in it
+OVER, FRACTIONS = 4, np.arange(4) / 4  # nodes (and samples) per pixel; their positions
 MARGIN = 64  # px of ground around the image: more than a parallax (20 px) or a shadow (60 rows, 45 px)
-STEP = 0.8  # m between neighbouring nodes, from which on they are a wall
-SLOPE_LIGHT = (0.5, 0.65)  # what slopes along columns and rows add: the sun is 50 degrees high, upper left
-SHADOW_SHIFT, SHADOW_DROP, AMBIENT = 3, 0.75, 0.25  # nodes and m a row; share of the light in a shadow
+STEP = 0.8  # m between adjacent nodes that form a wall
+SLOPE_LIGHT = (0.5, 0.65)  # shading of slopes along columns and rows: sun in the upper left, 50 degrees high
+SHADOW_SHIFT, SHADOW_DROP, AMBIENT = 3, 0.75, 0.25  # nodes and m per row; share of light in a shadow
 OFFSET, GAIN = np.array([[90, 62], [2400, 2570]])  # DN = offset + gain * radiance; left, right
-MID_LEVEL, SATURATION = 600.0, 4095  # DN at which the signal to noise holds; 12 bits
-CORNER = (0.32, 0.13)  # legs of the empty corner, shares of rows and columns
+MID_LEVEL, SATURATION = 600.0, 4095  # DN at which the signal to noise ratio is defined; 12 bits
+CORNER = (0.32, 0.13)  # legs of the empty corner as shares of rows and columns
 SPARE = 3  # px between the truth and the ends of the search range
 
-QUARTER = 230  # px between the roads that enclose a quarter
-HOUSES, BLOCKS, HALLS, FIELD, WOOD, PARK = range(6)  # kinds of quarter; for each of them:
+QUARTER = 230  # px between the roads around a quarter
+HOUSES, BLOCKS, HALLS, FIELD, WOOD, PARK = range(6)  # kinds of quarter; the next arrays have one value for each
 ALBEDO = np.array([0.24, 0.22, 0.26, 0.30, 0.12, 0.25])
 CONTRAST = np.array([0.25, 0.15, 0.08, 0.04, 0.30, 0.12])
-STREET = np.array([42, 46, 70, 130, 190, 96])  # px from one to the next
-PLAN = np.array([[1, 1, 0, 3], [1, 2, 0, 4], [5, 1, 1, 3], [0, 1, 4, 2]])  # neighbouring quarters, repeated
+STREET = np.array([42, 46, 70, 130, 190, 96])  # px between streets
+PLAN = np.array([[1, 1, 0, 3], [1, 2, 0, 4], [5, 1, 1, 3], [0, 1, 4, 2]])  # kinds of adjacent quarters, repeated
 FLAT, GABLE, TREE, FOREST, ROOFTOP = range(5)
-# Kinds of quarter; cell along a street (px), rows of cells a street, their shift, how far a thing strays
-# across (px); half length, half width (px); height (m) from, to; albedo from, to; share of cells taken; shape.
-THINGS = (
+# Kinds of quarter; cell length along a street (px), rows of cells per street, their shift, random offset across (px);
+# half length, half width (px); least and largest height (m); least and largest albedo; share of used cells; shape.
+OBJECTS = (
     ((HOUSES,), 30, 1, 0, 4, 11, 8, 5, 8.5, 0.2, 0.6, 0.95, GABLE),
     ((BLOCKS,), 44, 1, 0, 2, 21, 12.5, 8, 31, 0.2, 0.7, 0.6, FLAT),
     ((BLOCKS,), 44, 1, 0, 3, 21, 11, 8, 20, 0.2, 0.45, 0.7, GABLE),
@@ -60,20 +60,20 @@ THINGS = (
 
 @dataclass(frozen=True)
 class Scene:
-    """Two views and their truth, in arrays (rows, columns); pixel centres are at integers."""
+    """Two views and their truth, arrays (rows, columns); pixel centres are integers."""
 
     left: Array  # uint16, 12 bits, 0 = no data
     right: Array  # the same
-    truth: Array  # float32 px, x_right = x_left + truth; at hidden pixels too, NaN where left has no data
-    visible: Array  # bool, the right image shows the same point
-    minimum: int  # px; [minimum, maximum] is a search range that encloses the truth
+    truth: Array  # float32 px, x_right = x_left + truth; also at hidden pixels, NaN where left has no data
+    visible: Array  # bool, whether the right image shows the same point
+    minimum: int  # px; the search range [minimum, maximum] contains the truth
     maximum: int
 
 
 def make_scene(
     rows: int = 600, columns: int = 800, seed: int = 0, *, psf: float = 0.6, snr: float = 95, block: int = 64
 ) -> Scene:
-    """A scene with blur `psf` (sigma, px), signal to noise `snr` (infinite: none); `block`: rows at a time."""
+    """Make a scene with blur `psf` (sigma, px) and signal to noise `snr` (inf: no noise), `block` rows at a time."""
     random, halo = np.random.default_rng([seed, 1]), int(np.ceil(3 * psf))
     kernel = np.exp(-0.5 * (np.arange(-halo * OVER, halo * OVER + 1) / OVER / max(psf, 0.01)) ** 2)
     across, down = kernel / kernel.sum(), kernel[::OVER] / kernel[::OVER].sum()
@@ -88,7 +88,7 @@ def make_scene(
         lines.append(sum(w * fine[:, k : k + columns * OVER : OVER] for k, w in enumerate(across)))
         if 0 <= (row := profile[0]) < rows:
             truth[row] = (VIEWS[1] - VIEWS[0]) * (height[centres] - DATUM)
-            truth[row, : starts[row]] = np.nan  # which makes the comparisons below false
+            truth[row, : starts[row]] = np.nan  # NaN makes the comparisons below false
             partner = np.arange(columns) + truth[row]
             visible[row] = seen[centres] & (partner >= starts[row]) & (partner <= columns - 1)
         if (row := profile[0] - halo) >= 0:
@@ -101,7 +101,7 @@ def make_scene(
 
 
 def look(profile: Profile, view: int, x: Array) -> tuple[Array, Array, Array]:
-    """What view 0 (left) or 1 has at columns `x`: height (m), radiance, and whether the other shows it too."""
+    """Return height (m), radiance and visibility in the other view, at columns `x` of view 0 (left) or 1 (right)."""
     row, u, height, radiance = profile
     here, there = (u + a * (height - DATUM) for a in (VIEWS[view], VIEWS[1 - view]))
     k, share = _highest_crossing(here, x, VIEWS[view])
@@ -119,8 +119,8 @@ def look(profile: Profile, view: int, x: Array) -> tuple[Array, Array, Array]:
 
 
 def _highest_crossing(x: Array, at: Array, slant: float) -> tuple[Array, Array]:
-    """Where the rays at columns `at` cross polyline `x`: a share of the way from node k to node k + 1."""
-    # Rays lean: the highest crossing is the first from the left where slant is positive, else from the right.
+    """Return node k and share of the way to node k + 1 where the rays at columns `at` cross polyline `x`."""
+    # Rays are slanted: the highest crossing is the first from the left if the slant is positive, else from the right.
     if slant < 0:
         k, share = _highest_crossing(-x[::-1], -at, -slant)
         return x.size - 2 - k, 1 - share
@@ -129,7 +129,7 @@ def _highest_crossing(x: Array, at: Array, slant: float) -> tuple[Array, Array]:
 
 
 def profiles(rows: int, columns: int, seed: int = 0, halo: int = 0, block: int = 64) -> Iterator[Profile]:
-    """The lit surface of the rows from -halo to rows + halo - 1, with MARGIN px on either side."""
+    """Yield the lit surface of rows -halo to rows + halo - 1, with MARGIN px on either side."""
     lattice = np.pad(np.random.default_rng([seed, 0]).uniform(-1, 1, (256, 256)), (0, 1), mode="wrap")
     grid = np.arange((columns + 2 * MARGIN) * OVER) / OVER - MARGIN
     shade = np.full(grid.size, -np.inf)  # m, the height of the shadow of the rows above
@@ -145,7 +145,7 @@ def profiles(rows: int, columns: int, seed: int = 0, halo: int = 0, block: int =
 
 
 def _surface(lattice: Array, rows: Array, columns: int) -> Array:
-    """Height (m) and albedo, times the light its slope gives, of the nodes of some rows: (2, rows, nodes)."""
+    """Return height (m) and albedo (shaded by slope) of the nodes of some rows: (2, rows, nodes)."""
     r, c = np.append(rows, rows[-1] + 1.0)[:, None], np.arange(-MARGIN, columns + MARGIN + 2.0)[None]
     height, grain, quarter = _terrain(lattice, r, c), _noise(lattice, r, c, 4, 2), _quarter(lattice, r, c)
     albedo = np.where(height > 0, _ground(lattice, r, c, grain, quarter), 0.07 + 0.0015 * grain)
@@ -153,32 +153,32 @@ def _surface(lattice: Array, rows: Array, columns: int) -> Array:
     albedo[:-1, :-1] *= 1 + SLOPE_LIGHT[0] * along + SLOPE_LIGHT[1] * down
     pixels = np.stack([height, albedo, grain])[:, :-1, :-1, None]
     nodes = pixels[:, :, :-1] + np.diff(pixels, axis=2) * FRACTIONS
-    for salt, (kinds, *thing) in enumerate(THINGS):
+    for salt, (kinds, *item) in enumerate(OBJECTS):
         y, x = np.nonzero(np.isin(quarter[0][:-1, :-2], kinds))
-        near, frame = _place(lattice, r[y, 0], c[0, x], [v[y, x] for v in quarter], salt, thing)
+        near, frame = _place(lattice, r[y, 0], c[0, x], [v[y, x] for v in quarter], salt, item)
         y, x = y[near], x[near]
-        nodes[:2, y, x] = _draw(nodes[:, y, x], frame, thing)
+        nodes[:2, y, x] = _draw(nodes[:, y, x], frame, item)
     return nodes[:2].reshape(2, rows.size, -1)
 
 
 def _ground(lattice: Array, r: Array, c: Array, grain: Array, quarter: Arrays) -> Array:
-    """Albedo of gardens, fields, streets and roads; `grain` is their finest texture."""
+    """Return the albedo of gardens, fields, streets and roads; `grain` is their finest texture."""
     kind, border, angle, number = quarter
     p, q = _turned(r, c, angle)
     parcel = lattice[(number + np.floor(p / 75).astype(int)) & 255, np.floor(q / 130).astype(int) & 255]
     crop = np.where(kind == FIELD, 0.3 * parcel + 0.025 * np.sin(0.9 * p), 0)
     soil = ALBEDO[kind] * (1 + CONTRAST[kind] * grain + 0.1 * _noise(lattice, r, c, 36, 2) + crop)
     street = np.abs(q - STREET[kind] * np.round(q / STREET[kind]))
-    kerb = np.maximum(5 - street, 7 - border)  # px into a street or a road; pavements are 2 px wide
+    kerb = np.maximum(5 - street, 7 - border)  # px inside a street or a road; pavements are 2 px wide
     return np.where(kerb > -2, np.where(kerb > 0, 0.15, 0.26) * (1 + 0.08 * grain), soil)
 
 
-def _place(lattice: Array, r: Array, c: Array, quarter: Arrays, salt: int, thing: Sequence[float]) -> Arrays:
-    """Which of the positions (n,) are near one of THINGS, and a frame (6, m) for those.
+def _place(lattice: Array, r: Array, c: Array, quarter: Arrays, salt: int, item: Sequence[float]) -> Arrays:
+    """Return which of the positions (n,) are near an object, and the frame (6, m) of those.
 
-    Frame: px along and across from its centre, its angle, its base (m), two random numbers of its own (0 to 1).
+    Frame: px along and across from the object's centre, its angle, its base (m), two random numbers (0 to 1).
     """
-    along, lanes, shift, stray, length, width, *_, share, shape = thing
+    along, lanes, shift, stray, length, width, *_, share, shape = item
     kind, _, angle, number = quarter
     angle, across = angle + salt * (shape == FOREST), STREET[kind] / lanes
     p, q = _turned(r, c, angle)
@@ -194,9 +194,9 @@ def _place(lattice: Array, r: Array, c: Array, quarter: Arrays, salt: int, thing
     return np.flatnonzero(near)[free], frame[:, free]
 
 
-def _draw(nodes: Array, frame: Array, thing: Sequence[float]) -> Array:
-    """Height and albedo (2, m, OVER) of nodes (height, albedo, grain) with a thing, where it is the higher."""
-    *_, length, width, low, high, dark, bright, _, shape = thing
+def _draw(nodes: Array, frame: Array, item: Sequence[float]) -> Array:
+    """Return height and albedo (2, m, OVER) of nodes (height, albedo, grain) and an object, whichever is higher."""
+    *_, length, width, low, high, dark, bright, _, shape = item
     (p, q, angle, base, size, tone), (ground, _, grain) = frame[..., None], nodes
     sun_p, sun_q = _turned(np.array(SLOPE_LIGHT[1]), np.array(SLOPE_LIGHT[0]), angle)
     p = (p + FRACTIONS * np.cos(angle)) / (length * (0.7 + 0.3 * size))
@@ -215,7 +215,7 @@ def _draw(nodes: Array, frame: Array, thing: Sequence[float]) -> Array:
 
 
 def _quarter(lattice: Array, r: Array, c: Array) -> Arrays:
-    """The quarter at some rows and columns: its kind, px to its border, its streets' angle, its number."""
+    """Return the quarter at some rows and columns: kind, px to its border, angle of its streets, number."""
     y = (0.9 * r + 0.44 * c) / QUARTER + 0.25 * _noise(lattice, r, c, 500, 2)
     x = (0.9 * c - 0.44 * r) / QUARTER + 0.25 * _noise(lattice, c, r, 500, 2)
     i, j = np.floor(y).astype(int), np.floor(x).astype(int)
@@ -224,19 +224,19 @@ def _quarter(lattice: Array, r: Array, c: Array) -> Arrays:
 
 
 def _turned(r: Array, c: Array, angle: Array) -> tuple[Array, Array]:
-    """Coordinates (px) along and across a direction."""
+    """Return coordinates (px) along and across a direction."""
     return c * np.cos(angle) + r * np.sin(angle), r * np.cos(angle) - c * np.sin(angle)
 
 
 def _terrain(lattice: Array, r: Array, c: Array) -> Array:
-    """Height (m) of the ground: hills, and 0 on a river that winds through the image."""
+    """Return the height (m) of the ground: hills, and 0 on a river through the image."""
     away = np.abs(0.95 * r - 0.3 * c - 380 + 110 * _noise(lattice, r, c, 400, 3))
     rise = np.clip((away - 18) / 150, 0, 1)
     return np.asarray(rise * (2 - rise) * np.maximum(7 + 5 * _noise(lattice, r, c, 280, 4), 1))
 
 
 def _noise(lattice: Array, r: Array, c: Array, spacing: float, octaves: int) -> Array:
-    """Smooth noise, about -1 to 1: nodes of the lattice `spacing` px apart, and ever finer and weaker ones."""
+    """Return smooth noise, about -1 to 1: lattice nodes `spacing` px apart, then finer and weaker octaves."""
     total = np.zeros(())
     for scale in 0.5 ** np.arange(octaves):
         y, x = r / (spacing * scale) + 31.7 / scale, c / (spacing * scale) + 17.1 / scale

@@ -1,4 +1,4 @@
-"""The one family of errors this package raises for what a user can put right; and the check that a path is a file."""
+"""Errors of the package, and the check that a path is a regular file."""
 
 import os
 import stat
@@ -12,22 +12,22 @@ _KINDS = {
 
 
 class SatIntervalsError(ValueError):
-    """Base of every error of the package: one line that names what clashes and the way out."""
+    """Base class of the package's errors; the message names the file, the values and the way out."""
 
 
 class RunError(SatIntervalsError):
-    """A run that failed on its way, by no fault of its arguments; what is done is kept for the next try."""
+    """A run that failed although its arguments are correct; finished tiles are kept, so it can be resumed."""
 
 
 def check_regular(path: str | os.PathLike[str]) -> None:
-    """Refuse a local pipe, socket or device, which could be waited for without end.
+    """Raise if a path is a local pipe, socket or device: reading it could block forever.
 
-    Names of nothing, of folders and of what is elsewhere pass: whoever opens them knows better what to say.
+    Missing files, folders and URLs pass; opening them gives a better message.
 
     Raises
     ------
     SatIntervalsError
-        With the path and what it is.
+        Names the path and its kind.
     """
     try:
         kind = _KINDS.get(stat.S_IFMT(os.stat(path).st_mode))

@@ -1,4 +1,4 @@
-"""Memory and cores that this process may use, which in a container or a batch job are less than the machine's."""
+"""Find the memory and the cores that this process may use: in a container or a job, less than the machine has."""
 
 import os
 import re
@@ -10,39 +10,39 @@ _ROOT = Path("/")
 
 
 def usable_memory() -> int:
-    """Bytes: the least of physical memory, the limit of the address space, and the limits of cgroups."""
+    """Return bytes: the least of physical memory, address-space limit and cgroup limits."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *_memory_limits(_ROOT)]
     address_space, _ = resource.getrlimit(resource.RLIMIT_AS)
     return min(limits if address_space == resource.RLIM_INFINITY else [*limits, address_space])
 
 
 def usable_cores() -> int:
-    """The least of the cores that this process may run on, and the quotas of cgroups; at least 1."""
+    """Return the least of CPU affinity and cgroup quotas; at least 1."""
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min([affinity, *_core_limits(_ROOT)])
 
 
 def _memory_limits(root: Path) -> Iterator[int]:
-    """Limits in bytes of this process's cgroup and of its ancestors; ``root`` holds ``proc`` and the mount points."""
+    """Yield memory limits (bytes) of this process's cgroup and its ancestors; ``root`` contains ``proc`` and mounts."""
     for folder in _cgroups(root, "memory"):
         yield from _numbers(folder / "memory.max")
-        yield from _numbers(folder / "memory.limit_in_bytes")  # version 1; without limit a number near 2**63
+        yield from _numbers(folder / "memory.limit_in_bytes")  # version 1; close to 2**63 means no limit
 
 
 def _core_limits(root: Path) -> Iterator[int]:
-    """Cores that the quotas of this process's cgroup and of its ancestors are worth."""
+    """Yield CPU quotas, in cores, of this process's cgroup and its ancestors."""
     for folder in _cgroups(root, "cpu"):
         one = [*_numbers(folder / "cpu.cfs_quota_us"), *_numbers(folder / "cpu.cfs_period_us")]
         for figures in (_numbers(folder / "cpu.max"), one):
-            if len(figures) == 2 and min(figures) > 0:  # version 1 has the quota -1 for none
+            if len(figures) == 2 and min(figures) > 0:  # version 1: quota -1 means no limit
                 quota, period = figures
-                # Rounded up: tiles do not wait for each other, so workers held back now and then use the whole quota;
-                # rounded down, up to half of it would stay idle.
+                # Round up: tiles are independent, so throttled workers still use the whole quota. Rounding down would
+                # leave up to half of it idle.
                 yield -(-quota // period)
 
 
 def _numbers(file: Path) -> list[int]:
-    """Whole numbers in a file; none if it is absent, as in the root cgroup, or says ``max``."""
+    """Return the integers in a file; none if it is missing (root cgroup) or contains ``max``."""
     try:
         return [int(word) for word in file.read_text().split()]
     except (OSError, ValueError):
@@ -50,17 +50,17 @@ def _numbers(file: Path) -> list[int]:
 
 
 def _cgroups(root: Path, controller: str) -> Iterator[Path]:
-    """Folders of this process's cgroup and of its ancestors, as far up as they are mounted.
+    """Yield the folders of this process's cgroup and of its mounted ancestors.
 
-    A controller has a hierarchy of its own (version 1), or is part of the common one (version 2), or the common one is
-    there without it.
+    A controller either has its own hierarchy (version 1) or belongs to the common one (version 2). The common hierarchy
+    may also exist without this controller.
     """
     try:
         groups, mounts = (
             (root / "proc/self" / name).read_text(errors="surrogateescape").split("\n")[:-1]
             for name in ("cgroup", "mountinfo")
         )
-    except OSError:  # no Linux
+    except OSError:  # not Linux
         return
     paths = {}
     for line in groups:
@@ -81,10 +81,10 @@ def _cgroups(root: Path, controller: str) -> Iterator[Path]:
 
 
 def _below(path: str, top: str) -> list[str] | None:
-    """Names that lead from the cgroup at the top of a mount down to the one at ``path``; None if it is not below.
+    """Return the path from the cgroup at the top of a mount down to ``path``; None if ``path`` is not below it.
 
-    A container may see a part of the hierarchy only. Both paths start from the root of its cgroup namespace, with
-    ``..`` for what is above; of a mount from above it, the names down to that root cannot be known.
+    A container may see only part of the hierarchy. Both paths start at the root of its cgroup namespace, and ``..``
+    means above it. For a mount from above, the names down to that root are unknown.
     """
     names, tops = ([name for name in text.split("/") if name] for text in (path, top))
     rest = names[len(tops) :]

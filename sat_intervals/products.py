@@ -1,4 +1,4 @@
-"""What is written: bands, validity bits, and the states of an input pixel. One table for every reader."""
+"""Define the data dictionary: bands, validity flags and the states of an input pixel."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -9,15 +9,15 @@ import numpy as np
 NO_DATA = 1  # outside the image, declared no data, or not finite
 MASKED = 2  # excluded by the user's mask
 
-# Raw products of a tile hold integer disparities; this stands where there is none.
+# Raw products of a tile hold integer disparities; this value marks a missing one.
 NO_DISPARITY = -32768
 # The aggregated cost of an impossible candidate, above every declared span.
 IMPOSSIBLE_COST = 65535
 
-# MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008, 0 to 250: it fits in a byte.
+# MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008. Its codes, 0 to 250, fit in a byte.
 COSINE_STEPS = 125
 
-# Validity bits (method: section 9), with the numbers of Pandora so that its readers read ours.
+# Validity bits (method: section 9). They have Pandora's numbers, so its tools read our files.
 LEFT_WINDOW = 1 << 0
 NO_CANDIDATE = 1 << 1
 RANGE_INCOMPLETE = 1 << 2
@@ -35,7 +35,7 @@ INVALID = UNMATCHED | REJECTED
 
 @dataclass(frozen=True)
 class Flag:
-    """One bit of the validity band: its value, a short name, its meaning, and whether it makes a pixel invalid."""
+    """One bit of the validity band: its number, name and meaning, and whether it makes a pixel invalid."""
 
     bit: int
     name: str
@@ -44,7 +44,7 @@ class Flag:
 
     @property
     def value(self) -> int:
-        """The flag as a number, ``1 << bit``."""
+        """Return ``1 << bit``."""
         return 1 << self.bit
 
 
@@ -61,9 +61,15 @@ FLAGS = (
 )
 
 
+def cause(validity: np.ndarray) -> np.ndarray:
+    """Return the flag that makes each pixel invalid, 0 if valid; of several, the first in the order of FLAGS."""
+    reasons = validity.astype(np.int64) & INVALID
+    return reasons & -reasons  # the lowest bit
+
+
 @dataclass(frozen=True)
 class Band:
-    """One band of a file: its name (the GeoTIFF description), unit ("" = none) and meaning."""
+    """One band of a file: name (the GeoTIFF description), unit ("" for none) and meaning."""
 
     name: str
     unit: str
@@ -79,20 +85,20 @@ BANDS = (
 
 
 class Bands(NamedTuple):
-    """What a run says of some pixels, and what that is compared with, all ``(rows, columns)``.
+    """Results of a run for some pixels, with truth and left image where they were read; all ``(rows, columns)``.
 
     Attributes
     ----------
     disparity, lower, upper
-        float32 pixels, NaN for none.
+        float32 pixels, NaN if missing.
     confidence
-        float32, 0 to 1, NaN for none.
+        float32, 0 to 1, NaN if missing.
     validity
         uint16 flags.
     truth
-        True disparity in pixels, floats, NaN where it is not known; empty where it was not read.
+        True disparity in pixels, floats, NaN where unknown; empty if not read.
     image
-        Grey values of the left image, floats, NaN where there is no data; empty where it was not read.
+        Grey values of the left image, floats, NaN where no data; empty if not read.
     """
 
     disparity: np.ndarray
@@ -105,16 +111,16 @@ class Bands(NamedTuple):
 
     @property
     def valid(self) -> np.ndarray:
-        """Pixels that were matched and passed cross-checking."""
+        """Return the mask of pixels that were matched and passed cross-checking."""
         return np.asarray(self.validity & INVALID == 0)
 
     @property
     def known(self) -> np.ndarray:
-        """Pixels with an interval and a truth."""
+        """Return the mask of pixels with an interval and a truth."""
         return np.asarray(np.isfinite(self.truth) & np.isfinite(self.lower))
 
 
-# Of points.tif: longitude and latitude in degrees, heights in metres above the ellipsoid of WGS 84 (EPSG:4979).
+# Bands of points.tif: degrees, and metres above the WGS 84 ellipsoid (EPSG:4979).
 POINTS = (
     Band("longitude", "degree", "of the point that the disparity gives, WGS 84 (EPSG:4979)"),
     Band("latitude", "degree", "of the same point"),
@@ -128,7 +134,7 @@ POINTS = (
     Band("latitude_upper", "degree", "of the point at height_upper"),
 )
 
-# Of a surface model.
+# Bands of a surface model.
 SURFACE = (
     Band("height", "m", "mean of the points that reach the cell, the nearer the heavier"),
     Band("height_lower", "m", "lower bound of the height"),

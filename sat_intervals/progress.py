@@ -1,4 +1,4 @@
-"""How far a long call is, and how long its stages take."""
+"""Report progress and time the stages of a run."""
 
 import logging
 import time
@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Progress = Callable[[str, int, int], None]
-"""Called with the name of a stage, how much of it is done, and how much there is to do."""
+"""Callback with the name of a stage, the amount done, and the total amount."""
 
 _LOG = logging.getLogger(__name__)
 
 
 @contextmanager
 def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Add the seconds that the block takes to a stage."""
+    """Add the seconds that the block takes to ``seconds[stage]``."""
     started = time.perf_counter()
     yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
@@ -21,7 +21,7 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 @contextmanager
 def logged_stage(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Like `timed`, and say in the log when the stage begins and ends."""
+    """Time a stage as `timed` does, and log its start and end."""
     _LOG.info("stage %s begins", stage)
     before = seconds.get(stage, 0.0)
     with timed(seconds, stage):

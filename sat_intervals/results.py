@@ -1,4 +1,4 @@
-"""A finished run as its folder holds it: what it says of itself, its bands, its images, and a truth beside them."""
+"""Reopen a finished run from its folder: report, bands, input images and truth."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -26,7 +26,7 @@ from sat_intervals.raster import (
 from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed
 from sat_intervals.tiling import Window, strips
 
-# Pixels of a strip, and bands of the files.
+# Pixels in a strip, and band count of each file.
 _STRIP = 1 << 23
 _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
 _REGION = ("row", "column", "height", "width")
@@ -34,14 +34,14 @@ _REGION = ("row", "column", "height", "width")
 
 @dataclass(frozen=True)
 class Layer:
-    """A raster of the size of a run's region or of its left image, read by windows of the region."""
+    """A raster as large as a run's region or its left image, read by windows of the region."""
 
     image: Image
     row: int
     column: int
 
     def read(self, window: Window) -> np.ndarray:
-        """The pixels of a window of the region as floats, NaN where there is no data."""
+        """Read a window of the region as floats, NaN where no data."""
         place = Window(self.row + window.row, self.column + window.column, window.height, window.width)
         pixels, state = read_window(self.image, place)
         return np.where(state == 0, pixels, np.nan)
@@ -62,7 +62,7 @@ class Run:
     region
         The pixels of the left image that were matched. Rows and columns of the results count from its first pixel.
     which
-        See `_which`, of ``run.json``, which goes before and comes after all other files when a run replaces another.
+        Identity of ``run.json``, see `_which`. A new run removes that file first and writes it last.
     """
 
     out: Path
@@ -73,11 +73,11 @@ class Run:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the results."""
+        """Return the rows and columns of the results."""
         return self.region.height, self.region.width
 
     def read_bands(self, window: Window) -> Bands:
-        """What the run wrote of a window of the results."""
+        """Read the bands of a window of the results."""
         with self.unchanged():
             return Bands(
                 *read_layers(self.out / "intervals.tif", window), *read_layers(self.out / "validity.tif", window)
@@ -85,36 +85,24 @@ class Run:
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """A block that reads bands, and fails where they are no longer those of this run."""
+        """Raise RunError at the end of the block if another run has replaced the files."""
         try:
             yield
         finally:
             if _which(self.out / "run.json") != self.which:
-                raise RunError(f"the run in {self.out} was replaced while it was read: run the command again")
-
-    def check_whole(self) -> None:
-        """Hold that every byte of the files is what the run published.
-
-        Raises
-        ------
-        SatIntervalsError
-            With the first file that is damaged or was changed.
-        """
-        for name, told in self.report.get("files", {}).items():
-            if name in _BANDS and checksum_of(self.out / name) != told:
-                raise _damaged(self.out / name, "is not what the run published")
+                raise RunError(f"the run in {self.out} was replaced while it was read: rerun the command")
 
     def windows(self) -> Iterator[Window]:
-        """Full-width windows of the results, from the top."""
+        """Yield full-width windows of the results from the top."""
         return strips(*self.shape, _STRIP)
 
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
-        """Hold that none of the files to be written is one of the run, of its inputs, the truth, or ``inputs``."""
+        """Raise if an output would replace a file of the run, one of its inputs, the truth, or one of ``inputs``."""
         own = [self.out / name for name in (*_BANDS, "run.json")]
-        check_not_replaced([*own, *_files_told(self.report["inputs"]), self.truth_beside, *inputs], outputs)
+        check_not_replaced([*own, *_input_files(self.report["inputs"]), self.truth_beside, *inputs], outputs)
 
     def layer(self, path: str | Path) -> Layer:
-        """Another raster of the same pixels, such as the truth."""
+        """Open another raster of the same pixels, such as the truth."""
         image, left = open_image(path), self.report["inputs"]["left"]
         size = image.height, image.width
         if size == self.shape:
@@ -128,20 +116,20 @@ class Run:
 
     @property
     def truth_beside(self) -> Path:
-        """Where the truth lies by default: beside the left image."""
+        """Return the default path of the truth, ``truth.tif`` beside the left image."""
         return Path(self.report["inputs"]["left"]["path"]).parent / "truth.tif"
 
 
 @dataclass(frozen=True)
 class Results(Run):
-    """The folder of a finished run, its images, and a truth.
+    """A finished run with its images and, if known, the truth.
 
     Attributes
     ----------
     left, right
-        The images, as the run read them.
+        The images that the run read.
     truth
-        True disparity, None without.
+        True disparity, None if unknown.
     """
 
     left: Image
@@ -149,43 +137,43 @@ class Results(Run):
     truth: Layer | None
 
     def read(self, window: Window) -> Bands:
-        """Everything of the pixels of a window of the results."""
+        """Read bands, left image and truth of a window of the results."""
         image = Layer(self.left, self.region.row, self.region.column).read(window)
         truth = self.truth.read(window) if self.truth else np.full(image.shape, np.nan)
         return self.read_bands(window)._replace(truth=truth, image=image)
 
     def read_pixel(self, row: int, column: int) -> Bands:
-        """Everything of one pixel, as arrays of no dimension."""
+        """Read bands, left image and truth of one pixel as zero-dimensional arrays."""
         self.check_pixel(row, column)
         return Bands(*(band[0, 0] for band in self.read(Window(row, column, 1, 1))))
 
     def strips(self) -> Iterator[tuple[int, Bands]]:
-        """Everything, strip by strip from the top, with the first row of each."""
+        """Yield the first row and the content (see `read`) of each strip, from the top."""
         for window in self.windows():
             yield window.row, self.read(window)
 
     def read_small(self, shape: tuple[int, int]) -> Bands:
-        """All of the results but the truth, as ``shape`` pixels: the bands picked, the left image averaged."""
+        """Read all bands and the left image at ``shape`` pixels: bands subsampled, the image averaged; no truth."""
         with self.unchanged():
             layers = (read_small_layers(self.out / name, shape) for name in ("intervals.tif", "validity.tif"))
             bands = Bands(*(layer for of_file in layers for layer in of_file))
         return bands._replace(image=read_small_image(self.left, self.region, shape))
 
     def low(self, bands: Bands) -> np.ndarray:
-        """Pixels of low confidence (paper eq. 12 and 13) of whole rows.
+        """Return the mask of low-confidence pixels (paper eq. 12 and 13) of whole rows.
 
-        Where the run did not regularise, by the default settings of regularisation.
+        A run without regularisation uses its default settings.
         """
         settings = self.config.regularization or Regularization()
         return np.asarray(low_confidence(bands.confidence, settings.threshold, settings.kernel))
 
     def read_small_left(self, window: Window, shape: tuple[int, int]) -> np.ndarray:
-        """The left image under a window of the results, as ``shape`` pixels."""
+        """Read the left image under a window of the results at ``shape`` pixels."""
         place = Window(self.region.row + window.row, self.region.column + window.column, window.height, window.width)
         return read_small_image(self.left, place, shape)
 
     def check_pixel(self, row: int, column: int) -> None:
-        """Hold that a pixel is one of the results."""
+        """Raise if a pixel is outside the results."""
         height, width = self.shape
         if not (0 <= row < height and 0 <= column < width):
             raise SatIntervalsError(
@@ -194,22 +182,22 @@ class Results(Run):
             )
 
     def check_part(self, row: int, columns: tuple[int, int] | None) -> tuple[int, int]:
-        """Hold that a part of a row is one of the results; returns its first and last column, None being all."""
+        """Raise if a part of a row is outside the results; return its first and last column (None means all)."""
         first, last = columns or (0, self.region.width - 1)
         self.check_pixel(row, first)
         self.check_pixel(row, last)
         if first > last:
-            raise SatIntervalsError(f"columns {first} to {last} are the wrong way round: give the first one first")
+            raise SatIntervalsError(f"columns {first} to {last} are in the wrong order: give the smaller one first")
         return first, last
 
 
 def open_run(out: str | Path) -> Run:
-    """Look at the folder of a finished run: ``intervals.tif``, ``validity.tif`` and ``run.json``; no image is needed.
+    """Open the folder of a finished run: ``intervals.tif``, ``validity.tif`` and ``run.json``. Images are not needed.
 
     Raises
     ------
     SatIntervalsError
-        No finished run, or files that do not belong together.
+        The folder is not a finished run, or its files do not belong together.
     """
     out = Path(out)
     file = out / "run.json"
@@ -221,59 +209,67 @@ def open_run(out: str | Path) -> Run:
         for side in ("left", "right"):
             _check_input(report["inputs"][side])
         region = Window(**{name: index(report["tiles"]["region"][name]) for name in _REGION})
-        sizes = {name: index(told["bytes"]) for name, told in report.get("files", {}).items()}
+        files = {
+            name: {key: index(file[key]) for key in ("bytes", "crc32")}
+            for name, file in report.get("files", {}).items()
+        }
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
-        raise SatIntervalsError(f"{file} is not the report of a run: run match again with --overwrite") from error
+        raise SatIntervalsError(f"{file} is not the report of a run: rerun match with --overwrite") from error
     for name, bands in _BANDS.items():
-        _check_raster(out / name, bands, region, sizes.get(name))
+        _check_raster(out / name, bands, region, files.get(name))
     return Run(out, report, config, region, which)
 
 
 def _which(file: Path) -> tuple[int, int] | None:
-    """What tells a file from one that replaces it; None where there is none."""
+    """Return the identity of a file, which changes when it is replaced; None if it is missing."""
     with suppress(OSError):
         status = file.stat()
         return status.st_ino, status.st_mtime_ns
     return None
 
 
-def _files_told(told: Any) -> Iterator[str]:
-    """The paths of all files that a report tells of its inputs."""
-    for value in told.values() if isinstance(told, dict) else told if isinstance(told, list) else ():
-        yield from _files_told(value)
-    if isinstance(told, dict) and isinstance(told.get("path"), str):
-        yield told["path"]
+def _input_files(inputs: Any) -> Iterator[str]:
+    """Yield the paths of all files in the section ``inputs`` of a report, at any depth."""
+    for value in inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, list) else ():
+        yield from _input_files(value)
+    if isinstance(inputs, dict) and isinstance(inputs.get("path"), str):
+        yield inputs["path"]
 
 
-def _check_input(told: dict[str, Any]) -> None:
-    """Hold that a report tells of an image what is needed to open it again."""
-    Path(told["path"])
+def _check_input(record: dict[str, Any]) -> None:
+    """Raise if a report lacks what is needed to reopen an image."""
+    Path(record["path"])
     for name in ("band", "height", "width"):
-        index(told[name])
-    _nodata(told)
-    if told["mask"] is not None:
-        Path(told["mask"]["path"])
+        index(record[name])
+    _nodata(record)
+    if record["mask"] is not None:
+        Path(record["mask"]["path"])
 
 
-def _nodata(told: dict[str, Any]) -> float | None:
-    return None if told["nodata"] is None else float(told["nodata"])
+def _nodata(record: dict[str, Any]) -> float | None:
+    return None if record["nodata"] is None else float(record["nodata"])
 
 
-def _check_raster(file: Path, bands: int, region: Window, size: int | None) -> None:
-    """Hold that a raster is there, and what the report of its run tells; of other versions it tells no size."""
+def _check_raster(file: Path, bands: int, region: Window, published: dict[str, int] | None) -> None:
+    """Raise if a raster is missing, or differs in shape or bytes from the report of its run.
+
+    GDAL decodes most flipped bits of a compressed block without an error. Earlier versions wrote no checksums.
+    """
     if not file.exists():
-        raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or run match again")
-    if size not in (None, file.stat().st_size):
-        raise _damaged(file, f"has {file.stat().st_size} bytes, by run.json {size}")
+        raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or rerun match")
+    if published and published["bytes"] != file.stat().st_size:
+        raise _damaged(file, f"has {file.stat().st_size} bytes, by run.json {published['bytes']}")
+    if published and published != checksum_of(file):
+        raise _damaged(file, "is not what the run published")
     found, needed = read_shape(file), (bands, region.height, region.width)
     if found != needed:
         raise SatIntervalsError(
-            f"{file} has {found[0]} bands of {found[1]} x {found[2]} pixels, by run.json {needed[0]} of {needed[1]} x "
-            f"{needed[2]}: run match again with --overwrite"
+            f"{file} has {found[0]} bands of {found[1]} x {found[2]} pixels, but run.json says {needed[0]} of "
+            f"{needed[1]} x {needed[2]}: rerun match with --overwrite"
         )
 
 
@@ -284,20 +280,20 @@ def _damaged(file: Path, how: str) -> SatIntervalsError:
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
-    """Look at the folder of a finished run and at its images.
+    """Open the folder of a finished run, its images and its truth.
 
     Parameters
     ----------
     out
         Folder of ``intervals.tif``, ``validity.tif`` and ``run.json``.
     truth
-        True disparity of the left image, or of the region that was matched; by default ``truth.tif`` beside the left
-        image, if there is one.
+        True disparity of the left image or of the matched region; by default ``truth.tif`` beside the left image, if it
+        exists.
 
     Raises
     ------
     SatIntervalsError
-        No finished run, images that are no longer those it matched, or a truth of another size.
+        The folder is not a finished run, an image has changed since, or the truth has another size.
     """
     run = open_run(out)
     left, right = (_opened(run.report["inputs"][side]) for side in ("left", "right"))
@@ -307,18 +303,16 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     return Results(run.out, run.report, run.config, run.region, run.which, left, right, layer)
 
 
-def _opened(told: dict[str, Any]) -> Image:
-    """An input again, as the run read it."""
-    mask = told["mask"]
-    image = open_image(told["path"], band=told["band"], nodata=_nodata(told), mask=mask and mask["path"])
-    if (image.height, image.width) != (told["height"], told["width"]):
+def _opened(record: dict[str, Any]) -> Image:
+    """Reopen an input image; raise if it has changed since the run."""
+    mask = record["mask"]
+    image = open_image(record["path"], band=record["band"], nodata=_nodata(record), mask=mask and mask["path"])
+    if (image.height, image.width) != (record["height"], record["width"]):
         raise SatIntervalsError(
-            f"{image.path} has {image.height} x {image.width} pixels, when it was matched it had "
-            f"{told['height']} x {told['width']}: put that image back or match again"
+            f"{image.path} has {image.height} x {image.width} pixels, but had {record['height']} x {record['width']} "
+            "when it was matched: restore that image or match again"
         )
-    for file in (told, *told.get("files", ()), *([mask] if mask else [])):
+    for file in (record, *record.get("files", ()), *([mask] if mask else [])):
         if is_changed(file["path"], file):
-            raise SatIntervalsError(
-                f"{file['path']} is not the file that was matched: put that image back or match again"
-            )
+            raise SatIntervalsError(f"{file['path']} has changed since it was matched: restore it or match again")
     return image

@@ -1,4 +1,4 @@
-"""Cores, overlaps and margins: which pixels a tile keeps, which it needs. Pure geometry."""
+"""Geometry of windows and tiles: which pixels a tile owns and which it needs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,26 +15,26 @@ class Window:
 
     @property
     def row_stop(self) -> int:
-        """The row after the last."""
+        """Return the row after the last."""
         return self.row + self.height
 
     @property
     def column_stop(self) -> int:
-        """The column after the last."""
+        """Return the column after the last."""
         return self.column + self.width
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """The window as an index into a ``(row, column)`` array."""
+        """Return the index of the window into a ``(row, column)`` array."""
         return slice(self.row, self.row_stop), slice(self.column, self.column_stop)
 
     def grown(self, rows: int, columns: int | tuple[int, int]) -> "Window":
-        """The window with ``rows`` more above and below and ``columns`` more left and right (or one figure each)."""
+        """Return the window grown by ``rows`` above and below and ``columns`` (or a pair) left and right."""
         left, right = columns if isinstance(columns, tuple) else (columns, columns)
         return Window(self.row - rows, self.column - left, self.height + 2 * rows, self.width + left + right)
 
     def clipped(self, other: "Window") -> "Window":
-        """The part of the window inside ``other``; of zero size where they do not meet."""
+        """Return the intersection with ``other``; its size is zero if they do not overlap."""
         row, column = max(self.row, other.row), max(self.column, other.column)
         return Window(
             row,
@@ -44,13 +44,13 @@ class Window:
         )
 
     def relative_to(self, origin: "Window") -> "Window":
-        """The same pixels, counted from the first pixel of ``origin``."""
+        """Return the same pixels, counted from the first pixel of ``origin``."""
         return Window(self.row - origin.row, self.column - origin.column, self.height, self.width)
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One task: the core it owns and its place in the grid."""
+    """One task: its place in the grid and its core, the pixels it owns."""
 
     grid_row: int
     grid_column: int
@@ -58,25 +58,25 @@ class Tile:
 
     @property
     def name(self) -> str:
-        """How records, messages and reports call the tile."""
+        """Return the name of the tile in records, messages and reports."""
         return f"{self.grid_row}_{self.grid_column}"
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The tiles of a region of the left image: every pixel of the region lies in exactly one core."""
+    """The tiles of a region of the left image: each pixel of the region belongs to exactly one core."""
 
     region: Window
     size: int
 
     @property
     def rows(self) -> int:
-        """Number of rows of tiles."""
+        """Return the number of rows of tiles."""
         return -(-self.region.height // self.size)
 
     @property
     def columns(self) -> int:
-        """Number of columns of tiles."""
+        """Return the number of columns of tiles."""
         return -(-self.region.width // self.size)
 
     def __len__(self) -> int:
@@ -86,14 +86,14 @@ class Grid:
         return (self.tile(row, column) for row in range(self.rows) for column in range(self.columns))
 
     def tile(self, grid_row: int, grid_column: int) -> Tile:
-        """The tile at a place of the grid."""
+        """Return the tile at a grid position."""
         row = self.region.row + grid_row * self.size
         column = self.region.column + grid_column * self.size
         return Tile(grid_row, grid_column, Window(row, column, self.size, self.size).clipped(self.region))
 
 
 def strips(height: int, width: int, pixels: int) -> Iterator[Window]:
-    """Windows of whole rows, from the top, of no more pixels; of as many rows as the blocks of our files, or fewer."""
+    """Yield windows of whole rows from the top: at most ``pixels`` pixels and 512 rows, if possible 64 n rows."""
     rows = min(512, max(1, pixels // width))
     rows = rows // 64 * 64 or rows
     for row in range(0, height, rows):
@@ -101,9 +101,9 @@ def strips(height: int, width: int, pixels: int) -> Iterator[Window]:
 
 
 def facing(window: Window, minimum: int, maximum: int) -> Window:
-    """The right pixels that face a left window over the search range.
+    """Return the window of right pixels that are candidates of a left window over the search range.
 
-    The first column is the one that faces the window's first column at ``minimum``: with arrays cut so,
-    ``right[r, c + k]`` faces ``left[r, c]`` for disparity index ``k``.
+    Its first column is the candidate of the left window's first column at disparity ``minimum``. In arrays cut this
+    way, ``right[r, c + k]`` is the candidate of ``left[r, c]`` at disparity index ``k``.
     """
     return Window(window.row, window.column + minimum, window.height, window.width + maximum - minimum)

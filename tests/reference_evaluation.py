@@ -20,6 +20,8 @@ def evaluate(scene, rules, remove_bias=False, with_rejected=False):
     report = figures(scene, rules, pixels(known & scene.valid), bias)
     report["bias"] = bias if remove_bias else None
     report["tolerance"] = rules.tolerance
+    truths = [float(scene.truth[p]) for p in pixels(known & scene.valid)]
+    report["truth_is_whole"] = bool(truths) and all(truth.is_integer() for truth in truths)
     report["with_rejected"] = figures(scene, rules, pixels(known), bias) if with_rejected else None
     return report
 

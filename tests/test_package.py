@@ -20,12 +20,25 @@ def test_package__is_imported_without_its_libraries() -> None:
 
 def test_package__public_names_exist() -> None:
     assert set(sat_intervals._HOMES) == set(sat_intervals.__all__) - {"__version__"}
-    assert set(sat_intervals.__all__) <= set(dir(sat_intervals))
+    assert dir(sat_intervals) == sorted(sat_intervals.__all__)
     assert sat_intervals.__version__ == PYPROJECT["project"]["version"]
     for name in sat_intervals._HOMES:
         assert getattr(sat_intervals, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'match_pairs'"):
         _ = sat_intervals.match_pairs
+
+
+def test_package__public_names_load_without_extras() -> None:
+    script = """
+import sys
+sys.modules["shareloc"] = sys.modules["matplotlib"] = None
+from sat_intervals import *
+try:
+    triangulate("out", *"abcd")
+except SatIntervalsError as error:
+    print(error)
+"""
+    assert run_python(script) == "triangulation needs shareloc: pip install 'sat-intervals[dsm]'\n"
 
 
 def test_packages__equal_the_folders() -> None:

@@ -1,4 +1,4 @@
-"""What a user may set: its default, its range, its one-line meaning, and the thresholds that follow."""
+"""Settings: defaults, ranges, one-line descriptions and derived thresholds."""
 
 from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text

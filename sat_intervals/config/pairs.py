@@ -1,4 +1,4 @@
-"""Lists of pairs: those of known truth, which evaluation takes, and those of a batch."""
+"""Read lists of pairs: pairs with known truth for evaluation, and pairs of a batch."""
 
 import csv
 import io
@@ -19,19 +19,19 @@ _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
 _COLUMNS = ("left", "right", "truth", "minimum", "maximum")
 NO_GROUP = "all"
 
-# In the folder of a batch: how its pairs ended, and the logs of jobs; no pair is called so.
+# Report of a batch, in its folder. No pair may have its name or that of the folder of job logs.
 REPORT = "batch.json"
-_TAKEN = (REPORT, "logs")
-# Bytes of the name of a pair: those of a folder are 255 at most, and a store adds a digest.
+_RESERVED = (REPORT, "logs")
+# Bytes of a pair's name: a folder's name has at most 255, and a store adds a digest.
 _LONGEST_NAME = 200
 _IMAGES = ("left", "right", "left_mask", "right_mask")
-# Nodes of a list of pairs in YAML or JSON, which may have thousands of rows.
+# YAML nodes allowed in a list of pairs, which may have thousands of rows.
 _NODES = 200_000
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two epipolar images, their true disparity and the range in which to search it, both ends included."""
+    """Two epipolar images, their true disparity and the search range, both ends included."""
 
     name: str
     group: str
@@ -44,7 +44,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairOfBatch:
-    """One row of a batch: a name, its images, and the settings that are its own, as nested sections."""
+    """One row of a batch: name, images, and the pair's own settings as nested sections."""
 
     name: str
     left: str
@@ -55,34 +55,34 @@ class PairOfBatch:
 
 
 def is_pair(path: Path) -> bool:
-    """Whether a path looks like a folder of a pair, or a CSV file of pairs."""
+    """Return whether a path looks like the folder of a pair or a CSV file of pairs."""
     return path.suffix == ".csv" or (path / "left.tif").exists()
 
 
 def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
-    """Pairs from folders and CSV files, in their order.
+    """Read pairs from folders and CSV files, in their order.
 
     A folder holds ``left.tif``, ``right.tif``, ``truth.tif`` and ``meta.json`` with ``disparity``, the search range
-    ``[minimum, maximum]``, and, if it pleases, ``group``. A CSV file has a header of the columns left, right, truth,
-    minimum, maximum and, if it pleases, name and group; its paths are relative to the file.
+    ``[minimum, maximum]``, and optionally ``group``. A CSV file has a header with the columns left, right, truth,
+    minimum, maximum and optionally name and group; its paths are relative to the file.
 
     Raises
     ------
     SatIntervalsError
-        What is missing, and where.
+        Names the file or row and what is missing there.
     """
     pairs = []
     for path in map(Path, paths):
         pairs += _of_table(path) if path.suffix == ".csv" else [_of_folder(path)]
     check_names(pair.name for pair in pairs)
-    for pair, count in Counter(map(_unnamed, pairs)).items():
+    for pair, count in Counter(map(_without_name, pairs)).items():
         if count > 1:
             raise SatIntervalsError(f"the pair of {pair.left} is given {count} times: give it once")
     return pairs
 
 
 def read_batch(file: Path) -> list[PairOfBatch]:
-    """Pairs of a CSV, YAML or JSON file.
+    """Read the pairs of a batch from a CSV, YAML or JSON file.
 
     A row has ``name``, ``left`` and ``right``; ``minimum`` and ``maximum``, the search range; ``left_mask`` and
     ``right_mask``; and any setting under its dotted name, such as ``sgm.p2``. YAML and JSON hold a list of such rows,
@@ -91,7 +91,7 @@ def read_batch(file: Path) -> list[PairOfBatch]:
     Raises
     ------
     SatIntervalsError
-        With file, row and what is wrong there.
+        Names the file, the row and the error.
     """
     pairs = [_of_batch(place, row, file) for place, row in _rows(file, ("name", "left", "right"))]
     check_names((pair.name for pair in pairs), f"{file}: ")
@@ -99,20 +99,20 @@ def read_batch(file: Path) -> list[PairOfBatch]:
 
 
 def check_names(names: Iterable[str], where: str = "") -> None:
-    """Refuse a name that is given twice; ``where`` begins the message."""
+    """Raise if names are not unique; ``where`` begins the message."""
     for name, count in Counter(names).items():
         if count > 1:
             raise SatIntervalsError(f"{where}{count} pairs or runs are called {name}: give each its own name")
 
 
-def _unnamed(pair: Pair) -> Pair:
-    """What a pair is, whatever it is called and from wherever its files are named."""
+def _without_name(pair: Pair) -> Pair:
+    """Return a pair with resolved paths and without name and group, for comparison."""
     left, right, truth = (path.resolve() for path in (pair.left, pair.right, pair.truth))
     return replace(pair, name="", group="", left=left, right=right, truth=truth)
 
 
 def group_beside(image: str | Path) -> str:
-    """The group that the ``meta.json`` beside an image names; NO_GROUP where there is none."""
+    """Return the group in the ``meta.json`` beside an image, NO_GROUP without one."""
     meta = Path(image).parent / "meta.json"
     return str(_meta(meta).get("group", NO_GROUP)) if meta.exists() else NO_GROUP
 
@@ -162,14 +162,13 @@ def _of_table(file: Path) -> list[Pair]:
 def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
     name = str(row.pop("name"))
     if "cluster" in (str(key).split(".")[0] for key in row):
-        raise SatIntervalsError(f"{place}: cluster is one for all pairs: give it by --config or --cluster")
+        raise SatIntervalsError(f"{place}: all pairs share one cluster: set it with --config or --cluster")
     is_name = name.isprintable() and len(name.encode()) <= _LONGEST_NAME and os.sep not in name
-    if not is_name or name.startswith(".") or name in _TAKEN:
+    if not is_name or name.startswith(".") or name in _RESERVED:
         raise SatIntervalsError(
-            f"{place}: name {name!r} cannot be that of the pair's folder, take another, of {_LONGEST_NAME} bytes at "
-            "most"
+            f"{place}: name {name!r} cannot be a folder's name: choose another of at most {_LONGEST_NAME} bytes"
         )
-    images = {key: _beside(file, str(row.pop(key))) for key in _IMAGES if key in row}
+    images = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
     settings: dict[str, Any] = {}
     for key, value in row.items():
         try:
@@ -180,27 +179,27 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
 
 
 def _set(settings: dict[str, Any], key: str, value: Any) -> None:
-    """Set a setting under its dotted name; texts, such as all cells of a CSV, are YAML."""
+    """Set a setting by its dotted name; text, such as a cell of a CSV file, is parsed as YAML."""
     *sections, last = key.split(".")
     for section in sections:
         settings = settings.setdefault(section, {})
         if not isinstance(settings, dict):
-            raise ValueError(f"the row gives {section} as a whole too")
+            raise ValueError(f"the row also gives {section} as a whole")
     if last in settings:
-        raise ValueError(f"the row gives parts of {last} too" if isinstance(settings[last], dict) else "given twice")
+        raise ValueError(f"the row also gives parts of {last}" if isinstance(settings[last], dict) else "given twice")
     settings[last] = load_yaml(value) if isinstance(value, str) else value
 
 
-def _beside(file: Path, path: str) -> str:
+def _relative_to(file: Path, path: str) -> str:
     return path if "://" in path or path.startswith("/vsi") else str(file.parent / path)
 
 
 def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
-    """The rows of a CSV, YAML or JSON file without their empty values, each behind its place, file and number."""
-    wanted = f"needed is a row a pair, with {', '.join(needed)}"
+    """Read the rows of a CSV, YAML or JSON file without empty values; each comes after its place in the file."""
+    wanted = f"give a list of pairs, each with {', '.join(needed)}"
     try:
         if file.suffix.lower() == ".csv":
-            rows = _rows_of_csv(read_small(file, LARGEST_TABLE).decode("utf-8-sig"))  # spreadsheets begin with a mark
+            rows = _rows_of_csv(read_small(file, LARGEST_TABLE).decode("utf-8-sig"))  # with a byte order mark
         else:
             rows = load_yaml(read_small(file).decode("utf-8-sig"), _NODES)
     except SatIntervalsError:
@@ -225,5 +224,5 @@ def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]
 def _rows_of_csv(text: str) -> list[Any]:
     rows = csv.DictReader(io.StringIO(text, newline=""))
     if twice := [name for name, count in Counter(rows.fieldnames or ()).items() if count > 1]:
-        raise ValueError(f"column {twice[0]} is there twice")
+        raise ValueError(f"column {twice[0]} appears twice")
     return list(rows)

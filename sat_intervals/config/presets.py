@@ -1,4 +1,4 @@
-"""Settings that come with the package under a name, and what is given beside them."""
+"""Presets, and how they combine with the user's settings."""
 
 from collections.abc import Mapping
 from importlib import resources
@@ -6,24 +6,24 @@ from typing import Any
 
 import yaml
 
-# The default, whose settings are the defaults of all sections, first.
+# The first is the default: its settings are the defaults of all sections.
 PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homogeneous", "mccnn")
 
 
 def preset_text(name: str = PRESETS[0]) -> str:
-    """Return the file of a preset: complete, commented YAML."""
+    """Return the YAML of a preset, complete and commented."""
     return (resources.files("sat_intervals.configs") / f"{name}.yaml").read_text(encoding="utf-8")
 
 
 def with_preset(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Complete settings with those of the preset that they name; what is given beside it wins, key by key.
+    """Complete settings with those of the preset that they name; explicit settings win, key by key.
 
-    The search range is never that of a preset. Where another matching cost is given, cost and penalties of the preset
-    do not fit and are left out; where another kind of penalties is given, all but p1 and p2; where other penalties are
-    given without their span, the span.
+    The preset's search range is never used. If the settings choose another matching cost, the preset's cost and
+    penalties are dropped; with another kind of penalties, all but p1 and p2; with other penalties and no span, the
+    span.
     """
     name = values.get("preset", PRESETS[0])
-    if name == PRESETS[0] or name not in PRESETS:  # the defaults; or to be refused
+    if name == PRESETS[0] or name not in PRESETS:  # the defaults, or refused later
         return dict(values)
     preset = _settings(name)
     sgm, own = values.get("sgm"), preset["sgm"]
@@ -36,13 +36,13 @@ def with_preset(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settings(name: Any) -> dict[str, Any]:
-    """What a preset sets, without its search range; nothing for an unknown one."""
+    """Return the settings of a preset without its search range; empty if the preset is unknown."""
     values = yaml.safe_load(preset_text(name)) if name in PRESETS else {}
     return {key: value for key, value in values.items() if key != "disparity"}
 
 
 def without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The settings without cost and penalties where the overrides choose another method, whose keys are others."""
+    """Return the settings without cost and penalties if the overrides choose another matching cost."""
 
     def method(settings: Mapping[str, Any]) -> Any:
         cost = settings.get("cost")
@@ -58,7 +58,7 @@ def without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) 
 
 
 def merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Both, the second winning key by key."""
+    """Return both mappings merged; the second wins, key by key."""
     both = dict(values)
     for key, value in overrides.items():
         below = both.get(key)

@@ -1,4 +1,4 @@
-"""Settings from YAML files, mappings and the command line."""
+"""Read settings from YAML files, mappings and the command line."""
 
 import logging
 from collections.abc import Mapping
@@ -15,8 +15,8 @@ from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import explained, shown
 from sat_intervals.errors import SatIntervalsError, check_regular
 
-# Bytes of a file of settings or pairs, and of one of pairs in CSV. Nodes of YAML of a file of settings, where an alias
-# counts as what it repeats.
+# Largest size in bytes of a file of settings or pairs, and of a CSV file of pairs; YAML nodes of a file of settings,
+# aliases expanded.
 _LARGEST_FILE, LARGEST_TABLE, _NODES = 10**6, 10**7, 10_000
 
 _LOG = logging.getLogger(__name__)
@@ -33,17 +33,17 @@ def load_config(
     Parameters
     ----------
     source
-        A YAML file, a mapping of sections, or settings checked before; None for the defaults. ``preset`` names the
-        settings that fill in what is left out.
+        A YAML file, a mapping of sections, or a checked Config; None for the defaults. ``preset`` names the settings
+        that fill in missing keys.
     overrides
-        Sections and keys that win over ``source``, as those of the command line do.
+        Sections and keys that win over ``source``, such as those of the command line.
     preset_wins
-        Whether ``preset`` does too; else two that differ are refused.
+        Whether the overrides' ``preset`` wins too; otherwise two different presets are refused.
 
     Raises
     ------
     ConfigError
-        All that is wrong, in one line.
+        Lists all errors in one line.
     """
     overrides = overrides or {}
     values: Mapping[str, Any] = {}
@@ -57,8 +57,8 @@ def load_config(
             values = source.model_dump()
             if overrides.get("preset") not in (None, source.preset):
                 raise ConfigError(
-                    f"preset {shown(overrides['preset'])} would change nothing of a Config, which has all "
-                    "settings: give it with those that the Config was made from"
+                    f"preset {shown(overrides['preset'])} has no effect on a Config, which is complete: give it with "
+                    "the settings that the Config is made from"
                 )
         case Mapping():
             values = source
@@ -73,17 +73,17 @@ def load_config(
     except ValidationError as error:
         problems = error.errors(include_url=False)
         if all(_given(overrides, problem["loc"]) for problem in problems):
-            file = ""  # not to blame for what the overrides brought
+            file = ""  # the errors are in the overrides
         raise ConfigError(file + "; ".join(map(explained, problems))) from error
     if "sgm" not in settings and (better := f"{config.preset}-{config.cost.method}") in PRESETS:
         _warn(
-            f"preset {config.preset} sets no penalties for cost.method {config.cost.method}, whose defaults are taken: "
-            f"--preset {better} has some for such images"
+            f"preset {config.preset} has no penalties for cost.method {config.cost.method}, so defaults are used: "
+            f"--preset {better} has penalties for such images"
         )
     return config
 
 
-@lru_cache  # once for all pairs of a batch
+@lru_cache  # once per batch
 def _warn(line: str) -> None:
     _LOG.warning(line)
 
@@ -93,14 +93,13 @@ def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
         if not isinstance(overrides, Mapping) or key not in overrides:
             return False
         overrides = overrides[key]
-    return bool(path)  # an error without a path is between sections
+    return bool(path)  # an error without a path concerns several sections
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's safe subset with a bounded number of nodes, where a key given twice is an error.
+    """Safe YAML loader that refuses duplicate keys and more than a given number of nodes.
 
-    Plain YAML keeps the last of two keys without a word, and some lines of aliases in aliases or merge keys fill any
-    memory.
+    Plain YAML silently keeps the last of two keys, and a few lines of nested aliases or merge keys can fill the memory.
     """
 
     def __init__(self, text: str | bytes, most: int) -> None:
@@ -113,7 +112,7 @@ class _Loader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         self._nodes += self._sizes.get(id(node), 1) if isinstance(event, yaml.AliasEvent) else 1
         if self._nodes > self._most:
-            problem = f"more than {self._most} values, those that aliases repeat included: give fewer"
+            problem = f"more than {self._most} values, aliases expanded: give fewer"
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
         self._sizes.setdefault(id(node), self._nodes - before)
         return node
@@ -131,12 +130,12 @@ class _Loader(yaml.SafeLoader):
 
 
 def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
-    """What a text of YAML holds; a key given twice is an error, and so are more than ``most`` nodes.
+    """Parse YAML; duplicate keys and more than ``most`` nodes are errors.
 
     Raises
     ------
     yaml.YAMLError, ValueError, RecursionError
-        For what is none.
+        The text is not valid YAML.
     """
     loader = _Loader(text, most)
     try:
@@ -146,14 +145,14 @@ def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
 
 
 def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:
-    """Content of a file of settings or pairs, of ``most`` bytes.
+    """Read a file of settings or pairs of at most ``most`` bytes.
 
     Raises
     ------
     OSError
-        For a file that cannot be read.
+        The file cannot be read.
     SatIntervalsError
-        For a larger one, and for what is no regular file.
+        The file is larger, or not a regular file.
     """
     check_regular(file)
     with file.open("rb") as stream:
@@ -168,7 +167,7 @@ def _read_yaml(file: Path) -> Mapping[str, Any]:
         values = load_yaml(read_small(file))
     except OSError as error:
         preset = isinstance(error, FileNotFoundError) and file.suffix == ".yaml" and file.stem in PRESETS
-        hint = f" (--preset {file.stem} takes it from the package)" if preset else ""
+        hint = f" (give --preset {file.stem} for the preset of the package)" if preset else ""
         raise ConfigError(f"{file}: {error.strerror}{hint}") from error
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""

@@ -1,4 +1,4 @@
-"""Sections of the settings that stand for themselves: what may be set, from where to where, and what it means."""
+"""Sections of the settings: names, ranges and meanings."""
 
 import json
 import os
@@ -24,30 +24,30 @@ from sat_intervals.products import COSINE_STEPS
 
 
 class ConfigError(SatIntervalsError):
-    """Settings that cannot be used: the message names the file, the key, its value and what is allowed."""
+    """Invalid settings; the message names the file, the key, its value and the allowed values."""
 
 
 def check_odd(value: int) -> int:
-    """Refuse even numbers."""
+    """Raise if a number is even."""
     if value % 2 == 0:
         raise PydanticCustomError("odd", "must be odd")
     return value
 
 
 def as_written(value: Any) -> Any:
-    """The shortest decimal of a float is what was typed: 0.9, where the float is 0.90000000000000002."""
+    """Return the shortest decimal of a float, as the user typed it: 0.9 and not 0.90000000000000002."""
     return Decimal(repr(value)) if type(value) in (int, float) else value
 
 
 Odd = Annotated[int, AfterValidator(check_odd)]
-# A number whose thresholds must be exact; a plain number in JSON, so that a run's settings can be read back.
+# A number whose thresholds must be exact; a plain number in JSON, so that settings of a run can be read back.
 Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(float, when_used="json")]
-# Disparities are stored as int16; within this limit the difference of any two of them fits as well.
+# Disparities are stored as int16; within this limit the difference of any two also fits.
 Pixels = Annotated[int, Field(ge=-16000, le=16000)]
 
 
 class Section(BaseModel):
-    """Settings that belong together: immutable; unknown keys, other types and NaN are refused."""
+    """Base class of sections: immutable; unknown keys, wrong types and NaN are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -67,21 +67,28 @@ class Disparity(Section):
 
     @property
     def count(self) -> int:
-        """Number of candidates of a pixel."""
+        """Return the number of candidate disparities."""
         return self.maximum - self.minimum + 1
 
     def check_images(self, left: str, left_columns: int, right: str, right_columns: int) -> None:
-        """Hold that images, ``left`` and ``right`` in messages, can be searched over this range.
+        """Raise if no pixel of the left image has a candidate in the right one.
+
+        Parameters
+        ----------
+        left, right
+            Names of the images, for the message.
+        left_columns, right_columns
+            Widths in pixels.
 
         Raises
         ------
         ConfigError
-            No pixel of the left has a candidate in the right.
+            Names the range and both images.
         """
         if left_columns - 1 + self.maximum < 0 or self.minimum > right_columns - 1:
             raise ConfigError(
-                f"disparities {self.minimum} to {self.maximum} lead every pixel of {left}, {left_columns} columns, out "
-                f"of {right}, {right_columns}: check their sign, x_right = x_left + disparity"
+                f"disparities {self.minimum} to {self.maximum} move every pixel of {left} ({left_columns} columns) "
+                f"outside {right} ({right_columns} columns): check their sign, x_right = x_left + disparity"
             )
 
     @model_validator(mode="after")
@@ -99,70 +106,70 @@ class Census(Section):
 
     @property
     def steps(self) -> int:
-        """Integer costs to a unit of the settings: a bit."""
+        """Return the quantisation levels per unit of cost, a bit."""
         return 1
 
     @property
     def largest(self) -> int:
-        """The largest integer cost."""
+        """Return the largest integer cost."""
         return self.window**2 - 1
 
     @property
     def ceiling(self) -> int:
-        """From which the cost of impossible candidates is counted, as libSGM does."""
+        """Return the base of the cost of impossible candidates, as in libSGM."""
         return self.window**2
 
 
 class Mccnn(Section):
-    """Matching cost: 1 - cosine of the features of a network, MC-CNN fast (Zbontar and LeCun 2016)."""
+    """Matching cost: 1 - cosine of features of the network MC-CNN fast (Zbontar and LeCun 2016)."""
 
     method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
-    weights: str | None = Field(None, description="ONNX file of the network; null: the one of the extra [mccnn]")
+    weights: str | None = Field(None, description="ONNX file of the network; null: that of the extra [mccnn]")
 
     @field_validator("weights")
     @classmethod
-    def _name_wholly(cls, value: str | None) -> str | None:
-        return None if value is None else os.path.abspath(value)  # wherever a worker stands
+    def _make_absolute(cls, value: str | None) -> str | None:
+        return None if value is None else os.path.abspath(value)  # workers may have another working directory
 
     @property
     def window(self) -> int:
-        """Side of what a feature sees, in pixels."""
+        """Return the side of the receptive field of a feature, in pixels."""
         return 11
 
     @property
     def steps(self) -> int:
-        """Integer costs to a unit of the settings: of the cosine."""
+        """Return the quantisation levels per unit of cost, a unit of the cosine."""
         return COSINE_STEPS
 
     @property
     def largest(self) -> int:
-        """The largest integer cost."""
+        """Return the largest integer cost."""
         return 2 * COSINE_STEPS
 
     @property
     def ceiling(self) -> int:
-        """From which the cost of impossible candidates is counted."""
+        """Return the base of the cost of impossible candidates."""
         return self.largest
 
 
 class Ambiguity(Section):
-    """Confidence from the ambiguity of a pixel's costs (Sarrazin et al. 2021)."""
+    """Confidence from the ambiguity of a pixel's cost curve (Sarrazin et al. 2021)."""
 
-    eta_max: Exact = Field(Decimal("0.7"), gt=0, le=1, description="eta, a share of the cost span, stays below this")
-    # At most 1000 levels, so that the ambiguity histograms of tiles stay small.
+    eta_max: Exact = Field(Decimal("0.7"), gt=0, le=1, description="upper limit of eta, a share of the cost span")
+    # At most 1000 levels keep the ambiguity histograms of tiles small.
     eta_step: Exact = Field(
         Decimal("0.01"), ge=Decimal("0.001"), le=1, description="step of eta from 0, at most eta_max"
     )
     normalization: Literal["percentile", "range"] = Field(
-        "percentile", description="by the image's percentiles, or by the largest possible"
+        "percentile", description="by percentiles of the image, or by the largest possible ambiguity"
     )
-    p1: float | None = Field(None, ge=0, description="ambiguity to use as the 1st percentile, with p99")
-    p99: float | None = Field(None, ge=0, description="ambiguity to use as the 99th percentile, with p1")
+    p1: float | None = Field(None, ge=0, description="fixed 1st percentile of the ambiguity, with p99")
+    p99: float | None = Field(None, ge=0, description="fixed 99th percentile of the ambiguity, with p1")
 
     @model_validator(mode="after")
     def _check_together(self) -> Self:
         if self.eta_step > self.eta_max:
-            raise ValueError(f"eta_step {self.eta_step} is above eta_max {self.eta_max}")
+            raise ValueError(f"eta_step {self.eta_step} is above eta_max {self.eta_max}: give a smaller step")
         if self.p1 is None and self.p99 is None:
             return self
         if self.p1 is None or self.p99 is None:
@@ -170,7 +177,7 @@ class Ambiguity(Section):
         if self.p1 > self.p99:
             raise ValueError(f"p1 {self.p1} is above p99 {self.p99}, swap them")
         if self.normalization == "range":
-            raise ValueError("p1 and p99 stand for percentiles: leave them out with normalization range")
+            raise ValueError("p1 and p99 are percentiles: leave them out with normalization range")
         return self
 
 
@@ -183,74 +190,76 @@ class Interval(Section):
 class Refinement(Section):
     """Sub-pixel refinement of the disparity."""
 
-    method: Literal["vfit"] = Field("vfit", description="symmetric V through the costs at and beside the winner")
+    method: Literal["vfit"] = Field("vfit", description="symmetric V through the winner's cost and its neighbours")
 
 
 class CrossCheck(Section):
-    """Rejection of pixels on which the left and the right view disagree."""
+    """Rejection of pixels whose left and right disparities disagree."""
 
     method: Literal["fast", "accurate"] = Field(
-        "fast", description="right view read off the left costs, or matched itself at twice the work"
+        "fast", description="right disparities from the left costs, or matched on their own at twice the work"
     )
-    tolerance: int = Field(1, ge=0, description="largest difference of the two views, in pixels")
+    tolerance: int = Field(1, ge=0, description="largest difference of both disparities, in pixels")
 
 
 class Median(Section):
-    """Median filter on disparity and bounds, over kept pixels (paper, eq. 10 and 11)."""
+    """Median filter of disparity and bounds over valid pixels (paper, eq. 10 and 11)."""
 
     size: Odd = Field(3, ge=3, le=11, description="side of the square window, in pixels")
 
 
 class Regularization(Section):
-    """Intervals of low-confidence pixels from quantiles of the bounds around them."""
+    """Intervals of low-confidence pixels from quantiles of neighbouring bounds."""
 
-    threshold: float = Field(0.6, ge=0, le=1, description="confidence up to this is low")
-    kernel: Odd = Field(5, ge=1, le=101, description="pixels along the row whose least confidence counts")
-    depth: int = Field(2, ge=0, le=16, description="rows reached up and down through touching segments")
-    quantile: float = Field(0.9, ge=0.5, le=1, description="quantile of upper bounds, 1 - quantile of lower ones")
+    threshold: float = Field(0.6, ge=0, le=1, description="confidence at or below this is low")
+    kernel: Odd = Field(5, ge=1, le=101, description="length in pixels of the minimum filter on confidence, along rows")
+    depth: int = Field(2, ge=0, le=16, description="rows above and below that connected segments may reach")
+    quantile: float = Field(0.9, ge=0.5, le=1, description="quantile of upper bounds; 1 - quantile of lower bounds")
 
 
 class Tiles(Section):
-    """How the image is cut for the workers."""
+    """Division of the image into tiles."""
 
-    # Multiples of 64 keep cores aligned with the blocks of the images read and written.
+    # Multiples of 64 align cores with the blocks of the input and output files.
     size: int = Field(
-        1024, ge=64, le=16384, multiple_of=64, description="side of what a tile keeps, in pixels; memory follows it"
+        1024, ge=64, le=16384, multiple_of=64, description="side of a tile's core, in pixels; determines the memory"
     )
-    overlap: int = Field(100, ge=1, le=4096, description="pixels read around it and dropped; more leave fewer seams")
+    overlap: int = Field(
+        100, ge=1, le=4096, description="pixels read around the core and dropped; more give fewer seams"
+    )
 
 
 class Cluster(Section):
-    """Where tiles are matched; nothing here changes the results."""
+    """Where tiles are matched; no effect on the results."""
 
     kind: Literal["threads", "processes", "address", "slurm", "pbs", "lsf", "sge"] = Field(
         "threads", description="of this machine, an existing scheduler, or jobs of a batch system"
     )
-    workers: int | None = Field(None, ge=1, description="tiles in work at once on this machine; null: one a core")
-    address: str | None = Field(None, description="of the dask scheduler, such as tcp://host:8786")
-    jobs: int = Field(1, ge=1, description="jobs of the batch system, the least number where maximum_jobs is set")
-    maximum_jobs: int | None = Field(None, ge=1, description="most jobs, as many as the tiles left keep busy")
-    cores: int = Field(1, ge=1, description="of a job, and tiles it has in work at once")
-    memory: str | None = Field(None, description="of a job, such as 4GB; tiles get smaller until they fit")
-    walltime: str | None = Field(None, description="of a job, such as 01:00:00")
-    queue: str | None = Field(None, description="of the batch system")
-    account: str | None = Field(None, description="that jobs are charged to")
-    directives: list[str] = Field([], description="a list of further directives of the job script, such as --exclusive")
+    workers: int | None = Field(None, ge=1, description="tiles at once on this machine; null: one per core")
+    address: str | None = Field(None, description="address of the dask scheduler, such as tcp://host:8786")
+    jobs: int = Field(1, ge=1, description="jobs of the batch system; the least number if maximum_jobs is set")
+    maximum_jobs: int | None = Field(None, ge=1, description="largest number of jobs; follows the tiles that remain")
+    cores: int = Field(1, ge=1, description="cores of a job, and tiles at once in it")
+    memory: str | None = Field(None, description="memory of a job, such as 4GB; tiles are made smaller until they fit")
+    walltime: str | None = Field(None, description="time limit of a job, such as 01:00:00")
+    queue: str | None = Field(None, description="queue of the batch system")
+    account: str | None = Field(None, description="account that jobs are charged to")
+    directives: list[str] = Field([], description="further directives of the job script, a list such as --exclusive")
     store: str | None = Field(
-        None, description="folder or fsspec URL for tiles until the run is finished; null: in the folder of the run"
+        None, description="folder or fsspec URL for tiles during the run; null: in the folder of the run"
     )
-    retries: int = Field(2, ge=0, description="how often a tile that fails is tried again")
+    retries: int = Field(2, ge=0, description="how often a failed tile is tried again")
 
     @model_validator(mode="after")
     def _check_fit(self) -> Self:
         if (self.kind == "address") != (self.address is not None):
-            raise ValueError("address belongs to kind address, and to no other")
+            raise ValueError("address goes with kind address only: give both or neither")
         if self.maximum_jobs is not None and self.maximum_jobs < self.jobs:
             raise ValueError(f"maximum_jobs {self.maximum_jobs} is below jobs {self.jobs}, swap them")
         return self
 
 
 class Products(Section):
-    """What the written bands hold."""
+    """Content of the output bands."""
 
     keep_rejected: bool = Field(False, description="write values of pixels rejected by cross-checking")

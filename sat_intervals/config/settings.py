@@ -1,4 +1,4 @@
-"""All settings of a run, how their sections fit together, and the integer thresholds that follow from them."""
+"""All settings of a run, checks across sections, and the integer thresholds derived from them."""
 
 from collections.abc import Mapping
 from decimal import Decimal
@@ -33,9 +33,9 @@ SGM_PATHS = 8
 
 
 class Config(Section):
-    """All settings of a run; a section that is None switches its step off."""
+    """All settings of a run; None in place of a section switches its step off."""
 
-    preset: Literal[PRESETS] = Field(PRESETS[0], description="settings that fill in what is left out")  # type: ignore[valid-type]
+    preset: Literal[PRESETS] = Field(PRESETS[0], description="settings for keys that are left out")  # type: ignore[valid-type]
     disparity: Disparity
     cost: Census | Mccnn = Field(Census(), discriminator="method")
     sgm: AnySgm | None = Sgm()
@@ -52,7 +52,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _choose_methods(cls, values: Any) -> Any:
-        """Complete with the preset; where a section does not say its kind: census, and the penalties of the cost."""
+        """Complete with the preset; add the missing kinds of sections: census, and the penalties of the cost."""
         if not isinstance(values, Mapping):
             return values
         values = with_preset(values)
@@ -67,7 +67,7 @@ class Config(Section):
                 if missing := [key for key in ("p1", "p2", "span") if key not in sgm]:
                     raise ValueError(
                         f"sgm lacks {' and '.join(missing)}: constant penalties have no defaults with cost.method "
-                        "mccnn (config --preset satellite-mccnn shows some)"
+                        "mccnn (see config --preset satellite-mccnn)"
                     )
             elif sgm["penalty"] == "constant" and "span" in sgm:
                 raise ValueError(f"sgm.span is given, but with cost.method {method} it follows from p2: leave it out")
@@ -81,10 +81,10 @@ class Config(Section):
         off = [name for name in ("ambiguity", "interval") if getattr(self, name) is None]
         if self.regularization is not None and off:
             raise ValueError(
-                f"regularization needs {' and '.join(off)}, which null switches off: "
-                f"give {' and '.join(off)} or set regularization to null"
+                f"regularization needs {' and '.join(off)}, set to null: give {' and '.join(off)} or set "
+                "regularization to null too"
             )
-        # Neighbouring tiles are compared on a ring of one pixel around the core: windows must be whole there.
+        # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
         if self.tiles.overlap < smallest:
             raise ValueError(
@@ -96,7 +96,7 @@ class Config(Section):
         if isinstance(sgm, CosineSgm | MccnnSgm) != isinstance(self.cost, Mccnn):
             known = "constant or mc_cnn_fast" if isinstance(self.cost, Mccnn) else "constant, negative or inverse"
             raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: {known} with cost.method {self.cost.method}")
-        # The largest uint16 is kept free: it marks the summed cost of an impossible candidate.
+        # The largest uint16 marks the summed cost of an impossible candidate.
         largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.cost.largest
         if self.largest_p2 > largest:
             key = "p2" if sgm.penalty in ("constant", "mc_cnn_fast") else "gamma, the penalty without gradient,"
@@ -110,51 +110,51 @@ class Config(Section):
             )
         is_raw = isinstance(sgm, MccnnSgm) and sgm.gradients == "raw"
         if is_raw and not self.disparity.minimum <= 0 <= self.disparity.maximum:
-            raise ValueError("sgm.gradients raw looks at the right image at disparity 0, which is not searched")
+            raise ValueError("sgm.gradients raw reads the right image at disparity 0: search a range with 0")
 
     @property
     def _cost_in_words(self) -> str:
         return f"cost.window {self.cost.window}" if isinstance(self.cost, Census) else f"cost.method {self.cost.method}"
 
     def in_steps(self, value: Decimal | float | Fraction) -> int:
-        """The nearest integer cost to a value in units of the settings."""
+        """Round a cost in units of the settings to the nearest integer cost."""
         return floor(Fraction(value) * self.cost.steps + Fraction(1, 2))
 
     @property
     def largest_p2(self) -> int:
-        """The largest penalty, as an integer cost; 0 without SGM."""
+        """Return the largest penalty as an integer cost, 0 without SGM."""
         return 0 if self.sgm is None else self.in_steps(self.sgm.largest_p2)
 
     @property
     def impossible_cost(self) -> int:
-        """What an impossible candidate costs inside SGM."""
+        """Return the cost of an impossible candidate inside SGM."""
         return self.cost.ceiling + self.largest_p2 + self.cost.steps
 
     @property
     def largest_sum(self) -> int:
-        """The largest possible cost, after SGM where it is on; the smallest is 0."""
+        """Return the largest possible cost, after SGM if it is on; the smallest is 0."""
         return self.cost.largest if self.sgm is None else SGM_PATHS * (self.cost.largest + self.largest_p2)
 
     @property
     def cost_span(self) -> int:
-        """What etas and alpha are shares of: largest minus smallest possible cost, or what the settings declare.
+        """Return the cost span of etas and alpha: largest minus smallest possible cost, or the setting ``sgm.span``.
 
-        The paper's ``max C_V - min C_V``, declared and not measured: a span measured on a tile would make the result
-        depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they come nowhere near, and
-        differ: see ``span`` in its settings.
+        This is the paper's ``max C_V - min C_V``, declared rather than measured: a span measured on a tile would make
+        the result depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they stay far from
+        them and vary, hence the setting.
         """
         return self.in_steps(self.sgm.span) if isinstance(self.sgm, CosineSgm | MccnnSgm) else self.largest_sum
 
     @property
     def cut_level(self) -> int | None:
-        """Largest ``S(d) - min S`` of the alpha-cut: ``floor((1 - alpha) * cost_span)``; None if off."""
+        """Return the largest ``S(d) - min S`` of the alpha-cut, ``floor((1 - alpha) * cost_span)``; None if off."""
         if self.interval is None:
             return None
         return floor((1 - Fraction(self.interval.alpha)) * self.cost_span)
 
     @property
     def ambiguity_levels(self) -> tuple[int, ...] | None:
-        """Largest ambiguous ``S(d) - min S`` at each eta: ``floor(eta * cost_span)``; None if off."""
+        """Return the largest ambiguous ``S(d) - min S`` of each eta, ``floor(eta * cost_span)``; None if off."""
         if self.ambiguity is None:
             return None
         step = Fraction(self.ambiguity.eta_step)
@@ -163,15 +163,15 @@ class Config(Section):
 
     @property
     def largest_ambiguity(self) -> int:
-        """Ambiguity of a pixel all of whose disparities are ambiguous at every eta; 0 without ambiguity."""
+        """Return the ambiguity of a pixel with all disparities ambiguous at every eta, 0 without ambiguity."""
         return len(self.ambiguity_levels or ()) * self.disparity.count
 
     @property
     def ambiguity_weights(self) -> npt.NDArray[np.uint16] | None:
-        """Table ``(largest_sum + 1,)`` of what a candidate adds to the ambiguity, by its ``S(d) - min S``.
+        """Return the contribution of a candidate to the ambiguity by its ``S(d) - min S``: ``(largest_sum + 1,)``.
 
-        The number of levels at or above it; ``weights[0]``, all of them, is also what an impossible candidate
-        adds. None if off.
+        It is the number of levels at or above that value. An impossible candidate contributes ``weights[0]``, the
+        number of all levels. None if off.
         """
         levels = self.ambiguity_levels
         if levels is None:

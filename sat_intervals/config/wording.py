@@ -1,4 +1,4 @@
-"""What is wrong with settings, and what is allowed, in words made of the settings' own types and bounds."""
+"""Messages about invalid settings, built from the types and bounds of the settings."""
 
 import difflib
 import json
@@ -18,7 +18,7 @@ from sat_intervals.config.settings import Config
 
 
 def allowed(field: FieldInfo) -> str:
-    """Return in words which values a setting takes, from its own type and bounds: ``integer >= 1, odd``."""
+    """Describe the allowed values of a setting from its type and bounds, such as ``integer >= 1, odd``."""
     nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false", str: "text"}
     signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
     kinds = get_args(field.annotation) or (field.annotation,)
@@ -38,23 +38,23 @@ def allowed(field: FieldInfo) -> str:
 
 
 def _sections(annotation: Any) -> list[type[Section]]:
-    """The kinds of section that a field holds."""
+    """Return the kinds of section that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
         return [annotation]
     return [kind for part in get_args(annotation) for kind in _sections(part)]
 
 
 def _name(kind: type[Section]) -> tuple[str, str]:
-    """The key that tells a kind of section from others, which is its first, and what it says."""
+    """Return the discriminator of a kind of section, its first key, and the key's value."""
     key, field = next(iter(kind.model_fields.items()))
     return key, str(field.default)
 
 
 def explained(problem: ErrorDetails) -> str:
-    """One problem of settings: the key, its value, what is allowed."""
+    """Describe one problem of settings: the key, its value and the allowed values."""
     path = [str(key) for key in problem["loc"]]
     while len(path) > 1 and path[-1].isdecimal():
-        path.pop()  # a place in a list
+        path.pop()  # an index into a list
     owner: type[Section] = Config
     if path and path[0] in Config.model_fields:
         field = Config.model_fields[path[0]]
@@ -63,7 +63,7 @@ def explained(problem: ErrorDetails) -> str:
             methods = " or ".join(dict.fromkeys(_name(kind)[1] for kind in kinds))
             return f"{path[0]}.{_name(kinds[0])[0]} is {shown(problem['ctx']['tag'])}, allowed: {methods}"
         if len(kinds) > 1 and len(path) > 1:
-            tag = path.pop(1)  # pydantic names the kind as well
+            tag = path.pop(1)  # pydantic adds the kind
             kinds = [kind for kind in kinds if tag == (COSINE if kind is CosineSgm else _name(kind)[1])]
         owner = kinds[0] if len(path) > 1 else Config
     where = ".".join(path)
@@ -76,14 +76,14 @@ def explained(problem: ErrorDetails) -> str:
 
 
 def known(name: str, names: Iterable[str]) -> str:
-    """What a name may have been meant to be, and all there are."""
+    """Suggest the name that is closest, and list all names."""
     names = list(names)
     guess = "".join(f", did you mean {close}?" for close in difflib.get_close_matches(name, names, n=1))
     return f"{guess} (known: {', '.join(names)})"
 
 
 def shown(value: Any) -> str:
-    """A value as YAML has it, cut short where it is long."""
+    """Format a value as in YAML, shortened if it is long."""
     if value is None or isinstance(value, bool):
         return json.dumps(value)
     return str(value) if isinstance(value, Decimal) else reprlib.repr(value)

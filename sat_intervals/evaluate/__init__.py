@@ -1,1 +1,1 @@
-"""Intervals against truth: figures of merit, the paper's tables."""
+"""Evaluate intervals against truth: figures of merit and the paper's tables."""

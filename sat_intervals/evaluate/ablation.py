@@ -1,4 +1,4 @@
-"""What each part of the method is worth: the paper's ablation, in one matching pass a pair (paper, table 2)."""
+"""Run the paper's ablation (table 2): the effect of each part of the method, from one matching pass per pair."""
 
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
@@ -26,15 +26,15 @@ from sat_intervals.tiling import Window
 
 # The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).
 _BASELINE = 1, 10
-# Beside the volume: images on their way, codes, and the raw products of all methods; of the final bands only a strip.
+# Memory beside the volume: images, codes, the raw products of all methods, and one strip of final bands.
 _PIXEL_BYTES = 100
 _STRIP_PIXELS = 1 << 18
 
 
 def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> dict[str, Any]:
-    """Judge the paper's baseline, and the method at several levels with and without its regularisation, on one pair.
+    """Evaluate the paper's baseline, and the method at several levels and with regularisation, on one pair.
 
-    All of them are read off one aggregated volume, which must fit in memory, and judged on the same pixels: those that
+    All results come from one aggregated cost volume, which must fit in memory. All are evaluated on the pixels that
     pass cross-checking.
 
     Parameters
@@ -42,22 +42,22 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     pair
         Images, truth and search range.
     config
-        Settings, or what `load_config` makes them from; the pair's search range and the method's alpha win.
+        Settings, or an argument of `load_config`. The pair's search range and the method's alpha override them.
     tolerance
-        Pixels by which the truth may lie outside an interval that still counts as right.
+        Distance in pixels up to which a truth outside an interval counts as inside.
 
     Returns
     -------
-    For each of METHODS ``count``, ``accuracy``, ``relative_size`` and ``mean_width``, as `evaluate_run`; and ``cost``.
+    ``cost``, and for each of METHODS ``count``, ``accuracy``, ``relative_size`` and ``mean_width`` as `evaluate_run`.
 
     Raises
     ------
     SatIntervalsError
-        Images that are no pair, settings without the parts compared, or a volume larger than the memory.
+        The images are not a pair, the settings lack regularisation, or the volume does not fit in memory.
     """
     config = load_config(config, {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}})
     if config.regularization is None:
-        raise SatIntervalsError("regularization is null: the ablation compares with and without it, leave it on")
+        raise SatIntervalsError("regularization is null, but the ablation needs it: leave it on")
     left, right, truth = (open_image(path) for path in (pair.left, pair.right, pair.truth))
     check_pair(left, right, config.disparity.count)
     config.disparity.check_images(left.path, left.width, right.path, right.width)
@@ -92,7 +92,7 @@ def _statistics(images: Sequence[Image], config: Config) -> PairStatistics | Non
 
 
 def _check_memory(whole: Window, config: Config) -> None:
-    """Refuse a pair without memory for the volume, the right view's own if there is one, and the bands."""
+    """Raise if the cost volume and the bands do not fit in memory."""
     pixels, count = whole.height * whole.width, config.disparity.count
     beyond = count - 1 if config.cross_check and config.cross_check.method == "accurate" else 0
     needed = PROCESS_BYTES + volume_bytes(whole.height, whole.width + beyond, config) + _PIXEL_BYTES * pixels
@@ -103,7 +103,7 @@ def _check_memory(whole: Window, config: Config) -> None:
 def _all_methods(
     views: Views, areas: Sequence[Area], whole: Window, config: Config, statistics: PairStatistics | None
 ) -> tuple[dict[str, RawRows], ConfidenceScale]:
-    """Raw products of every one of METHODS, and what their confidence is relative to."""
+    """Return the raw products of each of METHODS, and the scale of their confidence."""
     search, settings = config.disparity, kernel_settings(config)
     area, *of_right = areas
     (cost,) = cost_areas(views, [area], config, statistics)
@@ -116,7 +116,7 @@ def _all_methods(
         assert level is not None  # there is an interval
         bounds[method] = read_alpha_cuts(volume, search.minimum, level, refine)
     seen = np.asarray(read_right_winners(volume, search.minimum))
-    del volume, cost  # before the right view has its own
+    del volume, cost  # free memory before the right view's volume
     if of_right:
         (cost,) = cost_areas(views, of_right, config, statistics)
         seen = match_right(cost, of_right[0], whole, settings).winner
@@ -131,17 +131,17 @@ def _all_methods(
 
 
 def _settled(rows: RawRows, method: str, config: Config) -> tuple[RawRows, Config]:
-    """What one method finishes: only the last has its intervals regularised, the baseline not even filtered."""
+    """Return products and settings of one method: only the last is regularised, the baseline is not filtered."""
     if method != METHODS[-1]:
         config = config.model_copy(update={"regularization": None})
     if method == "baseline":
         config = config.model_copy(update={"median": None})
-        rows = rows._replace(disparity=rows.winner.astype(np.float32))  # no refinement that bounds had to follow
+        rows = rows._replace(disparity=rows.winner.astype(np.float32))  # the baseline does not refine
     return rows, config
 
 
 def _evaluated(rows: RawRows, config: Config, scale: ConfidenceScale, truth: Image) -> Iterator[Bands]:
-    """Final bands and truth, strip by strip: whole they would take as much as the volume."""
+    """Yield final bands and truth strip by strip: whole, they would need as much memory as the volume."""
     height, width = rows.winner.shape
     step = max(1, _STRIP_PIXELS // width)
     row = 0

@@ -1,4 +1,4 @@
-"""Intervals of a run against a known truth, strip by strip, whatever the size of the images (method: section 10)."""
+"""Evaluate the intervals of a run against a known truth, strip by strip (method: section 10)."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -9,14 +9,14 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.metrics import Criteria, Judged, Metrics, bias_histogram
+from sat_intervals.evaluate.metrics import Criteria, Evaluated, Metrics, bias_histogram
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.match.postprocess import cut_rows, with_halo
 from sat_intervals.products import Bands
 from sat_intervals.results import Layer, Run, open_run
 
-_JUDGED_PIXELS = 1 << 20  # at a time, 150 bytes each; those read and waiting are 25
+_PIXELS = 1 << 20  # evaluated at a time, 150 bytes each; pixels read ahead take 25 bytes
 
 
 def evaluate_run(
@@ -27,35 +27,36 @@ def evaluate_run(
     tolerance: float = 0.0,
     remove_bias: bool = False,
 ) -> dict[str, Any]:
-    """Judge the intervals in the folder of a run.
+    """Evaluate the intervals of a run.
 
     Parameters
     ----------
     out
         Folder of ``intervals.tif``, ``validity.tif`` and ``run.json``.
     truth
-        True disparity of the left image, or of the run's region of it: NaN and no data are unknown. By default
-        ``truth.tif`` beside the left image.
+        True disparity of the left image or of the run's region; NaN and no data mean unknown. By default ``truth.tif``
+        beside the left image.
     mask
-        Of the truth's size: pixels where it is 0 are not judged, such as the occluded ones.
+        A raster as large as the truth: pixels where it is 0, such as occluded ones, are left out.
     tolerance
-        Pixels by which the truth may lie outside an interval that still counts as right.
+        Distance in pixels up to which a truth outside an interval counts as inside.
     remove_bias
-        Whether the median of disparity - truth, over valid pixels, is added to the truth first.
+        Whether to add the median of disparity - truth over valid pixels to the truth first.
 
     Returns
     -------
     Figures over valid pixels: for ``all``, ``high`` and ``low`` confidence ``count``, ``accuracy``, ``relative_size``
     and ``mean_width`` (pixels), for ``low`` also ``relative_overestimation``; ``bad1`` and ``bad3``, the shares of
-    disparities wrong by more than 1 and 3 px; ``truth_outside_range``, the share of truths that were not searched;
-    ``deciles`` of confidence with their coverage. ``with_rejected`` holds the same over all pixels that have an
-    interval, None unless the run wrote those of rejected pixels. ``bias`` is the bias removed (pixels), None if it was
-    not asked for. ``cost`` and ``tolerance`` say what was judged and how.
+    disparities wrong by more than 1 and 3 px; ``truth_outside_range``, the share of truths outside the search range;
+    ``deciles`` of confidence with their coverage. ``with_rejected`` contains the same over all pixels with an interval,
+    None unless the run kept rejected pixels. ``bias`` is the bias removed (pixels), None without ``remove_bias``.
+    ``truth_is_whole`` is true if all truths of valid pixels are whole numbers. ``cost`` and ``tolerance`` are the
+    settings used.
 
     Raises
     ------
     SatIntervalsError
-        No run, no truth, or sizes that do not fit.
+        The folder is not a run, there is no truth, or sizes do not fit.
     """
     run = open_run(out)
     config = run.config
@@ -78,7 +79,7 @@ def evaluate_run(
 
 
 def criteria_of(config: Config, tolerance: float = 0.0) -> Criteria:
-    """How a run is judged; where it did not regularise, low confidence is that of the default settings."""
+    """Return the criteria for a run; without regularisation, low confidence follows the default settings."""
     low, search = config.regularization or Regularization(), config.disparity
     return Criteria(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance)
 
@@ -90,19 +91,24 @@ def evaluate(
     remove_bias: bool = False,
     with_rejected: bool = False,
 ) -> dict[str, Any]:
-    """Judge rows given strip by strip, from the top; ``strips`` is called once for every time they are gone through.
+    """Evaluate rows given strip by strip from the top; each call of ``strips`` starts again at the top.
 
-    Returns what `evaluate_run` does, but for ``cost``.
+    Returns the figures of `evaluate_run` without ``cost``.
     """
     bias = _median_bias(strips()) if remove_bias else None
     criteria = replace(criteria, bias=bias or 0.0)
     kept, written = Metrics(criteria), Metrics(criteria)
+    is_whole = True
     for rows, first, last in with_halo(strips(), criteria.depth):
-        kept.add(_judged(rows, rows.known & rows.valid, first, last, criteria))
+        chosen = rows.known & rows.valid
+        is_whole = is_whole and bool((rows.truth[chosen] % 1 == 0).all())
+        kept.add(_evaluated(rows, chosen, first, last, criteria))
         if with_rejected:
-            written.add(_judged(rows, rows.known, first, last, criteria))
+            written.add(_evaluated(rows, rows.known, first, last, criteria))
+    report = kept.report()
     return {
-        **kept.report(),
+        **report,
+        "truth_is_whole": is_whole and report["all"]["count"] > 0,
         "tolerance": criteria.tolerance,
         "bias": bias,
         "with_rejected": written.report() if with_rejected else None,
@@ -110,7 +116,7 @@ def evaluate(
 
 
 def _median_bias(strips: Iterable[Bands]) -> float:
-    """Median of disparity - truth over valid pixels, in pixels; 0 where there are none."""
+    """Return the median of disparity - truth over valid pixels, in pixels; 0 if there are none."""
     histogram = bias_histogram()
     for rows in strips:
         chosen = rows.known & rows.valid
@@ -118,8 +124,8 @@ def _median_bias(strips: Iterable[Bands]) -> float:
     return histogram.median() or 0.0
 
 
-def _judged(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Criteria) -> Judged:
-    """The chosen pixels of the rows ``[first, last)``; the rows around them make their low-confidence areas whole."""
+def _evaluated(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Criteria) -> Evaluated:
+    """Return the chosen pixels of rows ``[first, last)``; the other rows complete their low-confidence areas."""
     truth = rows.truth.astype(np.float64) + criteria.bias
     low = low_confidence(rows.confidence, criteria.threshold, criteria.kernel)
     error = np.where(chosen, np.abs(truth - rows.disparity), np.nan)
@@ -128,12 +134,12 @@ def _judged(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Cr
     chosen = chosen[inner]
     disparity, lower, upper, confidence = (band[inner][chosen].astype(np.float64) for band in rows[:4])
     pixels = Bands(disparity, lower, upper, confidence, rows.validity[inner][chosen], truth[inner][chosen])
-    return Judged(pixels, low[inner][chosen], area_error[inner][chosen])
+    return Evaluated(pixels, low[inner][chosen], area_error[inner][chosen])
 
 
 def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[Bands]:
-    """Strips of rows, from the top; files are read by rows of blocks, which are then cut."""
-    step = max(1, _JUDGED_PIXELS // run.region.width)
+    """Yield strips of rows from the top; files are read by rows of blocks, which are then cut."""
+    step = max(1, _PIXELS // run.region.width)
     for window in run.windows():
         true = truth.read(window)
         if mask is not None:

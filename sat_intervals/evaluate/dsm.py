@@ -1,4 +1,4 @@
-"""Intervals of a surface model against reference heights, strip by strip, whatever the size."""
+"""Evaluate the intervals of a surface model against reference heights, strip by strip."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -19,19 +19,19 @@ from sat_intervals.raster import (
 )
 from sat_intervals.tiling import Window, strips
 
-# Judged heights of a strip, some hundred bytes each.
+# Heights evaluated at a time, some hundred bytes each.
 _STRIP = 1 << 20
-# Ends of classes: degrees of the reference's slope, metres of the interval's width.
+# Limits of classes: slope of the reference in degrees, width of the interval in metres.
 SLOPES = (0.0, 5.0, 15.0, 30.0, 45.0, 90.0)
 WIDTHS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, np.inf)
-# Errors and widths are counted in centimetres within so many metres.
+# Errors and widths are counted in centimetres, up to this many metres.
 _LARGEST = 500
-# NMAD, the robust standard deviation: of a normal distribution it is sigma (Hoehle and Hoehle 2009).
+# Factor of the NMAD, a robust standard deviation: sigma of a normal distribution (Hoehle and Hoehle 2009).
 _NORMAL = 1.4826
 
 
 class _Class:
-    """Figures of some cells."""
+    """Figures of a class of cells."""
 
     def __init__(self) -> None:
         self._count = self._inside = 0
@@ -55,32 +55,32 @@ class _Class:
 
 
 def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, Any]:
-    """Judge the intervals of a surface model.
+    """Evaluate the intervals of a surface model.
 
     Parameters
     ----------
     surface
         A file that `make_surface` wrote.
     reference
-        Heights above the same datum in any CRS. Where it is finer than the cells, a cell is judged by as many heights
-        as its side holds, squared, each by the interval of its cell; else by the one nearest to its centre.
+        Heights above the same datum in any CRS. If it is n times finer than the cells, each cell is compared with n x n
+        heights; else with the one nearest to its centre.
 
     Returns
     -------
     For ``all`` heights with an interval, by ``slope`` of the reference (degrees) and by ``width`` of the
     interval (metres): ``count``, ``accuracy`` (the share of reference heights inside the interval), ``median_width``,
-    ``bias`` (median of height - reference) and ``nmad`` of height - reference, in metres; None of no cells. Classes
-    have their ends in ``from`` and ``to``.
+    ``bias`` (median of height - reference) and ``nmad`` of height - reference, in metres; None without cells. ``from``
+    and ``to`` are the limits of a class.
 
     Raises
     ------
     SatIntervalsError
-        Files that cannot be read, do not meet, or whose heights have nothing to do with each other.
+        A file cannot be read, or both do not overlap, or their heights differ by too much.
     """
     surface, reference = Path(surface), Path(reference)
     shape, place = read_place(surface)
     if not is_surface(surface):
-        raise SatIntervalsError(f"{surface} is no surface model of sat-intervals dsm: is it the --reference?")
+        raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: is it the --reference?")
     read_place(reference)
     check_reference(reference, surface)
     assert place.pixel_size is not None
@@ -90,11 +90,11 @@ def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, An
     for window in strips(*shape, _STRIP // finer**2):
         height, lower, upper = (_refined(band, finer) for band in read_layers(surface, window)[:3].astype(np.float64))
         truth, slope = _truth(reference, place, shape, window, finer)
-        judged = np.isfinite(truth) & np.isfinite(lower) & np.isfinite(height)
-        error, width = (height - truth)[judged], (upper - lower)[judged]
-        inside = ((lower <= truth) & (truth <= upper))[judged]
+        known = np.isfinite(truth) & np.isfinite(lower) & np.isfinite(height)
+        error, width = (height - truth)[known], (upper - lower)[known]
+        inside = ((lower <= truth) & (truth <= upper))[known]
         whole.add(error, width, inside)
-        for classes, ends, values in ((slopes, SLOPES, slope[judged]), (widths, WIDTHS, width)):
+        for classes, ends, values in ((slopes, SLOPES, slope[known]), (widths, WIDTHS, width)):
             for kind, (first, last) in zip(classes, pairwise(ends), strict=True):
                 chosen = (first <= values) & (values < last)
                 kind.add(error[chosen], width[chosen], inside[chosen])
@@ -120,17 +120,16 @@ def _by(classes: list[_Class], ends: tuple[float, ...]) -> list[dict[str, Any]]:
 
 
 def _refined(band: np.ndarray, finer: int) -> np.ndarray:
-    """Cells ``(rows, columns)``, each so many times along both axes."""
+    """Repeat each cell ``finer`` times along both axes."""
     return np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
 
 
 def _truth(
     path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, finer: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reference heights of a window of cells, ``finer`` to the side of each, and their slope in degrees, NaN for none.
+    """Return reference heights of a window of cells, ``finer`` per side, and their slope in degrees; NaN if missing.
 
-    The slope is that of the heights interpolated between the reference's own pixels, which nearest ones would turn into
-    stairs.
+    The slope comes from interpolated heights: those of the nearest pixels would form steps.
     """
     place = place.refined(finer)
     shape = shape[0] * finer, shape[1] * finer

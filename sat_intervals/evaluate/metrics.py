@@ -1,7 +1,7 @@
-"""Figures of merit of intervals, gathered from pixels in any portions (paper section 4.1; method: section 10).
+"""Accumulate figures of merit of intervals (paper section 4.1; method: section 10).
 
-Medians are taken of counts: widths to 0.01 px (whole and half pixels, which most widths are, exactly), overestimation
-to 0.001 and not below -99, bias to 0.001 px within 1000 px, confidence to 0.001.
+Medians come from histograms with these steps: widths 0.01 px, overestimation 0.001 (at least -99), bias 0.001 px
+(within 1000 px), confidence 0.001.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ _LARGEST_RATIO, _LARGEST_BIAS = 100, 1000
 
 @dataclass(frozen=True)
 class Criteria:
-    """How intervals are judged.
+    """Parameters of an evaluation.
 
     Attributes
     ----------
     minimum, maximum
         The search range.
     threshold, kernel, depth
-        What low confidence is, and how far its areas reach: the settings of regularisation.
+        Definition of low confidence and of its areas: the settings of regularisation.
     tolerance
-        Pixels by which the truth may lie outside an interval that still counts as right.
+        Distance in pixels up to which a truth outside an interval counts as inside.
     bias
-        Pixels added to the truth before it is compared with anything.
+        Pixels added to the truth before any comparison.
     """
 
     minimum: int
@@ -40,17 +40,17 @@ class Criteria:
     bias: float = 0.0
 
 
-class Judged(NamedTuple):
-    """Pixels that have an interval and a known truth, one element a pixel.
+class Evaluated(NamedTuple):
+    """Pixels with an interval and a known truth, one element per pixel.
 
     Attributes
     ----------
     bands
-        float64 but for the flags.
+        float64 except the flags.
     low
         Whether the pixel is of low confidence (paper eq. 13).
     area_error
-        The largest ``|truth - disparity|`` over the judged pixels of its low-confidence area; NaN if not low.
+        The largest ``|truth - disparity|`` over the evaluated pixels of its low-confidence area; NaN if not low.
     """
 
     bands: Bands
@@ -59,20 +59,20 @@ class Judged(NamedTuple):
 
 
 class Histogram:
-    """Counts of values from ``first`` to ``last``, ``steps`` a unit; values beyond count as the ends."""
+    """Counts of values from ``first`` to ``last``, ``steps`` per unit; values beyond are clipped."""
 
     def __init__(self, first: int, last: int, steps: int) -> None:
         self._first, self._steps = first, steps
         self._counts = np.zeros((last - first) * steps + 1, np.int64)
 
     def add(self, values: np.ndarray) -> None:
-        """Count values, none of them NaN."""
+        """Count values; none may be NaN."""
         places = np.rint((values - self._first) * self._steps)
         places = np.clip(places, 0, self._counts.size - 1).astype(np.int64)
         self._counts += np.bincount(places, minlength=self._counts.size)
 
     def median(self) -> float | None:
-        """The value in the middle, the mean of the two in the middle of an even number; None of no values."""
+        """Return the median (the mean of both middle values of an even number); None without values."""
         upto = np.cumsum(self._counts)
         if upto[-1] == 0:
             return None
@@ -80,7 +80,7 @@ class Histogram:
         return float(self._first + middle.sum() / (2 * self._steps))
 
     def deviation(self) -> float | None:
-        """Median distance of the values from their median; None of no values."""
+        """Return the median absolute deviation from the median; None without values."""
         median = self.median()
         if median is None:
             return None
@@ -91,7 +91,7 @@ class Histogram:
 
 
 class _Intervals:
-    """Accuracy and size of the intervals of some pixels (paper eq. 14 and 15)."""
+    """Accuracy and size of the intervals of a group of pixels (paper eq. 14 and 15)."""
 
     def __init__(self, search: int) -> None:
         self._search = search
@@ -116,7 +116,7 @@ class _Intervals:
 
 
 class _Deciles:
-    """Coverage against confidence: ten groups of as many pixels, as far as equal confidences can be told apart."""
+    """Coverage by decile of confidence; pixels of equal confidence stay in one decile."""
 
     def __init__(self) -> None:
         self._count, self._inside, self._width = np.zeros((3, _CONFIDENCE + 1))
@@ -128,7 +128,7 @@ class _Deciles:
             total += np.bincount(step, weights, minlength=total.size)
 
     def report(self) -> list[dict[str, Any]]:
-        """From the least confidence up; a confidence belongs to the decile of the middle of its ranks."""
+        """Return the deciles, lowest confidence first; a confidence belongs to the decile of its mean rank."""
         present = np.flatnonzero(self._count)
         counts = self._count[present]
         middle = np.cumsum(counts) - counts / 2
@@ -146,7 +146,7 @@ class _Deciles:
 
 
 class Metrics:
-    """Figures of merit of one population of pixels."""
+    """Figures of merit of a set of pixels."""
 
     def __init__(self, criteria: Criteria) -> None:
         self._criteria = criteria
@@ -155,16 +155,16 @@ class Metrics:
         self._deciles = _Deciles()
         self._wrong = {"bad1": 0, "bad3": 0, "truth_outside_range": 0}
 
-    def add(self, judged: Judged) -> None:
-        """Take judged pixels into account."""
-        disparity, lower, upper, confidence, _, truth, _ = judged.bands
-        low, criteria = judged.low, self._criteria
+    def add(self, pixels: Evaluated) -> None:
+        """Add pixels."""
+        disparity, lower, upper, confidence, _, truth, _ = pixels.bands
+        low, criteria = pixels.low, self._criteria
         inside = (lower - criteria.tolerance <= truth) & (truth <= upper + criteria.tolerance)
         width = upper - lower
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
             self._areas[name].add(inside[chosen], width[chosen])
         wide = low & (width > 0)
-        self._ratios.add(judged.area_error[wide] / width[wide])
+        self._ratios.add(pixels.area_error[wide] / width[wide])
         self._deciles.add(confidence, inside, width)
         error = np.abs(disparity - truth)
         self._wrong["bad1"] += int((error > 1).sum())
@@ -172,7 +172,7 @@ class Metrics:
         self._wrong["truth_outside_range"] += int(((truth < criteria.minimum) | (truth > criteria.maximum)).sum())
 
     def report(self) -> dict[str, Any]:
-        """All figures; None where there is no pixel to tell. Shares are of the judged pixels."""
+        """Return all figures, None without pixels; shares are of the evaluated pixels."""
         report: dict[str, Any] = {name: area.report() for name, area in self._areas.items()}
         ratio = self._ratios.median()
         report["low"]["relative_overestimation"] = None if ratio is None else 1 - ratio  # paper eq. 16
@@ -182,7 +182,7 @@ class Metrics:
 
 
 def bias_histogram() -> Histogram:
-    """For differences of disparity and truth."""
+    """Return an empty histogram for differences of disparity and truth."""
     return Histogram(-_LARGEST_BIAS, _LARGEST_BIAS, _BIAS)
 
 

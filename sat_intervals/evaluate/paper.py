@@ -1,15 +1,14 @@
-"""The paper's tables: means over the scenes of a group, beside the paper's figures and the reference implementation's.
+"""Make the paper's tables: means over scenes, with the figures of the paper and of its implementation, Pandora.
 
-The reference implementation is Pandora, of the paper's authors, measured with penalties 8 and 32 on pixels that pass
-its cross-checking against a right view matched on its own; its overestimation also over all pixels that have an
-interval. What was not measured is None.
+Pandora was measured with penalties 8 and 32, on pixels that pass its accurate cross-checking; overestimation also on
+all pixels with an interval. Figures that were not measured are None.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-# Column of the table -> where the report of a scene holds it.
+# Column of the table -> path to its figure in the report of a scene.
 ACCURACY = ("all", "accuracy")
 TABLE_1 = {
     "acc.": ACCURACY,
@@ -23,7 +22,7 @@ TABLE_1 = {
 }
 METHODS = ("baseline", "0.5", "0.8", "0.9", "0.98", "0.9 regularised")
 TABLE_2 = {method: (method, "accuracy") for method in METHODS}
-OBJECTIVE = 0.9  # the accuracy that the paper wants of every scene
+OBJECTIVE = 0.9  # the paper's target accuracy of each scene
 
 _PAPER_1 = {
     ("census", "middlebury2003"): (0.973, 0.033, 0.983, 0.033, 0.942, 0.183, 0.165),
@@ -59,7 +58,7 @@ _REFERENCE_2 = {
 
 @dataclass(frozen=True)
 class SceneMetrics:
-    """The figures of one scene, as `evaluate_run` or `ablate_pair` report them, and the group it belongs to."""
+    """The report of one scene (from `evaluate_run` or `ablate_pair`) and its group."""
 
     name: str
     group: str
@@ -68,7 +67,7 @@ class SceneMetrics:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table: the means of a group's scenes, or what others print for it."""
+    """A row of a table: means over the scenes of a group, or published figures."""
 
     label: str
     figures: dict[str, float | None]
@@ -77,17 +76,17 @@ class Row:
 
 
 def table_1(scenes: Iterable[SceneMetrics]) -> list[Row]:
-    """Accuracy, relative size and overestimation by group (paper, table 1)."""
+    """Return accuracy, relative size and overestimation by group (paper, table 1)."""
     return _table(scenes, TABLE_1, ACCURACY, {"paper": _PAPER_1, "reference": _REFERENCE_1})
 
 
 def table_2(scenes: Iterable[SceneMetrics]) -> list[Row]:
-    """Accuracy of the methods of the ablation by group (paper, table 2)."""
+    """Return the accuracy of the ablation's methods by group (paper, table 2)."""
     return _table(scenes, TABLE_2, TABLE_2[METHODS[-1]], {"paper": _PAPER_2, "reference": _REFERENCE_2})
 
 
 def look_up(report: dict[str, Any], place: tuple[str, ...]) -> float | None:
-    """The figure at a place of a report, None where there is none."""
+    """Return the figure at a path of a report, None if it is missing."""
     found: Any = report
     for key in place:
         found = None if found is None else found[key]
@@ -106,7 +105,7 @@ def _table(
     rows = []
     places = list(dict.fromkeys(group for _, group in groups))
     several = len({cost for cost, _ in groups}) > 1
-    # The costs of a group stand one below the other, to be compared.
+    # List the costs of a group one below the other.
     for cost, group in sorted(groups, key=lambda key: places.index(key[1])):
         reports = groups[cost, group]
         means = {name: _mean([look_up(report, place) for report in reports]) for name, place in columns.items()}

@@ -1,1 +1,1 @@
-"""From disparity to ground: sensor models, points, surface models. The only home of shareloc."""
+"""Turn disparities into ground points and surface models. The only package that imports shareloc."""

@@ -1,8 +1,8 @@
-"""From the points of one or several runs to a surface model whose cells carry intervals of height.
+"""Make a surface model with height intervals from the points of one or several runs.
 
-The cells are made in tiles of a few rows, each of the points that may reach it: memory follows the tile. Every point
-reaches the cell it falls in and those whose centre lies within a radius of it; cells that none reaches are no data,
-never filled.
+Cells are computed in tiles, each from the points near it, so memory depends on the tile only. A point contributes to
+the cell that contains it and to all cells whose centre is within a radius. Other cells are no data; they are never
+filled.
 """
 
 import math
@@ -36,13 +36,13 @@ from sat_intervals.tiling import Grid, Window
 
 # Cells of a tile: some tens of megabytes.
 _TILE_ROWS, _TILE_COLUMNS = 512, 2048
-# Cells of a strip of tiles, of which a few are held, 24 bytes each; tiles of wide surfaces are lower for it.
+# Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
 _STRIP_CELLS, _LOWEST = 1 << 22, 64
-# A surface of more cells than this for a point is a wrong resolution, or points of two places.
+# More cells per point mean a wrong resolution or runs of different places.
 _CELLS_PER_POINT = 1000
-# Cells that a point reaches: the work grows with their square.
+# Largest radius in cells: the work grows with its square.
 _REACH = 32
-# Metres: no cell is wider, and no point reaches further.
+# Metres: largest cell and largest radius.
 _LARGEST = 10_000.0
 
 
@@ -57,12 +57,12 @@ def make_surface(
     geoid: str | Path | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Make a surface model of the points of some runs.
+    """Make a surface model from the points of one or several runs.
 
     Parameters
     ----------
     outs
-        Folders of runs that were triangulated, of one place.
+        Folders of triangulated runs of the same place.
     path
         The Cloud-Optimized GeoTIFF to write.
     resolution
@@ -70,26 +70,25 @@ def make_surface(
     crs
         A projected CRS in metres; by default the UTM zone of a point near the middle.
     radius
-        Metres from a point within which the centres of cells are reached, beside the cell it falls in; by default the
-        side of a cell.
+        A point also contributes to cells whose centre is within this distance (metres); by default the side of a cell.
     interval
-        The cell's interval: ``envelope`` holds the intervals of all points that reach it; ``mean`` is the weighted mean
-        of their bounds. The intervals of several runs are intersected where they meet, else the hull of all is taken.
+        The cell's interval: ``envelope`` contains the intervals of all its points; ``mean`` is the weighted mean of
+        their bounds. The intervals of several runs are intersected if they overlap; else their hull is taken.
     geoid
-        Grid of geoid heights, which then are what heights count from; by default the ellipsoid of WGS 84.
+        Grid of geoid heights; heights then refer to the geoid, by default to the WGS 84 ellipsoid.
     progress
-        Called from time to time.
+        Callback, see `Progress`.
 
     Returns
     -------
-    ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (the share of cells with a height), ``disagreeing`` (the
-    share of the cells of several runs in which these do not meet, None without such cells), ``without_intervals`` (the
-    folders of runs that have none).
+    ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (share of cells with a height), ``disagreeing`` (share of the
+    cells of several runs whose intervals do not overlap, None if there are none), ``without_intervals`` (folders of
+    runs without intervals).
 
     Raises
     ------
     SatIntervalsError
-        Runs without points, a CRS or grid that does not serve, a file that cannot be written.
+        A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, radius = Path(path), resolution if radius is None else radius
     _check_lengths(resolution, radius)
@@ -128,7 +127,7 @@ def make_surface(
 
 
 def runs_tag(runs: Sequence[Run]) -> str:
-    """What a surface says of the runs that it is of."""
+    """Return the tag RUNS of a surface, which identifies its runs."""
     return " ".join(run.report["finished"] for run in runs)
 
 
@@ -144,9 +143,9 @@ def _check_lengths(resolution: float, radius: float) -> None:
 
 
 def _check_target(path: Path) -> None:
-    """Refuse to replace what is no surface model."""
+    """Raise if the file exists and is not a surface model."""
     if path.exists() and not is_surface(path):
-        raise SatIntervalsError(f"{path} is there, and is no surface model to be replaced: choose another --output")
+        raise SatIntervalsError(f"{path} exists and is not a surface model: choose another --output")
 
 
 def _triangulated(outs: Sequence[Path]) -> list[Run]:
@@ -160,7 +159,7 @@ def _triangulated(outs: Sequence[Path]) -> list[Run]:
         if not path.exists():
             raise SatIntervalsError(f"{out} has no points.tif: run sat-intervals triangulate on it first")
         if read_tags(path).get("RUN") != run.report["finished"] or read_shape(path) != (len(POINTS), *run.shape):
-            raise SatIntervalsError(f"{path} is of an earlier run in {out}: triangulate again")
+            raise SatIntervalsError(f"{path} belongs to an earlier run in {out}: triangulate again")
         runs.append(run)
     return runs
 
@@ -173,7 +172,7 @@ def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Pro
 
 
 def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
-    """Longitude and latitude of a point of the first run that has any."""
+    """Return longitude and latitude of the middle of a window with points, of the first run that has any."""
     for run in runs:
         tiles = Grid(Window(0, 0, *run.shape), WINDOW)
         middle = tiles.rows / 2 - 0.5, tiles.columns / 2 - 0.5
@@ -182,7 +181,7 @@ def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
             known = np.isfinite(bands[0])
             if known.any():
                 return float(np.median(bands[0][known])), float(np.median(bands[1][known]))
-    raise SatIntervalsError(f"no valid pixel in {', '.join(str(run.out) for run in runs)}: there is no surface to make")
+    raise SatIntervalsError(f"no valid pixel in {', '.join(str(run.out) for run in runs)}: give runs with points")
 
 
 def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float) -> Cells:
@@ -201,7 +200,7 @@ def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float) -> Ce
 def _write(
     writer: OutputWriter, strips: Iterator[tuple[int, np.ndarray]], rows: int, progress: Progress
 ) -> tuple[int, int, int]:
-    """Write and publish strips; how many cells have a height, are of several runs, and are where these disagree."""
+    """Write and publish strips; return the number of cells with a height, of several runs, and in disagreement."""
     counts = np.zeros(3, np.int64)
     for row, strip in strips:
         writer.write(row, strip)
@@ -218,7 +217,7 @@ def _write(
 def _strips(
     threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, interval: str
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Bands of full-width strips, from the top, with the first row of each; tiles in work end early at an error."""
+    """Yield first row and bands of full-width strips from the top; an error stops the running tiles."""
     ended = threading.Event()
 
     def tile(window: Window) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The cells of several runs as one: intersection of their intervals where they meet, hull where they do not."""
+"""Fuse the cells of several runs: intersection of their intervals if they overlap, else their hull."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from sat_intervals.products import SURFACE
 
 
 class RunCells(NamedTuple):
-    """The cells of one run; NaN where no point reaches."""
+    """The cells of one run; NaN where no point contributes."""
 
     weight: np.ndarray
     height: np.ndarray
@@ -21,7 +21,7 @@ class RunCells(NamedTuple):
 
 
 def cells_of_run(gathered: np.ndarray, interval: str) -> RunCells:
-    """Heights and bounds from what points gathered, see `kernels.splat`; ``interval`` as of `make_surface`."""
+    """Return heights and bounds from sums over points, see `kernels.splat`; ``interval`` as in `make_surface`."""
     weight = np.where(gathered[COUNT] > 0, gathered[WEIGHT], np.nan)
     bounded = np.where(gathered[BOUNDED] > 0, gathered[BOUNDED], np.nan)
     if interval == "mean":
@@ -33,18 +33,18 @@ def cells_of_run(gathered: np.ndarray, interval: str) -> RunCells:
 
 
 def fused(runs: Sequence[RunCells]) -> np.ndarray:
-    """The bands of SURFACE from those of each run: ``(6, rows, columns)`` float32."""
+    """Return the bands of SURFACE from the cells of each run: ``(6, rows, columns)`` float32."""
     weights = np.stack([run.weight for run in runs])
     weight = np.where(np.isfinite(weights).any(axis=0), np.nansum(weights, axis=0), np.nan)
     height = np.nansum([run.weight * run.height for run in runs], axis=0) / weight
-    judged = np.nansum([np.where(np.isnan(run.confidence), np.nan, run.weight) for run in runs], axis=0)
+    known = np.nansum([np.where(np.isnan(run.confidence), np.nan, run.weight) for run in runs], axis=0)
     confidence = np.nansum([run.weight * run.confidence for run in runs], axis=0)
-    confidence = np.divide(confidence, judged, out=np.full(judged.shape, np.nan), where=judged > 0)
+    confidence = np.divide(confidence, known, out=np.full(known.shape, np.nan), where=known > 0)
     lowers, uppers = (np.stack([getattr(run, name) for run in runs]) for name in ("lower", "upper"))
     inner = np.fmax.reduce(lowers), np.fmin.reduce(uppers)
     outer = np.fmin.reduce(lowers), np.fmax.reduce(uppers)
-    meeting = inner[0] <= inner[1]
-    lower, upper = (np.where(meeting, one, other) for one, other in zip(inner, outer, strict=True))
+    overlapping = inner[0] <= inner[1]
+    lower, upper = (np.where(overlapping, one, other) for one, other in zip(inner, outer, strict=True))
     several = np.isfinite(lowers).sum(axis=0) > 1
     bands = {
         "height": np.fmin(np.fmax(height, lower), upper),
@@ -52,13 +52,13 @@ def fused(runs: Sequence[RunCells]) -> np.ndarray:
         "height_upper": _outwards(upper, np.inf),
         "count": np.where(np.isfinite(weight), sum(run.points for run in runs), np.nan),
         "confidence": confidence,
-        "agreement": np.where(several, meeting, np.nan),
+        "agreement": np.where(several, overlapping, np.nan),
     }
     return np.stack([bands[band.name] for band in SURFACE]).astype(np.float32)
 
 
 def _outwards(bound: np.ndarray, end: float) -> np.ndarray:
-    """The float32 next to a bound, on the side of ``end`` where it is not the bound itself."""
+    """Round a bound to float32, towards ``end``."""
     single = bound.astype(np.float32)
     inside = single > bound if end < 0 else single < bound
     return np.where(inside, np.nextafter(single, np.float32(end)), single)

@@ -1,4 +1,4 @@
-"""Points of a run on the map, and the cells of a surface model that they reach."""
+"""Project the points of a run to the map and accumulate them in the cells of a surface model."""
 
 import math
 import threading
@@ -15,20 +15,20 @@ from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Window
 
 _POINT = {band.name: index for index, band in enumerate(POINTS)}
-# Pixels of a side of a window of points: some tens of megabytes.
+# Side of a window of points in pixels: some tens of megabytes.
 WINDOW = 512
 
 
 class Extent(NamedTuple):
-    """A rectangle on the map, in metres."""
+    """A rectangle in map coordinates, in metres."""
 
     left: float
     bottom: float
     right: float
     top: float
 
-    def meets(self, other: "Extent") -> bool:
-        """Whether they share a point."""
+    def intersects(self, other: "Extent") -> bool:
+        """Return whether both share a point."""
         return (
             self.left <= other.right
             and other.left <= self.right
@@ -37,7 +37,7 @@ class Extent(NamedTuple):
         )
 
     def grown(self, margin: float) -> "Extent":
-        """The rectangle with a margin around it."""
+        """Return the rectangle grown by a margin on all sides."""
         return Extent(self.left - margin, self.bottom - margin, self.right + margin, self.top + margin)
 
 
@@ -53,13 +53,13 @@ class Cells:
 
     @classmethod
     def over(cls, extent: Extent, resolution: float) -> "Cells":
-        """The cells that cover an extent."""
+        """Return the cells that cover an extent."""
         left, bottom = (math.floor(edge / resolution) for edge in (extent.left, extent.bottom))
         right, top = (math.floor(edge / resolution) + 1 for edge in (extent.right, extent.top))
         return cls(left * resolution, top * resolution, resolution, top - bottom, right - left)
 
     def extent(self, window: Window) -> Extent:
-        """Where a window of the cells lies."""
+        """Return the extent of a window of the cells."""
         return Extent(
             self.left + window.column * self.resolution,
             self.top - window.row_stop * self.resolution,
@@ -69,7 +69,7 @@ class Cells:
 
 
 class PointCloud:
-    """The points of one run, read by windows, with the extent of each on the map."""
+    """The points of one run, read by windows, and the map extent of each window."""
 
     def __init__(self, run: Run, projection: Projection) -> None:
         self.run = run
@@ -78,9 +78,10 @@ class PointCloud:
         self._extents: list[tuple[Window, Extent]] = []
         self.points = 0
         for tile in Grid(Window(0, 0, *run.shape), WINDOW):
-            self._look(tile.core)
+            self._scan(tile.core)
 
-    def _look(self, window: Window) -> None:
+    def _scan(self, window: Window) -> None:
+        """Count the points of a window and find their extent."""
         bands = read_layers(self._path, window)
         longitude, latitude = bands[_POINT["longitude"]], bands[_POINT["latitude"]]
         known = np.isfinite(longitude)
@@ -89,36 +90,36 @@ class PointCloud:
             longitude, latitude = longitude[known], latitude[known]
             if np.isnan(self._projection.undulation(longitude, latitude)).any():
                 raise SatIntervalsError(
-                    f"the grid of geoid heights ends before the points of {self.run.out}, at longitudes "
+                    f"the grid of geoid heights does not cover the points of {self.run.out}, at longitudes "
                     f"{longitude.min():.4f} to {longitude.max():.4f}, latitudes {latitude.min():.4f} to "
                     f"{latitude.max():.4f}: give one that covers them"
                 )
             x, y = self._projection.place(longitude, latitude)
             if not (np.isfinite(x).all() and np.isfinite(y).all()):
                 raise SatIntervalsError(
-                    f"{self._projection.crs} has no place for points of {self.run.out}: give another"
+                    f"points of {self.run.out} are outside the domain of {self._projection.crs}: give another CRS"
                 )
             self._extents.append((window, Extent(x.min(), y.min(), x.max(), y.max())))
 
     @property
     def extent(self) -> Extent | None:
-        """Of all points; None where there is none."""
+        """Return the extent of all points; None if there are none."""
         if not self._extents:
             return None
         left, bottom, right, top = zip(*(extent for _, extent in self._extents), strict=True)
         return Extent(min(left), min(bottom), max(right), max(top))
 
     def splat(self, cells: Cells, window: Window, radius: float, ended: threading.Event) -> np.ndarray:
-        """What the points gather in a window of the cells, see `kernels.splat`; ``radius`` in metres.
+        """Accumulate the points in a window of the cells, see `kernels.splat`; ``radius`` in metres.
 
-        Once ``ended`` is set, nobody waits for the rest.
+        Stops early once ``ended`` is set.
         """
         gathered = empty_cells(window.height, window.width)
         place = cells.extent(window)
         for source, extent in self._extents:
             if ended.is_set():
                 break
-            if extent.grown(radius).meets(place):
+            if extent.grown(radius).intersects(place):
                 bands = read_layers(self._path, source)
                 known = np.isfinite(bands[_POINT["height"]])
                 longitude, latitude, height, lower, upper = (

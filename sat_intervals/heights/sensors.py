@@ -1,4 +1,4 @@
-"""Epipolar pixels to points on the ground, through sensor models and epipolar grids. The only home of shareloc."""
+"""Convert epipolar pixels to ground points with sensor models and epipolar grids (shareloc)."""
 
 import math
 import warnings
@@ -19,15 +19,15 @@ try:
 except ModuleNotFoundError as error:
     raise SatIntervalsError("triangulation needs shareloc: pip install 'sat-intervals[dsm]'") from error
 
-# Pixels between the nodes of the lattice: points are smooth enough for errors below a millimetre between them.
+# Pixels between nodes of the lattice: interpolation errors are below 1 mm.
 _SPACING = 32
-# Nodes that shareloc is given at a time, a kilobyte each.
+# Nodes triangulated at a time, a kilobyte each.
 _AT_ONCE = 100_000
-# Positions along rows and columns of a region, and ends of the search range, by which models and grids are judged.
-_JUDGED = 9
-# Lines of sight of one scene meet within centimetres; with models of two scenes they pass by hundreds of metres.
+# Positions along rows and columns of a region, to check models and grids.
+_CHECKED = 9
+# Metres: lines of sight of one scene meet within centimetres, those of two scenes miss by hundreds of metres.
 _FOREIGN_RESIDUAL = 10.0
-# Metres above the ellipsoid between which all ground lies.
+# Range of ground heights on Earth, metres above the ellipsoid.
 _GROUND = -600.0, 9500.0
 
 
@@ -52,7 +52,7 @@ class Points(NamedTuple):
 
 @dataclass(frozen=True)
 class Sensors:
-    """Models of both images and the grids that lead from epipolar to sensor positions, as shareloc reads them."""
+    """Sensor models of both images, and grids from epipolar to sensor positions, as read by shareloc."""
 
     left_model: Any
     right_model: Any
@@ -66,21 +66,21 @@ class Sensors:
         Raises
         ------
         SatIntervalsError
-            A file that is missing or holds something else.
+            A file is missing or has another content.
         """
         models = (_read(path, "RPC model", GeoModel) for path in (left_model, right_model))
         grids = (_read(path, "epipolar grid", RectificationGrid) for path in (left_grid, right_grid))
         return cls(*models, *grids)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-        """Points of epipolar positions: ``(n, 4)`` longitude, latitude, height and residual, see `Points`.
+        """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions, see `Points`.
 
         Parameters
         ----------
         row, column
-            ``(n,)`` positions in the whole left epipolar image, pixel centres being integers.
+            ``(n,)`` positions in the whole left epipolar image; pixel centres are integers.
         disparity
-            ``(n,)`` pixels; the partner is at ``column + disparity`` of the same row.
+            ``(n,)`` pixels; the right pixel is at ``column + disparity`` of the same row.
         """
         matches = np.column_stack([column, row, column + disparity, row]).astype(np.float64)
         found = [self._triangulate(matches[first : first + _AT_ONCE]) for first in range(0, len(matches), _AT_ONCE)]
@@ -99,24 +99,24 @@ def _read(path: Path, kind: str, reader: Any) -> Any:
     try:
         with warnings.catch_warnings(action="ignore"):
             return reader(str(path))
-    except Exception as error:  # whatever shareloc, scipy or GDAL stumble over
+    except Exception as error:  # shareloc, scipy and GDAL raise many types
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise SatIntervalsError(f"{path} is no {kind} that shareloc reads: {reason}") from error
+        raise SatIntervalsError(f"shareloc cannot read {path} as {kind}: {reason}") from error
 
 
 class Lattice:
-    """Points at the nodes of a lattice over rows, columns and disparities, and between them by interpolation.
+    """Triangulate the nodes of a lattice over rows, columns and disparities, and interpolate points between them.
 
-    shareloc takes seconds for a million points, and there are three to a pixel. Between nodes 32 pixels apart the
-    points are linear to less than a millimetre. Nodes are triangulated row by row as windows come, from the top, and
-    forgotten above them.
+    shareloc needs seconds for a million points, and each pixel has three. Between nodes 32 pixels apart, linear
+    interpolation is accurate to less than 1 mm. Windows must come from the top: nodes are triangulated row by row when
+    needed, and dropped above the window.
 
     Parameters
     ----------
     sensors
         Models and grids.
     region
-        The pixels of the left image that it covers.
+        The pixels of the left image to cover.
     right_width
         Columns of the right image.
     minimum, maximum
@@ -125,13 +125,13 @@ class Lattice:
     Raises
     ------
     SatIntervalsError
-        Grids that do not cover the region, models that do not fit each other.
+        The grids do not cover the region, or the models do not fit.
     """
 
     def __init__(self, sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:
         _check_cover(sensors, region, right_width, minimum, maximum)
-        self.residual = _judged(sensors, region, minimum, maximum)
-        """Metres by which lines of sight pass each other, in the median of a few places."""
+        self.residual = _median_residual(sensors, region, minimum, maximum)
+        """Median distance between lines of sight at some positions, in metres."""
         self._sensors = sensors
         self._minimum = float(minimum)
         (self._rows, row_step) = _axis(region.row, region.row_stop - 1)
@@ -141,7 +141,7 @@ class Lattice:
         self._nodes: dict[int, np.ndarray] = {}
 
     def points(self, window: Window, *disparities: np.ndarray) -> list[Points]:
-        """Points of each of some disparities of a window ``(rows, columns)``, counted from the region's first pixel."""
+        """Return the points of disparity maps ``(rows, columns)`` of a window, relative to the region."""
         step = self._spacing[0]
         first = min(int(window.row / step), len(self._rows) - 2)
         last = min(int((window.row_stop - 1) / step) + 1, len(self._rows) - 1)
@@ -156,21 +156,21 @@ class Lattice:
         ]
 
     def _row(self, row: int) -> np.ndarray:
-        """A row of nodes: ``(columns, disparities, 4)``."""
+        """Triangulate a row of nodes: ``(columns, disparities, 4)``."""
         column, disparity = np.meshgrid(self._columns, self._disparities, indexing="ij")
         points = self._sensors.triangulate(np.full(column.size, self._rows[row]), column.ravel(), disparity.ravel())
         return points.reshape(*column.shape, 4)
 
 
 def _axis(first: float, last: float) -> tuple[np.ndarray, float]:
-    """Nodes that reach from first to last, at most `_SPACING` apart, and how far apart they are."""
+    """Return nodes from first to last, at most `_SPACING` apart, and their distance."""
     count = max(1, math.ceil((last - first) / _SPACING))
     step = max(1.0, (last - first) / count)
     return first + step * np.arange(count + 1), step
 
 
 def _check_cover(sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:
-    """Refuse a grid that ends inside the images: shareloc goes on past its end without a word."""
+    """Raise if a grid does not cover the images: shareloc extrapolates silently."""
     rows = region.row, region.row_stop - 1
     columns = region.column, region.column_stop - 1
     seen = max(0, columns[0] + minimum), min(right_width - 1, columns[1] + maximum)
@@ -179,25 +179,25 @@ def _check_cover(sensors: Sensors, region: Window, right_width: int, minimum: in
         for name, nodes in (("rows", grid_rows), ("columns", grid_columns)):
             if nodes[0] > nodes[-1]:
                 raise SatIntervalsError(
-                    f"the {name} of {grid.grid_filename} descend: give a grid whose positions ascend"
+                    f"the {name} of {grid.grid_filename} are in descending order: give a grid in ascending order"
                 )
         inside = grid_rows[0] <= rows[0] and rows[1] <= grid_rows[-1]
         if not (inside and grid_columns[0] <= first and last <= grid_columns[-1]):
             raise SatIntervalsError(
                 f"{grid.grid_filename} covers rows {grid_rows[0]:g} to {grid_rows[-1]:g} and columns "
-                f"{grid_columns[0]:g} to {grid_columns[-1]:g} of the {side} epipolar image, the run rows {rows[0]} to "
-                f"{rows[1]} and columns {first} to {last}: give the grid of this image"
+                f"{grid_columns[0]:g} to {grid_columns[-1]:g} of the {side} epipolar image, the run needs rows "
+                f"{rows[0]} to {rows[1]} and columns {first} to {last}: give the grid of this image"
             )
 
 
-def _judged(sensors: Sensors, region: Window, minimum: int, maximum: int) -> float:
-    """The median residual of lines of sight all over a region; refuses models that do not fit."""
-    rows = np.linspace(region.row, region.row_stop - 1, _JUDGED)
-    columns = np.linspace(region.column, region.column_stop - 1, _JUDGED)
+def _median_residual(sensors: Sensors, region: Window, minimum: int, maximum: int) -> float:
+    """Return the median residual at some positions across a region; raise if the models do not fit."""
+    rows = np.linspace(region.row, region.row_stop - 1, _CHECKED)
+    columns = np.linspace(region.column, region.column_stop - 1, _CHECKED)
     places = np.meshgrid(rows, columns, [minimum, maximum], indexing="ij")
     try:
         points = sensors.triangulate(*(place.ravel() for place in places))
-    except (ValueError, TypeError, ArithmeticError) as error:  # of what grids hold, such as complex numbers
+    except (ValueError, TypeError, ArithmeticError) as error:  # grids of complex numbers, for example
         raise SatIntervalsError(
             f"shareloc cannot use {sensors.left_grid.grid_filename} and {sensors.right_grid.grid_filename}: "
             f"{' '.join(str(error).split())}"
@@ -206,13 +206,13 @@ def _judged(sensors: Sensors, region: Window, minimum: int, maximum: int) -> flo
     if 2 * len(points) < places[0].size:
         raise SatIntervalsError(
             f"shareloc finds no point for {places[0].size - len(points)} of {places[0].size} lines of sight: check "
-            "which model and which grid belong to the left and the right image; a scene across the 180th meridian is "
-            "beyond it"
+            "which model and which grid belong to the left and the right image; shareloc does not support scenes "
+            "across the 180th meridian"
         )
     residual, height = float(np.median(points[:, 3])), float(np.median(points[:, 2]))
     if not (residual <= _FOREIGN_RESIDUAL and _GROUND[0] <= height <= _GROUND[1]):
         raise SatIntervalsError(
-            f"the models do not fit these images: lines of sight pass each other by {residual:.1f} m and meet at "
-            f"{height:.0f} m (medians): check which model and which grid belong to the left and the right image"
+            f"the models do not fit these images: lines of sight miss each other by {residual:.1f} m at a height "
+            f"of {height:.0f} m (medians): check which model and which grid belong to the left and the right image"
         )
     return residual

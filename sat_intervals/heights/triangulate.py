@@ -1,25 +1,27 @@
-"""From the disparities and bounds of a run to points and heights, in the geometry of the run.
+"""Triangulate the disparities and bounds of a run: points and heights in its geometry.
 
-Points are interpolated from a lattice, which takes about a second a megapixel: no tiles, no cluster and no resuming are
-needed. Rows are read, computed and written strip by strip, whatever the size.
+Points are interpolated from a lattice at about one second per megapixel, so a single process without resuming is
+enough. Rows are read, computed and written strip by strip, so memory does not depend on the size.
 """
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sat_intervals.heights.sensors import Lattice, Points, Sensors
 from sat_intervals.progress import Progress
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
-# Pixels in work at a time, 300 bytes each; those read and waiting are 18.
+if TYPE_CHECKING:
+    from sat_intervals.heights.sensors import Lattice, Points
+
+# Pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes.
 _PIXELS = 1 << 20
-# What is written is rounded to hundredths of a millimetre on the ground and tenths of one in height, below the error of
-# the lattice: the file is half as large.
+# Positions are rounded to 0.01 mm on the ground and 0.1 mm in height, below the error of the lattice. This halves the
+# file.
 _DEGREES, _METRES = 2.0**-33, 2.0**-13
 
 
@@ -31,7 +33,7 @@ def triangulate(
     right_grid: str | Path,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Triangulate a run: ``points.tif`` beside its files.
+    """Triangulate a run and write ``points.tif`` to its folder.
 
     Parameters
     ----------
@@ -40,23 +42,25 @@ def triangulate(
     left_model, right_model
         RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
     left_grid, right_grid
-        Epipolar grids: band 1 sensor column, band 2 sensor row at nodes whose epipolar position the geotransform tells
-        (the convention of shareloc and CARS). Epipolar positions are those of the whole left image.
+        Epipolar grids: band 1 is the sensor column, band 2 the sensor row. The geotransform gives the epipolar position
+        of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image.
     progress
-        Called from time to time.
+        Callback, see `Progress`.
 
     Returns
     -------
-    ``points``, how many pixels have one, and ``lost``, how many valid pixels have none, for grids or models that have
-    no values there; where there are points, the least and the largest ``height`` (metres above the ellipsoid) and
-    ``residual`` (metres); ``median_residual`` of a few places all over the region: with models and grids of these
-    images it is far below a decimetre, whatever the disparities.
+    ``points``, the number of points; ``lost``, the number of valid pixels without a point, because grids or models have
+    no values there; if there are points, minimum and maximum of ``height`` (metres above the ellipsoid) and
+    ``residual`` (metres); ``median_residual`` (metres) at some positions across the region, far below 0.1 m if models
+    and grids belong to these images, for any disparities.
 
     Raises
     ------
     SatIntervalsError
-        No run, models or grids that cannot be read or do not fit, a file that cannot be written.
+        The folder is not a run, models or grids cannot be read or do not fit, or the file cannot be written.
     """
+    from sat_intervals.heights.sensors import Lattice, Sensors  # needs the extra `dsm`
+
     run = open_run(out)
     run.check_kept([run.out / POINT_FILES[0].name], [left_model, right_model, left_grid, right_grid])
     search = run.config.disparity
@@ -78,7 +82,7 @@ def triangulate(
 
 
 class _Tally:
-    """How many points there are, and what lies between which values."""
+    """Count points and valid pixels, and gather minimum and maximum of some bands."""
 
     def __init__(self) -> None:
         self._points = self._valid = 0
@@ -102,7 +106,7 @@ def _georeferencing(run: Run) -> Georeferencing:
 
 
 def _strips(run: Run) -> Iterator[tuple[Window, np.ndarray]]:
-    """Windows of whole rows, from the top, with disparity, lower and upper ``(3, rows, columns)``, NaN if not valid.
+    """Yield windows of whole rows from the top with disparity, lower and upper ``(3, rows, columns)``, NaN if invalid.
 
     Files are read by rows of blocks, which are then cut.
     """
@@ -115,10 +119,10 @@ def _strips(run: Run) -> Iterator[tuple[Window, np.ndarray]]:
             yield Window(block.row + first, 0, part.shape[1], block.width), part
 
 
-def _bands(lattice: Lattice, window: Window, disparities: np.ndarray) -> np.ndarray:
-    """The bands of ``points.tif`` for a window."""
+def _bands(lattice: "Lattice", window: Window, disparities: np.ndarray) -> np.ndarray:
+    """Return the bands of ``points.tif`` for a window."""
     middle, one, other = lattice.points(window, *disparities)
-    # Which bound is the higher depends on which image is the left one, and how the grids are turned.
+    # Which bound gives the higher point depends on the geometry of the pair.
     low, high = _ordered(one, other)
     heights = (point.height for point in (middle, low, high))
     middle_place, *bound_places = ((point.longitude, point.latitude) for point in (middle, low, high))
@@ -136,9 +140,9 @@ def _rounded(bands: Iterable[np.ndarray], step: float) -> Iterator[np.ndarray]:
     return (np.rint(band / step) * step for band in bands)
 
 
-def _ordered(one: Points, other: Points) -> tuple[Points, Points]:
-    """The lower and the higher of two points of each pixel."""
+def _ordered(one: "Points", other: "Points") -> tuple["Points", "Points"]:
+    """Return the lower and the higher of two points of each pixel."""
     swapped = one.height > other.height
-    low = Points(*(np.where(swapped, b, a) for a, b in zip(one, other, strict=True)))
-    high = Points(*(np.where(swapped, a, b) for a, b in zip(one, other, strict=True)))
+    low = type(one)(*(np.where(swapped, b, a) for a, b in zip(one, other, strict=True)))
+    high = type(one)(*(np.where(swapped, a, b) for a, b in zip(one, other, strict=True)))
     return low, high

@@ -1,1 +1,1 @@
-"""Other tools of photogrammetry: a method of CARS, exports to CARS, ASP, s2p and OTB."""
+"""Work with other photogrammetry tools: a plugin for CARS, exports to CARS, ASP, s2p and OTB."""

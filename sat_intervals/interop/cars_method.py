@@ -1,7 +1,7 @@
-"""The matcher as a method of CARS, in its own pipeline: ``dense_matching: {method: sat_intervals}``.
+"""Provide the matcher as a method of CARS: ``dense_matching: {method: sat_intervals}``.
 
-It takes from CARS what is CARS' own, the size of tiles, their margins and the dataset of a tile, and puts disparity,
-interval and confidence where its triangulation looks for them.
+CARS chooses tiles, margins and the dataset of a tile. The method writes disparity, interval and confidence under the
+names that CARS' triangulation reads.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from pandora.margins import Margins
 from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 
-# Bands of `match_arrays` under the names of CARS' triangulation. Of the first CARS makes its ambiguity, 1 - confidence.
+# Bands of `match_arrays` -> names in CARS' triangulation. CARS computes its ambiguity, 1 - confidence, from the first.
 _INDICATORS = {
     "confidence": "confidence_from_ambiguity.cars_1",
     "lower": "confidence_from_interval_bounds_inf.cars_3",
@@ -28,16 +28,16 @@ _INDICATORS = {
 
 
 class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore[call-arg, misc]
-    """Disparities with intervals, tile by tile of CARS.
+    """Match the tiles of CARS: disparities with intervals.
 
     Parameters
     ----------
     conf
-        What CARS' configuration says of ``dense_matching``. ``settings`` holds this package's own, by sections, without
-        the search range, which CARS knows. The rest is Pandora's and does not matter.
+        The section ``dense_matching`` of CARS' configuration. ``settings`` contains the settings of this package by
+        sections, without the search range, which CARS provides. Other keys belong to Pandora and are ignored.
 
-    Confidence is relative to the whole search range (``ambiguity: {normalization: range}``) unless the settings say
-    otherwise: percentiles of one tile would make neighbouring tiles differ.
+    By default, confidence is relative to the whole search range (``ambiguity: {normalization: range}``): percentiles of
+    one tile would make adjacent tiles differ.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
             "loader_conf": Or(dict, None),
             "confidence_filtering": dict,
         }
-        # CARS' pipeline asks every method for Pandora's maps of risk and its filtering by them: here are intervals.
+        # CARS' pipeline expects Pandora's risk maps and its filters of each method; ours provides intervals.
         self.used_config: dict[str, Any] = {
             "method": "sat_intervals",
             "settings": dict((conf or {}).get("settings") or {}),
@@ -73,13 +73,13 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         self.margins = Margins(overlap, overlap, overlap, overlap)
 
     def _config(self, minimum: int, maximum: int) -> Config:
-        """The settings over a search range."""
+        """Return the settings with a search range."""
         settings = self.used_config["settings"]
         wrong = [name for name in ("disparity",) if name in settings]
         wrong += [name for name in ("interval", "ambiguity") if settings.get(name, {}) is None]
         if wrong:
             raise SatIntervalsError(
-                f"dense_matching.settings: leave out {' and '.join(wrong)}: CARS gives the search range, and needs "
+                f"dense_matching.settings: leave out {' and '.join(wrong)}: CARS provides the search range and needs "
                 "intervals and ambiguity"
             )
         ambiguity = settings.get("ambiguity", {})
@@ -103,10 +103,10 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
     ) -> xr.Dataset:
         """Match one tile with its margins; parameters and result are those of CARS' abstract method.
 
-        The whole range of the tile is searched in all its pixels; where CARS' memory does not allow it, it is cropped
-        around nil as CARS does.
+        Each pixel is searched over the range of the whole tile. If CARS limits memory, the range is cropped around zero
+        as CARS does.
         """
-        from sat_intervals.match.in_memory import match_arrays  # not for every `import cars`: it sets up numba
+        from sat_intervals.match.in_memory import match_arrays  # `import cars` must not load numba
 
         grids = dense_matching_algo.compute_disparity_grid(
             disp_range_grid.data, left_image_object, right_image_object, used_band, False
@@ -139,7 +139,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
 
 
 class _NoLoader:
-    """What CARS asks of the loader of Pandora's configuration: there is none."""
+    """Replace the loader of Pandora's configuration, which CARS calls."""
 
     def get_conf(self) -> dict[str, Any]:
         return {}
@@ -149,20 +149,20 @@ class _NoLoader:
 
 
 def _search_range(lowest: np.ndarray, highest: np.ndarray, most: int | None) -> tuple[int, int, bool]:
-    """The range that holds those of all pixels, and whether it is cropped around nil, to ``most`` disparities."""
+    """Return the range over all pixels, cropped around zero to ``most`` disparities, and whether it was cropped."""
     minimum, maximum = int(np.floor(lowest.min())), int(np.ceil(highest.max()))
     share = 1.0 if most is None else min(1.0, most / max(1, maximum - minimum))
     return round(share * minimum), round(share * maximum), share < 1
 
 
 def _of_band(tile: xr.Dataset, band: str) -> xr.Dataset:
-    """The tile with the mask of one band."""
+    """Return the tile with the mask of one band."""
     mask = tile[names.EPI_MSK].sel({names.BAND_IM: band}, drop=True)
     return tile.drop_vars(names.EPI_MSK).assign({names.EPI_MSK: mask})
 
 
 def _pixels(tile: xr.Dataset, band: str, classes: list[Any] | None = None) -> np.ma.MaskedArray:
-    """The pixels of one band, masked where the tile's mask is, or any of some classes."""
+    """Return the pixels of one band, masked by the tile's mask and by classes."""
     masked = tile[names.EPI_MSK].values != 0
     if classes and names.EPI_CLASSIFICATION in tile:
         masked |= (tile[names.EPI_CLASSIFICATION].sel(band_classif=classes).values != 0).any(axis=0)
@@ -170,7 +170,7 @@ def _pixels(tile: xr.Dataset, band: str, classes: list[Any] | None = None) -> np
 
 
 def _as_pandora(matched: xr.Dataset, tile: xr.Dataset) -> xr.Dataset:
-    """The dataset that Pandora would return, whose validity bits are those of `products`."""
+    """Return the dataset that Pandora would return; its validity bits are those of `products`."""
     place = (names.ROW, names.COL)
     layers = np.stack([matched[band].values for band in _INDICATORS], axis=-1)
     return xr.Dataset(

@@ -1,8 +1,8 @@
-"""What CARS loads whenever it is imported, by the entry point group ``cars.plugins``: it registers our method."""
+"""Register our method with CARS, which imports this module through the entry point group ``cars.plugins``."""
 
 import warnings
 
 try:
     from sat_intervals.interop.cars_method import SatIntervals as SatIntervals
-except ImportError as error:  # of another CARS than the extra [cars] names, which must go on without us
-    warnings.warn(f"this CARS cannot match with sat_intervals, which needs CARS 1.3: {error}", stacklevel=2)
+except ImportError as error:  # another version of CARS must still work, without our method
+    warnings.warn(f"sat_intervals needs CARS 1.3 and cannot be used with this version: {error}", stacklevel=2)

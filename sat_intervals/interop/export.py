@@ -1,7 +1,7 @@
-"""A run as the files that other photogrammetry tools take for their own.
+"""Export a run to the file formats of other photogrammetry tools.
 
-In all of them disparity is ``x_right - x_left`` of the epipolar pair, as here, and none has a CRS. Files have the size
-of the left image, since these tools lay them on it; what is outside the region that was matched is not valid.
+All of them define disparity as ``x_right - x_left`` of the epipolar pair, as here, and none uses a CRS. The files have
+the size of the left image; pixels outside the matched region are invalid.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from sat_intervals.tiling import Window, strips
 _STRIP = 1 << 22
 
 Raster = tuple[File, Callable[[Bands], np.ndarray]]
-"""A file, and its bands from those of a run; NaN, not valid, becomes the file's no-data value, or 0 without one."""
+"""A file and a function from the bands of a run to its bands. NaN (invalid) becomes the file's no-data value if any."""
 
 
 def _file(name: str, *bands: str, dtype: str = "float32", nodata: float | None = None, driver: str = "COG") -> File:
@@ -28,12 +28,12 @@ def _file(name: str, *bands: str, dtype: str = "float32", nodata: float | None =
 
 
 def _two(horizontal: np.ndarray, *more: np.ndarray) -> np.ndarray:
-    """A horizontal disparity and the vertical one, which is nil."""
+    """Stack the horizontal disparity, a vertical disparity of zero, and ``more``."""
     return np.stack([horizontal, np.zeros_like(horizontal), *more])
 
 
 def _cars(prefix: str, config: Config) -> list[Raster]:
-    """The epipolar disparity that CARS 1.3 saves: 255 = valid in the mask, -9999 = no data in all others."""
+    """Return the files of CARS 1.3: 255 = valid in the mask, -9999 = no data in the others."""
     bounds: list[Raster] = [
         (_file("epi_disp_interval_bounds_inf.tif", "lower", nodata=-9999), lambda pixels: pixels.lower),
         (_file("epi_disp_interval_bounds_sup.tif", "upper", nodata=-9999), lambda pixels: pixels.upper),
@@ -51,13 +51,13 @@ def _cars(prefix: str, config: Config) -> list[Raster]:
 
 
 def _asp(prefix: str, config: Config) -> list[Raster]:
-    """The disparity that ``parallel_stereo --entry-point 5`` triangulates: horizontal, vertical, 1 = valid."""
+    """Return the input of ``parallel_stereo --entry-point 5``: horizontal, vertical, 1 = valid."""
     file = _file(f"{prefix}-F.tif", "horizontal", "vertical", "valid")
     return [(file, lambda pixels: _two(np.nan_to_num(pixels.disparity), pixels.valid))]
 
 
 def _s2p(prefix: str, config: Config) -> list[Raster]:
-    """What s2p leaves in the folder of a tile after matching: NaN = no disparity, 1 = valid in the mask."""
+    """Return the files of s2p after matching a tile: NaN = no disparity, 1 = valid in the mask."""
     confidence: Raster = (
         _file("rectified_disp_confidence.tif", "confidence", nodata=float("nan")),
         lambda pixels: pixels.confidence,
@@ -70,7 +70,7 @@ def _s2p(prefix: str, config: Config) -> list[Raster]:
 
 
 def _otb(prefix: str, config: Config) -> list[Raster]:
-    """What OTB's DisparityMapToElevationMap takes as ``-io.in`` (horizontal, vertical) and ``-io.mask``."""
+    """Return the input of OTB's DisparityMapToElevationMap: ``-io.in`` (horizontal, vertical), ``-io.mask``."""
     return [
         (_file("disparity.tif", "horizontal", "vertical"), lambda pixels: _two(np.nan_to_num(pixels.disparity))),
         (_file("mask.tif", "valid", dtype="uint8"), lambda pixels: 255 * pixels.valid),
@@ -81,7 +81,7 @@ FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "asp
 
 
 def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
-    """Write a run in the form of another tool.
+    """Write a run in the format of another tool.
 
     Parameters
     ----------
@@ -94,13 +94,13 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
 
     Returns
     -------
-    The files written; files of these names that were there are replaced. What a run has no band for, such as bounds
-    where its settings switch intervals off, has no file.
+    The files written. Existing files of these names are replaced. A band that the run lacks, such as bounds without
+    intervals, has no file.
 
     Raises
     ------
     SatIntervalsError
-        No run, a file that cannot be written, or one that is an input or a file of the run.
+        The folder is not a run, or a file cannot be written or would replace an input or a file of the run.
     """
     run, target = open_run(out), Path(target)
     left = run.report["inputs"]["left"]
@@ -120,7 +120,7 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
 
 
 def _read(run: Run, window: Window) -> Bands:
-    """The pixels of a window of the left image: outside the run's region none is valid."""
+    """Read a window of the left image; pixels outside the run's region are invalid."""
     pixels = np.full((4, window.height, window.width), np.nan, np.float32)
     inside = window.clipped(run.region)
     if inside.height:

@@ -1,4 +1,4 @@
-"""GeoTIFF in and out: images, their georeferencing, and the files of a run. The only home of rasterio and pyproj."""
+"""Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing

@@ -1,4 +1,4 @@
-"""What the files of a run say of themselves, from the tables of `sat_intervals.products`."""
+"""Metadata of the files of a run, from the tables of `sat_intervals.products`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, Band
 
 @dataclass(frozen=True)
 class File:
-    """What is particular to a file: its name, type, bands, further tags of its first band, predictor, GDAL driver."""
+    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver."""
 
     name: str
     dtype: str
@@ -21,7 +21,7 @@ class File:
     driver: str = "COG"
 
     def describe(self, dataset: DatasetWriter) -> None:
-        """Give the bands their names, units and meanings."""
+        """Write names, units and meanings of the bands."""
         for index, band in enumerate(self.bands, start=1):
             dataset.set_band_description(index, band.name)
             dataset.update_tags(index, meaning=band.meaning)
@@ -43,5 +43,5 @@ POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FL
 
 
 def surface_file(name: str) -> File:
-    """A surface model."""
+    """Return the properties of a surface model's file."""
     return File(name, "float32", float("nan"), SURFACE)

@@ -1,4 +1,4 @@
-"""Where an image lies, as its file tells."""
+"""Georeferencing of an image, as stored in its file."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,9 +24,9 @@ class ControlPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Georeferencing:
-    """CRS and transform, or control points, or RPCs, or nothing: what a file has, and no more.
+    """CRS and transform, control points or RPCs, as far as the file has them.
 
-    ``transform`` takes pixels (column, row) to the CRS; ``rpcs`` hold offsets in pixels of this image.
+    ``transform`` maps pixels (column, row) to the CRS; offsets of ``rpcs`` are in pixels of this image.
     """
 
     crs: CRS | None = None
@@ -37,7 +37,7 @@ class Georeferencing:
 
     @classmethod
     def of(cls, dataset: Any) -> "Georeferencing":
-        """The georeferencing of an open rasterio dataset."""
+        """Return the georeferencing of an open rasterio dataset."""
         points, points_crs = dataset.gcps
         return cls(
             crs=dataset.crs,
@@ -49,14 +49,14 @@ class Georeferencing:
 
     @property
     def pixel_size(self) -> tuple[float, float] | None:
-        """Width and height of a pixel in units of the CRS; None without a transform."""
+        """Return width and height of a pixel in units of the CRS, None without a transform."""
         if self.transform is None:
             return None
         a, b, _, d, e, _ = self.transform[:6]
         return math.hypot(a, d), math.hypot(b, e)
 
     def shifted(self, window: Window) -> "Georeferencing":
-        """The georeferencing of a region of the image, its first pixel being that of ``window``."""
+        """Return the georeferencing of a window of the image."""
         row, column = window.row, window.column
         transform, rpcs = self.transform, self.rpcs
         if transform is not None:
@@ -69,13 +69,13 @@ class Georeferencing:
         return replace(self, transform=transform, gcps=gcps, rpcs=rpcs)
 
     def refined(self, finer: int) -> "Georeferencing":
-        """The georeferencing of the same image with so many pixels along both sides of each; it has a transform."""
+        """Return the georeferencing with each pixel split into ``finer`` x ``finer``; needs a transform."""
         assert self.transform is not None
         a, b, c, d, e, f = self.transform[:6]
         return replace(self, transform=Affine(a / finer, b / finer, c, d / finer, e / finer, f))
 
     def creation_options(self) -> dict[str, Any]:
-        """The arguments by which rasterio gives it to a new GeoTIFF, which holds a transform or control points."""
+        """Return rasterio's creation options for a new GeoTIFF, which stores a transform or control points."""
         options: dict[str, Any] = {}
         if self.gcps and self.transform is None:
             points = [GroundControlPoint(row, column, x, y, z) for row, column, x, y, z in self.gcps]

@@ -1,4 +1,4 @@
-"""Which file an input is, as manifests and run.json tell; whether it still is; whether an output would replace it."""
+"""Identify input files for manifests and run.json, detect changes, and keep outputs from replacing inputs."""
 
 import hashlib
 import os
@@ -16,44 +16,43 @@ from urllib.request import Request, urlopen
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.store.folder import object_tag
 
-# Names of GDAL, as rasterio takes them too, of objects in the stores that fsspec knows.
+# GDAL's prefixes of object stores, and those of fsspec.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
-# What GDAL puts before the name of a file to look inside it: an archive, or, with offset and size, a part of a file.
+# GDAL's prefix to read inside a file: an archive, or a part given by offset and size.
 _INSIDE = re.compile(r"/vsi\w+/(\d+(_\d+)?,)?")
-# Seconds for a server to answer.
-_PATIENCE = 30
-# How often a file is hashed that is touched meanwhile.
+# Seconds until a server must answer.
+_TIMEOUT = 30
+# Attempts to hash a file that changes meanwhile.
 _TRIES = 3
 
 
 class ChangedInputError(RunError):
-    """An input that was replaced or changed while a run worked on it."""
+    """An input that was replaced or changed during a run."""
 
 
 def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:
-    """What tells a file from any other.
+    """Return what identifies a file.
 
     Parameters
     ----------
     path
         Local file, URL, or any name that GDAL opens.
     known
-        What this function said before, by path: a file of the same stamp is not hashed again.
+        Earlier results by path; a file with the same stamp is not hashed again.
 
     Returns
     -------
-    Of a local file its path, size in bytes, time of the last change, SHA-256, and a stamp: inode and times in
-    nanoseconds, of which no user can put back that of the last change of the inode. Of one inside an archive those of
-    the archive. Of one that a server of HTTP or of objects offers, size in bytes and ETag, or time of the last change
-    where it has none. The path alone of any other, and where the server answers to nobody but GDAL, who has credentials
-    of its own.
+    For a local file: path, size in bytes, modification time, SHA-256, and a stamp of inode, size and times in
+    nanoseconds (users cannot reset the inode's change time). For a file inside an archive: those of the archive. For
+    HTTP and object stores: size in bytes and ETag, or modification time without one. For any other file, and for
+    servers that only GDAL has credentials for: the path alone.
 
     Raises
     ------
     ChangedInputError
-        A file that is being written.
+        The file is being written.
     SatIntervalsError
-        A pipe or a device.
+        The path is a pipe or a device.
     """
     check_regular(path)
     if file := _local_file(path):
@@ -69,7 +68,7 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
 
 
 def _local_file(path: str) -> Path | None:
-    """The local file that a name of GDAL is read from, such as the archive of ``/vsizip/{a.zip}/left.tif``."""
+    """Return the local file behind a GDAL name, such as the archive in ``/vsizip/{a.zip}/left.tif``; None if remote."""
     name = path
     while found := _INSIDE.match(name):
         name = name[found.end() :]
@@ -87,13 +86,13 @@ def _of_file(file: Path, before: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _stamp(file: str | Path) -> str:
-    """What any change of a file changes, found without reading it."""
+    """Return inode, size and times of a file: any change of the file changes them."""
     status = os.stat(file)
     return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}"
 
 
 def _hashed(file: str | Path) -> tuple[str, str]:
-    """Stamp and SHA-256 of a file; one that is touched meanwhile is looked at again."""
+    """Return stamp and SHA-256 of a file; try again if it changes meanwhile."""
     for _ in range(_TRIES - 1):
         with suppress(ChangedInputError):
             stamp = _stamp(file)
@@ -104,16 +103,16 @@ def _hashed(file: str | Path) -> tuple[str, str]:
 
 @lru_cache(maxsize=1024)
 def _sha256(file: str | Path, stamp: str) -> str:
-    """Of a file with this stamp; a worker asks for it again with every tile."""
+    """Return the SHA-256 of a file; cached by stamp, as workers need it for every tile."""
     with open(file, "rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     if _stamp(file) != stamp:
-        raise ChangedInputError(f"{file} is being written: run the command again when it is whole")
+        raise ChangedInputError(f"{file} is being written: rerun the command when it is complete")
     return digest
 
 
 def checksum_of(file: Path) -> dict[str, int]:
-    """Bytes and CRC-32 of a local file."""
+    """Return size in bytes and CRC-32 of a local file."""
     size = crc32 = 0
     with file.open("rb") as stream:
         while block := stream.read(1 << 20):
@@ -122,9 +121,9 @@ def checksum_of(file: Path) -> dict[str, int]:
 
 
 def _of_url(url: str) -> dict[str, Any]:
-    """By a request of one byte, which servers allow that refuse HEAD."""
+    """Return size and ETag of a URL; requests one byte, since some servers refuse HEAD."""
     try:
-        with urlopen(Request(url, headers={"Range": "bytes=0-0"}), timeout=_PATIENCE) as answer:
+        with urlopen(Request(url, headers={"Range": "bytes=0-0"}), timeout=_TIMEOUT) as answer:
             headers = answer.headers
     except (OSError, HTTPException):
         return {}
@@ -133,54 +132,54 @@ def _of_url(url: str) -> dict[str, Any]:
     return {"bytes": int(size) if size.isdigit() else None, "etag": tag}
 
 
-def is_changed(path: str, told: Mapping[str, Any]) -> bool:
-    """Whether a file is no longer what `identity` told of it; where a server does not answer, it is not."""
-    if "sha256" in told:
+def is_changed(path: str, known: Mapping[str, Any]) -> bool:
+    """Return whether a file differs from its `identity` of before; False if a server does not answer."""
+    if "sha256" in known:
         file = _local_file(path)
         try:
-            return file is None or (_stamp(file) != told.get("stamp") and _hashed(file)[1] != told["sha256"])
+            return file is None or (_stamp(file) != known.get("stamp") and _hashed(file)[1] != known["sha256"])
         except FileNotFoundError:
             return True
     now = identity(path)
-    return any(key in told and now.get(key, told[key]) != told[key] for key in ("etag", "bytes"))
+    return any(key in known and now.get(key, known[key]) != known[key] for key in ("etag", "bytes"))
 
 
 def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
-    """Hold that the inputs of a run, by name, still are what `identity` told of them, after something was read of them.
+    """Raise if an input of a run, by name, differs from its `identity` of before; call it after reading.
 
-    Costs a look at each local file, which is hashed only where its stamp differs, and a request for each remote one.
+    A local file is hashed only if its stamp differs; a remote one costs a request.
 
     Raises
     ------
     ChangedInputError
-        With the first that is not.
+        Names the first changed file.
     """
-    for name, told in files.items():
-        if is_changed(name, told):
+    for name, known in files.items():
+        if is_changed(name, known):
             raise ChangedInputError(
-                f"{name} was replaced or changed while the run worked on it: put it back, and the same command goes on "
-                "from the tiles that are done, or start afresh with --overwrite"
+                f"{name} was replaced or changed during the run: restore it and rerun the same command: it resumes; or "
+                "start again with --overwrite"
             )
 
 
 def check_not_replaced(
     inputs: Iterable[str | Path | None], outputs: Iterable[str | Path], folders: Iterable[str | Path] = ()
 ) -> None:
-    """Hold that no input is a file that is to be written, by whatever name or link, or inside a folder of outputs.
+    """Raise if an input is also an output, under any name or link, or is inside a folder of outputs.
 
     Parameters
     ----------
     inputs
-        Files; names that are none of this machine's, and None, are passed over.
+        Files; remote names and None are ignored.
     outputs
         Files that are written or deleted.
     folders
-        Whose files are written and deleted.
+        Folders whose files are written and deleted.
 
     Raises
     ------
     SatIntervalsError
-        With the first input that would be lost.
+        Names the first input that would be lost.
     """
     outputs, parents = list(outputs), [Path(folder).resolve() for folder in folders]
     for name in inputs:

@@ -1,4 +1,4 @@
-"""Images in: what a raster file holds, and whether two make a pair."""
+"""Open images, and check that two make an epipolar pair."""
 
 import logging
 import os
@@ -16,9 +16,9 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.tiling import Window
 
-# Of what GDAL makes the mask of a band whose file has none: nothing, the no-data value, the alpha band.
+# Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# Pixel sizes that differ by less, relatively, are one size written with other digits.
+# Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
 
 _LOG = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class InputError(SatIntervalsError):
 
 @dataclass(frozen=True)
 class Image:
-    """One band of a raster file, and all that a worker in whatever process needs to read any window of it.
+    """One band of a raster file, with all that a worker needs to read any window of it; picklable.
 
     Attributes
     ----------
@@ -43,15 +43,15 @@ class Image:
     dtype
         NumPy name of the file's type.
     nodata
-        Value that stands for no data: the user's, else the file's, else None.
+        No-data value: the user's, else the file's, else None.
     use_mask
-        Whether the file has a mask, inside or in a ``.msk`` beside it.
+        Whether the file has a mask, inside or in a ``.msk`` file.
     alpha
-        Band, counted from 1, that is 0 where there is no data; None without one.
+        Alpha band, counted from 1, 0 where there is no data; None without one.
     mask
         The user's mask: a file of the same size, not 0 where the image must not be used; None without one.
     georeferencing
-        As in the file.
+        Georeferencing of the file.
     """
 
     path: str
@@ -73,24 +73,24 @@ def open_image(
     nodata: float | None = None,
     mask: str | os.PathLike[str] | None = None,
 ) -> Image:
-    """Look at an image without reading a pixel.
+    """Open an image without reading a pixel.
 
     Parameters
     ----------
     path
         Local file, URL, or any name that GDAL opens.
     band
-        Counted from 1; needed where there are several, an alpha band not counted.
+        Counted from 1; required if there are several, not counting an alpha band.
     nodata
-        Takes the place of the file's value; one that the file's type cannot hold matches nothing. The file's mask and
-        alpha count all the same, and NaN and infinity are always no data.
+        Replaces the file's value; a value that the file's type cannot hold matches no pixel. Mask and alpha band of the
+        file still apply, and NaN and infinity are always no data.
     mask
-        File of the same size, of which the first band is not 0 where the image must not be used.
+        File of the same size; its first band is not 0 where the image must not be used.
 
     Raises
     ------
     InputError
-        Nothing there that can be matched, or a mask that does not fit.
+        The file has no usable band, or the mask has another size.
     """
     name = _absolute(path)
     with opened(name) as dataset:
@@ -112,12 +112,12 @@ def open_image(
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
             raise InputError(
-                f"{name}: band {band} has a colour table, so its values are no grey levels: expand it first, as by "
+                f"{name}: band {band} has a colour table, so its values are not grey levels: expand it first, with "
                 "gdal_translate -expand gray"
             )
         pages = len(dataset.subdatasets) if dataset.driver == "GTiff" else 0
     if pages > 1:
-        _LOG.warning("%s has %d pages: the first is taken; name another as GTIFF_DIR:2:%s", name, pages, name)
+        _LOG.warning("%s has %d pages: the first is used; name another as GTIFF_DIR:2:%s", name, pages, name)
     if "complex" in image.dtype:
         raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
     if image.mask is not None:
@@ -126,14 +126,14 @@ def open_image(
 
 
 def check_pair(left: Image, right: Image, count: int) -> None:
-    """Hold that the rows of two images correspond, and that ``count`` disparities can be searched.
+    """Raise if the rows of two images do not correspond, or ``count`` disparities cannot be searched.
 
-    Widths and origins may differ: a disparity counts columns, not ground.
+    Widths and origins may differ: a disparity is measured in columns.
 
     Raises
     ------
     InputError
-        Images that are no epipolar pair, or fewer columns than disparities.
+        The images are not an epipolar pair, or have fewer columns than disparities.
     """
     pair = f"{left.path} and {right.path}"
     if left.height != right.height:
@@ -155,7 +155,7 @@ def check_pair(left: Image, right: Image, count: int) -> None:
 
 @contextmanager
 def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
-    """A raster open for reading, of which ``window`` is wanted; what GDAL has against it is an `InputError`."""
+    """Open a raster for reading and turn GDAL's errors into `InputError`; ``window`` is for the message."""
     check_regular(path)
     try:
         with gdal.reading(path) as dataset:
@@ -168,26 +168,26 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
             ) from error
         raise InputError(
             f"{path} cannot be read at rows {window.row} to {window.row_stop - 1}, columns {window.column} to "
-            f"{window.column_stop - 1}: {reason}: the file may be cut short, give a whole copy"
+            f"{window.column_stop - 1}: {reason}: the file may be truncated, give a complete copy"
         ) from error
 
 
 def _absolute(path: str | os.PathLike[str]) -> str:
-    """A local file wherever the process works; other names of GDAL as they are."""
+    """Return the absolute path of a local file, and other GDAL names unchanged."""
     name = os.fspath(path)
     return os.path.abspath(name) if os.path.exists(name) else name
 
 
 def _kinds(dataset: DatasetReader) -> tuple[list[int], list[int]]:
-    """Numbers of the image bands and of the alpha bands."""
+    """Return the numbers of the image bands and of the alpha bands."""
     alphas = [band for band, kind in enumerate(dataset.colorinterp, start=1) if kind == ColorInterp.alpha]
     return [band for band in dataset.indexes if band not in alphas], alphas
 
 
 def _chosen(path: str, bands: list[int], band: int | None) -> int:
-    """The band to match."""
+    """Return the number of the band to match."""
     if not bands:
-        raise InputError(f"{path} has no image band: name a raster, or one of the subdatasets if it has some")
+        raise InputError(f"{path} has no image band: give a raster, or one of its subdatasets")
     if band is None and len(bands) > 1:
         raise InputError(f"{path} has {len(bands)} bands: choose one of {bands[0]} to {bands[-1]} with --band")
     if band is not None and band not in bands:
@@ -206,7 +206,7 @@ def _check_mask(image: Image, mask: str) -> None:
 
 
 def other_files(name: str) -> list[str]:
-    """The other files that a raster is read from: a mask beside it, sources of a virtual raster and masks of these."""
+    """Return the other files that a raster is read from: its mask file, sources of a virtual raster and their masks."""
     seen: list[str] = []
     waiting = [name]
     while waiting:
@@ -214,11 +214,11 @@ def other_files(name: str) -> list[str]:
         try:
             with gdal.reading(path) as dataset:
                 files = dataset.files
-        except gdal.GDAL_ERRORS:  # a file beside it that is no raster
+        except gdal.GDAL_ERRORS:  # a sidecar file that is not a raster
             continue
         new = [file for file in files if file not in seen and Path(file).resolve() != Path(name).resolve()]
         seen += new
-        # no pipe, which nobody may ever write to; and of what a server offers only what is known to have sources
+        # no pipes, since opening one could block; of remote files only virtual rasters
         waiting += [
             file
             for file in new

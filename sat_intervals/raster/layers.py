@@ -1,4 +1,4 @@
-"""Single layers that fit in memory, such as those of the demo, and files that replace others when they are whole."""
+"""Read and write layers that fit in memory, and replace files atomically."""
 
 import os
 import shutil
@@ -20,20 +20,20 @@ from sat_intervals.raster.images import opened
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
 
-# A file kept aside: by which report, and its name.
+# Name of a file kept aside: the report's stamp and the file's name.
 _ASIDE = ".sat-intervals.{}.{}"
 
 
 def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing:
-    """The georeferencing of an image whose upper left corner is at ``x, y`` of a CRS, with square pixels."""
+    """Return the georeferencing of a north-up image with square pixels and its upper left corner at ``x, y``."""
     return Georeferencing(crs=CRS.from_user_input(crs), transform=Affine(pixel, 0.0, x, 0.0, -pixel, y))
 
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A new file beside ``path``, for the block to write, that takes the name at its end, or goes where it fails.
+    """Give the block a temporary file to write; rename it to ``path`` at the end, or delete it on failure.
 
-    A link that has the name is replaced, not followed.
+    A symbolic link at ``path`` is replaced, not followed.
     """
     path = Path(path)
     new = path.with_name(f".{uuid.uuid4().hex}-{path.name}")
@@ -47,9 +47,9 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
-    """Keep files aside while the block may replace them; put them back where it ends before ``report`` is new.
+    """Keep copies of files while the block may replace them; restore them if it does not renew ``report``.
 
-    Where the process is killed, the next block of the same files begins with that.
+    If the process is killed, the next call with the same files restores them.
     """
     with LocalFolder(report.parent).locked():
         _settle(files, report)
@@ -57,7 +57,7 @@ def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
             for file in filter(os.path.lexists, files):
                 try:
                     os.link(file, _aside(file, report), follow_symlinks=False)
-                except OSError:  # a disk without links
+                except OSError:  # a file system without hard links
                     with whole_file(_aside(file, report)) as new:
                         shutil.copy2(file, new, follow_symlinks=False)
             yield
@@ -66,16 +66,16 @@ def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
 
 
 def _settle(files: Sequence[Path], report: Path) -> None:
-    """Put files back that were kept with the report that is there, and delete those kept with one of before."""
+    """Restore the copies that belong to the current report, and delete those of an earlier one."""
     for file in files:
         for kept in file.parent.glob(_ASIDE.format("*", file.name)):
             if kept == _aside(file, report):
                 os.replace(kept, file)
-            kept.unlink(missing_ok=True)  # also where it is a link to the very file
+            kept.unlink(missing_ok=True)  # os.replace does nothing between links to the same file
 
 
 def _aside(file: Path, report: Path) -> Path:
-    """Where a file is kept until the report that is there now is replaced."""
+    """Return where the copy of a file is kept until the current report is replaced."""
     status = report.stat() if report.exists() else None
     which = f"{status.st_size:x}-{status.st_mtime_ns:x}" if status else "none"
     return file.with_name(_ASIDE.format(which, file.name))
@@ -84,7 +84,7 @@ def _aside(file: Path, report: Path) -> Path:
 def write_layer(
     path: str | os.PathLike[str], pixels: np.ndarray, nodata: float, georeferencing: Georeferencing
 ) -> None:
-    """Write ``(rows, columns)`` as a tiled, compressed GeoTIFF of one band, in place of what has the name."""
+    """Write ``(rows, columns)`` as a tiled, compressed GeoTIFF of one band; replaces an existing file."""
     height, width = pixels.shape
     kind = {"count": 1, "dtype": pixels.dtype.name, "nodata": nodata, "tiled": True, "compress": "deflate"}
     with (
@@ -98,36 +98,36 @@ def write_layer(
 def write_once(
     path: Path, pixels: np.ndarray, nodata: float, georeferencing: Georeferencing, *, overwrite: bool
 ) -> None:
-    """Write a layer as `write_layer` does, unless the file holds it already.
+    """Write a layer with `write_layer` unless the file already has the same content.
 
     Raises
     ------
     SatIntervalsError
-        When the file holds something else, and is not to be overwritten.
+        The file has other content and ``overwrite`` is not set.
     """
     if path.exists():
         with suppress(SatIntervalsError):
             if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
                 return
         if not overwrite:
-            raise SatIntervalsError(f"{path} holds something else: choose another folder or --overwrite")
+            raise SatIntervalsError(f"{path} has other content: choose another folder or --overwrite")
     write_layer(path, pixels, nodata, georeferencing)
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> np.ndarray:
-    """Read all bands of a file, or of a window inside it: ``(bands, rows, columns)`` in the file's type."""
+    """Read all bands of a file or of a window inside it, ``(bands, rows, columns)`` in the file's type."""
     area = window and RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
         return np.asarray(dataset.read(window=area))
 
 
 def read_shape(path: str | os.PathLike[str]) -> tuple[int, int, int]:
-    """Bands, rows and columns of a file."""
+    """Return the numbers of bands, rows and columns of a file."""
     with opened(str(path)) as dataset:
         return dataset.count, dataset.height, dataset.width
 
 
 def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:
-    """What a file says of itself as a whole."""
+    """Read the tags of a file as a whole."""
     with opened(str(path)) as dataset:
         return dict(dataset.tags())

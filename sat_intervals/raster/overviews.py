@@ -1,4 +1,4 @@
-"""Small pictures of large rasters, through the overviews of files that have them: memory follows the picture."""
+"""Read reduced versions of large rasters through their overviews; memory depends on the reduced size."""
 
 import os
 
@@ -12,13 +12,13 @@ from sat_intervals.tiling import Window
 
 
 def read_small_layers(path: str | os.PathLike[str], shape: tuple[int, int]) -> np.ndarray:
-    """Read all bands of a file as ``(bands, *shape)`` in the file's type: pixels are picked, never mixed."""
+    """Read all bands of a file as ``(bands, *shape)`` in the file's type, with nearest-neighbour sampling."""
     with opened(str(path)) as dataset:
         return np.asarray(dataset.read(out_shape=(dataset.count, *shape)))
 
 
 def read_small_image(image: Image, window: Window, shape: tuple[int, int]) -> np.ndarray:
-    """Read a window inside an image as ``shape`` pixels, means of those they stand for; NaN where not usable."""
+    """Read a window inside an image as ``shape`` pixels, averaged; NaN where not usable."""
     picked, state = read_inside(image, window, shape)
     if shape == (window.height, window.width):
         means = picked

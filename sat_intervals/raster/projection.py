@@ -1,4 +1,4 @@
-"""Longitude and latitude to a map, and ellipsoidal heights to a geoid."""
+"""Convert longitude and latitude to map coordinates, and ellipsoidal heights to heights above a geoid."""
 
 from pathlib import Path
 
@@ -11,16 +11,16 @@ from pyproj.exceptions import CRSError, ProjError
 from sat_intervals.errors import SatIntervalsError
 
 _GEOGRAPHIC = "EPSG:4326"
-# Degrees beyond the area of a CRS at which its map still serves: the next UTM zone.
+# Degrees outside the area of a CRS that are accepted: the next UTM zone.
 _BEYOND = 6.0
-# By which a map's scale may be off: beyond what UTM has in the next zone (1 %), and polar maps at their edges (4 %).
+# Largest scale error of a map: above that of UTM in the next zone (1 %) and of polar maps at their edges (4 %).
 _LARGEST_DISTORTION = 0.05
 # Metres.
 _LARGEST_UNDULATION = 120.0
 
 
 def utm_of(longitude: float, latitude: float) -> str:
-    """The UTM zone of a place (degrees), such as ``EPSG:32637``."""
+    """Return the UTM zone of a place (degrees), such as ``EPSG:32637``."""
     area = AreaOfInterest(longitude, latitude, longitude, latitude)
     zones = query_utm_crs_info(datum_name="WGS 84", area_of_interest=area)
     if not zones:
@@ -29,19 +29,19 @@ def utm_of(longitude: float, latitude: float) -> str:
 
 
 class Projection:
-    """Points to map coordinates in metres, and heights above the ellipsoid to heights above a geoid.
+    """Convert points to map coordinates in metres, and heights above the ellipsoid to heights above a geoid.
 
     Parameters
     ----------
     crs
         A projected CRS in metres, such as ``EPSG:32637``.
     geoid
-        A grid of geoid heights that PROJ reads (GTX, GeoTIFF); None leaves heights above the ellipsoid.
+        A grid of geoid heights that PROJ reads (GTX, GeoTIFF); None for heights above the ellipsoid.
 
     Raises
     ------
     SatIntervalsError
-        Another CRS, a grid that cannot be read.
+        The CRS is not a map in metres, or the grid cannot be read.
     """
 
     def __init__(self, crs: str, geoid: Path | None = None) -> None:
@@ -49,13 +49,15 @@ class Projection:
         try:
             target = CRS.from_user_input(crs)
         except CRSError as error:
-            raise SatIntervalsError(f"{crs} is no CRS that PROJ knows: give one such as EPSG:32637") from error
+            raise SatIntervalsError(f"{crs} is not a CRS known to PROJ: give one such as EPSG:32637") from error
         if not target.is_projected or target.axis_info[0].unit_name != "metre":
             raise SatIntervalsError(
-                f"{crs} ({target.name}) is no map in metres: give a projected CRS such as EPSG:32637"
+                f"{crs} ({target.name}) is not a map in metres: give a projected CRS such as EPSG:32637"
             )
         if len(target.axis_info) != 2:
-            raise SatIntervalsError(f"{crs} ({target.name}) has heights too: give a map alone, and a geoid by --geoid")
+            raise SatIntervalsError(
+                f"{crs} ({target.name}) includes heights: give a horizontal CRS, and a geoid with --geoid"
+            )
         self.crs = crs
         self._area = target.area_of_use
         self._proj = Proj(target)
@@ -63,7 +65,7 @@ class Projection:
         self._geoid = None if geoid is None else _geoid(geoid)
 
     def check(self, longitude: float, latitude: float) -> None:
-        """Refuse a CRS whose area is elsewhere, and heights that are no geoid's, at a place (degrees)."""
+        """Raise if the CRS or the geoid does not fit at a place (degrees)."""
         here = f"longitude {longitude:.2f}, latitude {latitude:.2f}"
         area = self._area
         if area is not None:
@@ -72,28 +74,28 @@ class Projection:
             if max(beyond) > _BEYOND:
                 raise SatIntervalsError(
                     f"{self.crs} is for longitudes {area.west:g} to {area.east:g} and latitudes {area.south:g} to "
-                    f"{area.north:g}, the points are at {here}: give the CRS of this place, or none for its UTM zone"
+                    f"{area.north:g}, the points are at {here}: give a CRS of this area, or none for its UTM zone"
                 )
         factors = self._proj.get_factors(longitude, latitude)
         scale = max(factors.meridional_scale, factors.parallel_scale, key=lambda factor: abs(factor - 1))
         if not abs(scale - 1) <= _LARGEST_DISTORTION:
             raise SatIntervalsError(
-                f"a metre of {self.crs} is {1 / scale:.3g} m on the ground at {here}: give a map true to scale there, "
-                f"such as its UTM zone {utm_of(longitude, latitude)}"
+                f"a metre of {self.crs} is {1 / scale:.3g} m on the ground at {here}: give a map with true scale "
+                f"there, such as its UTM zone {utm_of(longitude, latitude)}"
             )
         undulation = float(self.undulation(np.array([longitude]), np.array([latitude]))[0])
         if not abs(undulation) <= _LARGEST_UNDULATION:
             raise SatIntervalsError(
-                f"the grid of geoid heights says {undulation:g} m at {here}, where the points are: give one that "
-                f"covers them; the geoid is never more than {_LARGEST_UNDULATION:g} m from the ellipsoid"
+                f"the grid of geoid heights has {undulation:g} m at {here}, where the points are: give one that covers "
+                f"them; the geoid is at most {_LARGEST_UNDULATION:g} m from the ellipsoid"
             )
 
     def place(self, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Easting and northing in metres."""
+        """Return easting and northing in metres."""
         return self._map.transform(longitude, latitude)
 
     def undulation(self, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
-        """Metres from the ellipsoid up to the geoid; 0 without one, NaN beyond its grid."""
+        """Return metres from the ellipsoid up to the geoid; 0 without a geoid, NaN outside its grid."""
         if self._geoid is None:
             return np.zeros(longitude.shape)
         height = np.asarray(self._geoid.transform(longitude, latitude, np.zeros(longitude.shape))[2])
@@ -109,4 +111,4 @@ def _geoid(path: Path) -> Transformer:
     try:
         return Transformer.from_pipeline(f"+proj=pipeline +step {radians} +step {shift} +step {degrees}")
     except ProjError as error:
-        raise SatIntervalsError(f"{path} is no grid of geoid heights that PROJ reads: {error}") from error
+        raise SatIntervalsError(f"{path} is not a grid of geoid heights that PROJ reads: {error}") from error

@@ -1,4 +1,4 @@
-"""Rasters on the cells of a surface model."""
+"""Read rasters on the grid of a surface model."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from sat_intervals.tiling import Window
 
 
 def is_surface(path: Path) -> bool:
-    """Whether a file has the bands of a surface model."""
+    """Return whether a file has the bands of a surface model."""
     try:
         with opened(str(path)) as dataset:
             return bool(dataset.descriptions == tuple(band.name for band in SURFACE))
@@ -27,27 +27,27 @@ def is_surface(path: Path) -> bool:
 
 
 def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
-    """Rows and columns of a surface, and where it lies.
+    """Return rows and columns of a surface model, and its georeferencing.
 
     Raises
     ------
     SatIntervalsError
-        Where it has no CRS or is not north up.
+        It has no CRS or is not north up.
     """
     with opened(str(path)) as dataset:
         place = Georeferencing.of(dataset)
         if place.crs is None or place.transform is None or place.transform.b or place.transform.d:
-            raise SatIntervalsError(f"{path} does not say where it lies: give a north-up raster with a CRS")
+            raise SatIntervalsError(f"{path} has no CRS or is not north up: give a north-up raster with a CRS")
         return dataset.shape, place
 
 
 def check_reference(path: Path, surface: Path) -> None:
-    """Refuse reference heights that cannot be laid on a surface model, or count from another level.
+    """Raise if reference heights cannot be resampled to a surface model, or have another vertical datum.
 
     Raises
     ------
     SatIntervalsError
-        A CRS that is local, or one with heights above a geoid where those of the surface are above the ellipsoid.
+        The CRS is local, or has heights above a geoid while the surface has heights above the ellipsoid.
     """
     with opened(str(path)) as dataset:
         crs = pyproj.CRS.from_wkt(dataset.crs.to_wkt())
@@ -61,12 +61,12 @@ def check_reference(path: Path, surface: Path) -> None:
     if len(parts) > 1 and level.endswith("ellipsoid") and "ellipsoid" not in parts[1].name.lower():
         raise SatIntervalsError(
             f"{path} has heights of {parts[1].name}, {surface} heights {level}: make the surface with --geoid, or "
-            "bring the reference to the ellipsoid"
+            "convert the reference to the ellipsoid"
         )
 
 
 def resolution_of(path: Path, place: Georeferencing) -> float:
-    """Side of a raster's pixels in units of another CRS."""
+    """Return the pixel size of a raster in units of another CRS."""
     with opened(str(path)) as dataset:
         transform, _, _ = calculate_default_transform(
             dataset.crs, place.crs, dataset.width, dataset.height, *dataset.bounds
@@ -77,18 +77,18 @@ def resolution_of(path: Path, place: Georeferencing) -> float:
 def read_heights(
     path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, *, smooth: bool = False
 ) -> np.ndarray:
-    """The first band of a raster at the centres of cells; NaN where there is none.
+    """Read the first band of a raster at the centres of cells, NaN where it has no value.
 
     Parameters
     ----------
     path
         Any raster with a CRS; scale and offset of its band are applied.
     place, shape
-        The cells.
+        Georeferencing and size of the grid of cells.
     window
-        Which of them.
+        The cells to read.
     smooth
-        Whether values are interpolated between the raster's pixels; else the nearest counts.
+        Whether to interpolate bilinearly; otherwise the nearest pixel is used.
     """
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
@@ -98,5 +98,5 @@ def read_heights(
             with WarpedVRT(dataset, dtype="float64", nodata=np.nan, **grid) as warped:
                 values = warped.read(1, window=RasterioWindow(window.column, window.row, window.width, window.height))
         except gdal.GDAL_ERRORS as error:
-            raise SatIntervalsError(f"{path} cannot be laid on the surface: {gdal.reason(error)}") from error
+            raise SatIntervalsError(f"{path} cannot be resampled to the surface: {gdal.reason(error)}") from error
         return np.asarray(values * dataset.scales[0] + dataset.offsets[0])

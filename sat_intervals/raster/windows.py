@@ -1,4 +1,4 @@
-"""Pixels in: any window of an image, with the states of its pixels."""
+"""Read any window of an image, with the states of its pixels."""
 
 import numpy as np
 from rasterio.windows import Window as RasterioWindow
@@ -7,21 +7,21 @@ from sat_intervals.products import MASKED, NO_DATA
 from sat_intervals.raster.images import Image, InputError, opened
 from sat_intervals.tiling import Window
 
-# Types whose every value is a float32.
+# Types whose values are all exact in float32.
 _FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
-# Integers up to this are floats of 64 bits.
+# Integers up to this are exact in float64.
 _EXACT = 2**53
 
 
 def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of a window, which may lie partly or wholly outside the image, and what they are good for.
+    """Read a window, which may be partly or wholly outside the image, and the states of its pixels.
 
-    Any thread or process may call it: the file is opened each time (0.15 ms, against some ms for the pixels of a tile).
+    Thread-safe: the file is opened each time (0.15 ms; the pixels of a tile take some ms).
 
     Returns
     -------
     pixels
-        ``(height, width)``, float32 where that holds every value of the file's type, else float64; 0 where not usable.
+        ``(height, width)``, float32 if that is exact for the file's type, else float64; 0 where not usable.
     state
         ``(height, width)`` uint8: 0 = usable; bit NO_DATA = outside the image, no-data value, the file's mask or alpha,
         NaN or infinity; bit MASKED = the user's mask.
@@ -29,7 +29,7 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
     Raises
     ------
     InputError
-        Pixels that cannot be read, as in a file cut short; it names the file and the rows and columns.
+        Pixels cannot be read, as in a truncated file; names the file, rows and columns.
     """
     inside = window.clipped(Window(0, 0, image.height, image.width))
     pixels = np.zeros((window.height, window.width), np.float32 if image.dtype in _FLOAT32_HOLDS else np.float64)
@@ -43,23 +43,23 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_exact(path: str, values: np.ndarray, usable: np.ndarray) -> None:
-    """Refuse integers of which float64 would make one what are several."""
+    """Raise if integers are not exact in float64."""
     if values.dtype.kind in "iu" and values.dtype.itemsize == 8:
         large = usable & ((values > _EXACT) | (values < -_EXACT if values.dtype.kind == "i" else False))
         if large.any():
             raise InputError(
-                f"{path} has {values.dtype} values such as {values[large][0]}, beyond 2^53, which lose their texture "
-                "as float64: subtract an offset, or give their no-data value"
+                f"{path} has {values.dtype} values such as {values[large][0]}, beyond 2^53, which are not exact as "
+                "float64: subtract an offset, or give their no-data value"
             )
 
 
 def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Values in the file's type, and states, of a window that lies inside the image; with ``shape`` so many picked."""
+    """Read values, in the file's type, and states of a window inside the image, sampled to ``shape`` if given."""
     area = RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(image.path, window) as dataset:
         values = dataset.read(image.band, window=area, out_shape=shape)
         usable = np.isfinite(values) & _differs(values, image.nodata)
-        # Asked for one by one, since GDAL's mask of a band is but the first there is of: mask, no-data value, alpha.
+        # GDAL's mask of a band uses only the first of mask, no-data value and alpha: combine them here.
         if image.use_mask:
             usable &= dataset.read_masks(image.band, window=area, out_shape=shape) != 0
         if image.alpha is not None:
@@ -72,7 +72,7 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
 
 
 def _differs(values: np.ndarray, nodata: float | None) -> np.ndarray:
-    """Where values are not the no-data value as their type holds it: 0.1 is no float32, and 300 no uint8 at all."""
+    """Return where values differ from the no-data value rounded to their type; uint8 never equals 300."""
     if nodata is None:
         return np.ones(values.shape, bool)
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Files out: rasters of one size as Cloud-Optimized GeoTIFFs, all of them under their names or none."""
+"""Write rasters of one size as Cloud-Optimized GeoTIFFs and publish all of them or none."""
 
 import errno
 import os
@@ -24,27 +24,27 @@ from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.store.folder import LocalFolder
 
-# Folder, beside the files, where they grow until they are whole; named after the first of them, and locked. Files of
-# these names that a killed process left there are replaced, others stay.
+# Locked folder of unfinished files, named after the first of them. Files of these names from a killed process are
+# replaced, others stay.
 _SCRATCH = ".unpublished-{}"
-# The report of a run, which is published with its files.
+# Report of a run, published with its files.
 _REPORT = "run.json"
-# Strips are kept as they come, in blocks low enough that a strip fills most of those it touches, and band by band, from
-# which the final files are made in four fifths of the time.
+# Layout of the temporary strips. Blocks are low, so that a strip fills most of those it touches; interleaving by band
+# saves a fifth of the time of the final files.
 _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "band", "bigtiff": "IF_SAFER"}
-# DEFLATE is read by all that read GeoTIFF. On the bands of a Pleiades pair level 1 makes 5.4 Mpx a second and core, and
-# 49 bits a pixel; level 6, 3.2 and 46; no compression, 9.1 and 186. Predictors make these slower and larger (4.3 and
-# 63): bounds are whole numbers and V-fits fractions of small ones, which come back byte for byte.
+# Every GeoTIFF reader supports DEFLATE. On the bands of a Pleiades pair level 1 writes 5.4 Mpx per second and core, 49
+# bits per pixel; level 6: 3.2 and 46; no compression: 9.1 and 186. Predictors are slower and larger (4.3 and 63), since
+# bounds are integers and V-fits are fractions of small ones, whose bytes repeat.
 _COG = {"COMPRESS": "DEFLATE", "LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
-# Pixels of a side below which there is no smaller overview.
+# Side in pixels of the smallest overview.
 _OVERVIEW_SIZE = 512
-# Bytes of blocks in GDAL's hands, by default a twentieth of the machine's memory. More makes nothing faster, not even
-# strips of 60 000 columns, and keeps the whole of a small image in memory.
+# GDAL's block cache in bytes; the default is a twentieth of the memory. A larger cache is not faster, even for strips
+# of 60 000 columns, and keeps small images in memory.
 _CACHE = 16 << 20
-# Pixels of a window that is read back: blocks enough for every thread.
+# Rows and columns of a window that is read back: enough blocks for every thread.
 _READ_BACK = 512, 4096
-_SUM_WRAPS = 1 << 64  # the bits of a few float64 are more
-_WAY_OUT = "make room or choose another folder"
+_SUM_WRAPS = 1 << 64  # sums of bits are modulo 2^64
+_WAY_OUT = "free disk space or choose another folder"
 
 
 class OutputError(SatIntervalsError):
@@ -52,7 +52,7 @@ class OutputError(SatIntervalsError):
 
 
 class OutputWriter:
-    """Files from full-width strips of rows in increasing order.
+    """Write files from full-width strips of rows in increasing order.
 
     ::
 
@@ -60,29 +60,29 @@ class OutputWriter:
             writer.write(row, intervals, validity)  # strip by strip
             writer.publish()
 
-    Memory follows the strip. Until `publish` the files are in a hidden folder inside ``folder``, as plain GeoTIFFs and
-    then as Cloud-Optimized GeoTIFFs; leaving the context removes it, whatever happened. It is locked: of two processes
-    that write the same files the second is refused.
+    Memory depends on the strip. Until `publish` the files are in a hidden folder inside ``folder``, as plain GeoTIFFs
+    and then as Cloud-Optimized GeoTIFFs; leaving the context removes it in any case. The folder is locked: a second
+    process that writes the same files is refused.
 
     Parameters
     ----------
     folder
-        Where the files go; made if missing.
+        Output folder; created if missing.
     files
-        Which.
+        The files to write.
     height, width
         Pixels.
     georeferencing
-        That of the pixels written.
+        Georeferencing of the pixels written.
     tags
-        Metadata of both files.
+        Metadata of all files.
     threads
-        That compress; None for one a core.
+        Threads for compression; None for one per core.
 
     Raises
     ------
     OutputError
-        What cannot be written, from every method.
+        From every method: names the file that cannot be written.
     """
 
     def __init__(
@@ -112,12 +112,12 @@ class OutputWriter:
         for file in self._files:
             place = self._folder / file.name
             if place.exists() and not place.is_file():
-                raise OutputError(f"{place} cannot be written: it is no file: choose another name or folder")
+                raise OutputError(f"{place} cannot be written: it is not a regular file: choose another name or folder")
         with self._failing(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
         for place in (self._hidden, self._scratch, self._replaced):
             if place.is_symlink():
-                raise OutputError(f"{place} is a symbolic link, and files grow there: remove it")
+                raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
         self._locked.enter_context(LocalFolder(self._hidden).locked())
         try:
             with self._failing(self._folder):
@@ -137,7 +137,7 @@ class OutputWriter:
         self._clean()
 
     def write(self, row: int, *rasters: np.ndarray) -> None:
-        """Write the strip that begins at ``row``: of each file ``(bands, rows, width)``, or ``(rows, width)``."""
+        """Write the strip that begins at ``row``; one array per file, ``(bands, rows, width)`` or ``(rows, width)``."""
         for file, raster in zip(self._files, rasters, strict=True):
             bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
             area = RasterioWindow(0, row, self._shape[1], bands.shape[1])
@@ -146,9 +146,9 @@ class OutputWriter:
             self._sums[file.name] += _sum(bands)
 
     def build(self) -> dict[str, dict[str, int]]:
-        """Make the files that `publish` names, and read them back; returns size and CRC-32 of those made, by name."""
+        """Build the final files under temporary names and read them back; return size and CRC-32 by name."""
         files = [file for file in self._files if file.name in self._strips]
-        with ThreadPoolExecutor() as threads:  # GDAL's own threads compress, but one alone reads and writes a file
+        with ThreadPoolExecutor() as threads:  # GDAL compresses in threads, but reads and writes in one
             return {file.name: made for file, made in zip(files, threads.map(self._build, files), strict=True)}
 
     def _build(self, file: File) -> dict[str, int]:
@@ -167,10 +167,10 @@ class OutputWriter:
         return made
 
     def publish(self, report: tuple[str, str] | None = None) -> None:
-        """Give the files their names, all of them or none.
+        """Rename the files to their final names, all of them or none.
 
-        With a ``report``, name and text of a file that tells that the others are whole, that of before goes first and
-        this one comes last: without it the others do not count. Where one fails the files of before are put back.
+        ``report`` is name and text of a file that marks the others as complete: the old one is removed first and the
+        new one comes last. If a rename fails, the old files are restored.
         """
         self.build()
         names = [file.name for file in self._files]
@@ -184,7 +184,7 @@ class OutputWriter:
             if report:
                 self._put_aside(names[-1])
             for name in names:
-                if name != names[-1]:  # after the last there is nothing to put back
+                if name != names[-1]:  # after the last rename nothing is restored
                     self._put_aside(name)
                 with self._failing(self._folder / name):
                     os.replace(self._scratch / name, self._folder / name)
@@ -194,7 +194,7 @@ class OutputWriter:
             raise
 
     def _put_aside(self, name: str) -> None:
-        """Keep the file that has the name until the new ones have theirs."""
+        """Move an existing file aside until all new files have their names."""
         place = self._folder / name
         with self._failing(place), suppress(FileNotFoundError):
             if place.is_dir() and not place.is_symlink():
@@ -202,7 +202,7 @@ class OutputWriter:
             os.replace(place, self._replaced / name)
 
     def _take_back(self, names: Sequence[str]) -> None:
-        """Put back the files that had the names before."""
+        """Restore the files that had the names before."""
         for name in names:
             with suppress(OSError):
                 if os.path.lexists(self._replaced / name):
@@ -211,7 +211,7 @@ class OutputWriter:
                     os.unlink(self._folder / name)
 
     def _create(self, file: File) -> DatasetWriter:
-        """A plain GeoTIFF for the strips, with all that is said of the file."""
+        """Create a plain GeoTIFF for the strips, with all metadata of the final file."""
         height, width = self._shape
         kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
         options = _STRIPS | kind | self._georeferencing.creation_options()
@@ -222,14 +222,14 @@ class OutputWriter:
         return strips
 
     def _add_overviews(self, strips: DatasetWriter) -> None:
-        """Add overviews to the strips: the COG driver, left to itself, takes longer for them than for all the rest."""
+        """Add overviews to the strips; the COG driver's own take longer than all its other work."""
         size = max(self._shape)
         factors = [2**level for level in range(1, 32) if size > _OVERVIEW_SIZE << (level - 1)]
         if factors:
             strips.build_overviews(factors, Resampling.nearest)
 
     def _verify(self, whole: Path, expected: int) -> None:
-        """Read a file back, overviews included: GDAL may take a full disk for written."""
+        """Read a file back, with its overviews: GDAL may not report a full disk."""
         found = 0
         with gdal.reading(str(whole), num_threads=self._threads) as dataset:
             levels = range(len(dataset.overviews(1)))
@@ -240,24 +240,24 @@ class OutputWriter:
                 for area in _areas(dataset):
                     dataset.read(window=area)
         if (found - expected) % _SUM_WRAPS:
-            raise OSError(errno.EIO, "what can be read back is not what was written")
+            raise OSError(errno.EIO, "the content read back differs from that written")
 
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:
-        """Turn what fails into an error that names the file as the user knows it, and the system's reason."""
+        """Turn errors into an OutputError with the final name of the file and the system's reason."""
         try:
             yield
         except (*gdal.GDAL_ERRORS, OSError) as error:
             if gdal.is_out_of_memory(error):
                 raise OutputError(
-                    f"{path} cannot be written: not enough memory ({gdal.reason(error)}): give the process more"
+                    f"{path} cannot be written: not enough memory ({gdal.reason(error)}): give the process more memory"
                 ) from error
             raise OutputError(f"{path} cannot be written: {self._reason(error)}: {_WAY_OUT}") from error
 
     def _reason(self, error: Exception) -> str:
         if isinstance(error, OSError) and error.strerror:
             return error.strerror
-        # GDAL keeps the system's reason to itself. A Cloud-Optimized GeoTIFF is made with its overviews twice.
+        # GDAL hides the system's reason. A Cloud-Optimized GeoTIFF needs room for two copies.
         free = shutil.disk_usage(self._folder).free
         full = (
             f"{os.strerror(errno.ENOSPC)}, {_size(free)} free: " if free < 2 * _bytes(self._files, *self._shape) else ""
@@ -273,7 +273,7 @@ class OutputWriter:
         self._locked.close()
 
     def _remove_scratch(self) -> None:
-        """Delete what was made here, now or by a process that was killed, and nothing else that may be there."""
+        """Delete temporary files of this or a killed process, and no others."""
         names = [file.name for file in self._files]
         ours = (*names, *(f"strips-{name}" for name in names), _REPORT)
         for folder in (self._replaced, self._scratch):
@@ -285,7 +285,7 @@ class OutputWriter:
 
 
 def remove_scratch(folder: Path, files: Sequence[File]) -> None:
-    """Delete what a process that was killed left of files that have their names since."""
+    """Delete temporary files of a killed process whose final files exist."""
     hidden = folder / _SCRATCH.format(files[0].name)
     if hidden.is_dir() and not hidden.is_symlink():
         with LocalFolder(hidden).locked():
@@ -293,25 +293,25 @@ def remove_scratch(folder: Path, files: Sequence[File]) -> None:
 
 
 def check_space(folder: Path, files: Sequence[File], height: int, width: int) -> None:
-    """Refuse a folder that has no room for files of so many pixels.
+    """Raise if a folder has not enough free space for files of ``height`` x ``width`` pixels.
 
     Raises
     ------
     OutputError
-        With the figures.
+        Gives free and needed space.
     """
     needed, free = _bytes(files, height, width), shutil.disk_usage(folder).free
     if needed > free:
-        raise OutputError(f"{folder} has {_size(free)} left, the bands need {_size(needed)} to begin with: {_WAY_OUT}")
+        raise OutputError(f"{folder} has {_size(free)} free, the bands need at least {_size(needed)}: {_WAY_OUT}")
 
 
 def _bytes(files: Sequence[File], height: int, width: int) -> int:
-    """Of all bands uncompressed."""
+    """Return the size of all bands without compression."""
     return height * width * sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in files)
 
 
 def _areas(dataset: DatasetReader) -> Iterator[RasterioWindow]:
-    """Windows that cover a file."""
+    """Yield windows that cover a file."""
     height, width = _READ_BACK
     for row in range(0, dataset.height, height):
         for column in range(0, dataset.width, width):
@@ -319,12 +319,12 @@ def _areas(dataset: DatasetReader) -> Iterator[RasterioWindow]:
 
 
 def _sum(bands: np.ndarray) -> int:
-    """Sum, modulo 2^64, of an array's bits taken as unsigned integers: one figure in whatever order blocks are read."""
+    """Return the sum of an array's bits as unsigned integers, modulo 2^64; independent of the order of blocks."""
     return int(bands.view(f"uint{8 * bands.itemsize}").sum(dtype=np.uint64))
 
 
 def _flush(path: Path) -> None:
-    """Have the system write a file to the disk, and tell if it cannot."""
+    """Flush a file to the disk; raises if that fails."""
     with open(path, "rb") as stream:
         os.fsync(stream.fileno())
 

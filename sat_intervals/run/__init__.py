@@ -1,1 +1,1 @@
-"""Many tiles, many pairs: plan, submit, match, assemble. The only home of dask."""
+"""Plan, submit and match tiles of one or many pairs, and assemble the files. Only this folder imports dask."""

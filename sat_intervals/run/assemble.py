@@ -1,4 +1,4 @@
-"""From the tiles of a job to the files of its run: strips, final bands, report."""
+"""Assemble the files of a run from its tiles: strips, final bands, report."""
 
 import json
 import logging
@@ -27,34 +27,42 @@ from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished,
 
 Item = TypeVar("Item")
 
-# Pixels of a strip, in whole rows: what is held of one takes about 100 bytes a pixel, several times.
+# Pixels of a strip, in whole rows. A strip in memory takes about 100 bytes per pixel, and there are several.
 STRIP_PIXELS = 1 << 20
-# Disparities up to which refinement alone makes an interval the whole search range.
-_FEW = 3
+# Number of disparities up to which refinement alone can widen an interval to the whole search range.
+_NARROW_RANGE = 3
+
+# Meanings of some of the counts, for readers of run.json.
+_COUNTS_MEANING = {
+    "ambiguous": "valid pixels whose interval is the whole search range",
+    "low_confidence": "valid pixels with the flag regularized; flags.regularized also counts invalid ones",
+    "causes": "invalid pixels, each under its first flag that makes it invalid; with valid they add up to pixels",
+    "flags": "pixels with the flag, valid or not; a pixel may have several flags",
+}
 
 _LOG = logging.getLogger(__name__)
 
 
 def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_tiles: bool = False) -> dict[str, Any]:
-    """Write the files of a run whose tiles are done; returns the content of run.json.
+    """Write the files of a run whose tiles are done; return the content of run.json.
 
     Parameters
     ----------
     job
         The pair.
     seconds
-        What earlier stages took; those of this one are added.
+        Times of earlier stages; those of this one are added.
     progress
-        Called strip by strip.
+        Called after each strip.
     keep_tiles
-        Whether the tiles stay afterwards.
+        Whether the tiles are kept.
 
     Raises
     ------
     DamagedTilesError
-        Tiles are to be matched again.
+        Tiles must be matched again.
     RunError
-        Tiles are missing, or a file cannot be written.
+        A file cannot be written.
     SatIntervalsError
         No pixel could be matched.
     """
@@ -66,11 +74,11 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
-    with _going_on(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
+    with _resumable(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
         with logged_stage(seconds, "bands"):
             strips = (RawRows(**strip) for strip in store.strips(STRIP_PIXELS // region.width, records))
             row = 0
-            for final in _ahead(postprocess_strips(_ahead(strips), scale, config)):
+            for final in _prefetched(postprocess_strips(_prefetched(strips), scale, config)):
                 writer.write(row, np.stack(final[:4]), final.validity)
                 tally.add(final)
                 row += final.validity.shape[0]
@@ -79,7 +87,7 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
             progress("files", 0, 1)
             files = writer.build()
             job.check_inputs()
-            progress("files", 0, 1)  # so that a run that is to end does so before it publishes
+            progress("files", 0, 1)  # a last chance to interrupt the run before it publishes
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
@@ -96,16 +104,16 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
 
 
 @contextmanager
-def _going_on() -> Iterator[None]:
-    """What cannot be written any more, with all tiles done, is a failure of the run, which the next try makes good."""
+def _resumable() -> Iterator[None]:
+    """Turn an OutputError into a RunError: all tiles are done, so the run can be resumed."""
     try:
         yield
     except OutputError as error:
-        raise RunError(f"{error}; the same command goes on from the tiles, all of which are done") from error
+        raise RunError(f"{error}; rerun the same command: it resumes from the tiles, which are all done") from error
 
 
-def _ahead(items: Iterable[Item]) -> Iterator[Item]:
-    """The same items, each made in a thread of its own while the one before is used."""
+def _prefetched(items: Iterable[Item]) -> Iterator[Item]:
+    """Yield the items; compute the next one in a thread while the current one is used."""
     with ThreadPoolExecutor(1) as thread:
         iterator = iter(items)
         following = thread.submit(next, iterator, None)
@@ -115,29 +123,29 @@ def _ahead(items: Iterable[Item]) -> Iterator[Item]:
 
 
 def _check_done(job: Job, records: Records, normalization: dict[str, Any] | None) -> None:
-    """What went missing since the tiles were matched is made again by the next try."""
+    """Raise if tiles or image statistics are missing; a retry restores them."""
     if isinstance(job.config.cost, Mccnn) and normalization is None:
         raise DamagedTilesError(
-            f"what was measured of the images is lost in {job.store.folder}: run the same command again"
+            f"the image statistics in {job.store.folder} are missing: rerun the same command: it resumes"
         )
     missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
         raise DamagedTilesError(
-            f"tiles {', '.join(missing)} are missing in {job.store.folder}: run the same command again"
+            f"tiles {', '.join(missing)} are missing in {job.store.folder}: rerun the same command: it resumes"
         )
 
 
 def _check_matched(job: Job, records: Records, searched: int) -> None:
-    """An image without data is the user's mistake, and is told so."""
+    """Raise if no pixel could be matched, with the likely reason."""
     if searched:
         return
     usable = {side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")}
     empty = [image.path for image, side in ((job.left, "left"), (job.right, "right")) if not usable[side]]
     search, window = job.config.disparity, job.config.cost.window
     reason = (
-        f"all pixels of {' and '.join(empty)} hold no data or are masked"
+        f"all pixels of {' and '.join(empty)} are no data or masked"
         if empty
-        else f"nowhere do {window} x {window} usable pixels of both face each other"
+        else f"nowhere do both images have {window} x {window} usable pixels"
     )
     raise SatIntervalsError(
         f"no pixel of {job.left.path} can be matched in {job.right.path} over disparities {search.minimum} to "
@@ -146,18 +154,18 @@ def _check_matched(job: Job, records: Records, searched: int) -> None:
 
 
 def _warn_of_ambiguity(job: Job, counts: dict[str, Any]) -> None:
-    """Say that most intervals tell nothing."""
+    """Warn if most intervals are the whole search range."""
     search = job.config.disparity
-    if 2 * counts["ambiguous"] > counts["valid"] and search.count > _FEW:
+    if 2 * counts["ambiguous"] > counts["valid"] and search.count > _NARROW_RANGE:
         _LOG.warning(
-            "%s: the interval of %d of %d valid pixels is the whole search range %d to %d: there the images have no "
-            "texture that tells disparities apart",
+            "%s: the interval of %d of %d valid pixels is the whole search range %d to %d: the texture there does not "
+            "distinguish disparities",
             job.left.path, counts["ambiguous"], counts["valid"], search.minimum, search.maximum,
         )  # fmt: skip
 
 
 def _tags(config: Config) -> dict[str, str]:
-    """What the files say of themselves."""
+    """Return the tags of the output files."""
     tags = {
         "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
         "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
@@ -175,7 +183,7 @@ def _report(
     seconds: dict[str, float],
     seams: np.ndarray,
 ) -> dict[str, Any]:
-    """The content of run.json."""
+    """Return the content of run.json."""
     grid, config = job.store.grid, job.config
     packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
     return {
@@ -193,6 +201,7 @@ def _report(
         "normalization": normalization,
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),
+        "counts_meaning": _COUNTS_MEANING,
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },

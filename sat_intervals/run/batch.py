@@ -1,4 +1,4 @@
-"""Many pairs in one go: one cluster for all, tiles of several pairs in flight, a folder for each."""
+"""Match many pairs on one cluster, with tiles of several pairs in flight and a folder for each pair."""
 
 import json
 import logging
@@ -33,7 +33,7 @@ from sat_intervals.store.tiles import finished_run, remove_tiles
 
 _LOG = logging.getLogger(__name__)
 
-# Completes settings whose search range the pairs bring.
+# Placeholder for the search range, which each pair sets.
 _ANY_RANGE = {"disparity": {"minimum": 0, "maximum": 0}}
 
 
@@ -47,35 +47,35 @@ def match_batch(
     keep_tiles: bool = False,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, dict[str, Any]]:
-    """Match many pairs; one that fails does not stop the others.
+    """Match many pairs; a failed pair does not stop the others.
 
     Parameters
     ----------
     pairs
         See `sat_intervals.config.pairs.read_batch`.
     out
-        Each pair has the folder of its name here; ``batch.json`` says how each ended.
+        Folder with a subfolder for each pair, and ``batch.json`` with their states.
     config, overrides
-        Settings of all pairs, as of `load_config`; a pair's own win over them. ``cluster`` is that of the batch.
+        Settings of all pairs, see `load_config`; a pair's own settings win. ``cluster`` is shared by all.
     overwrite, keep_tiles, progress
-        As of `match_pair`.
+        See `match_pair`.
 
     Returns
     -------
     By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``counts`` and ``seconds``. ``batch.json``
-    holds the same while the batch goes on, with "waiting" for pairs that have not ended.
+    has the same during the batch, with "waiting" for pairs that have not ended.
 
     Raises
     ------
     SatIntervalsError
-        Settings or a folder that cannot be used.
+        Settings or the folder cannot be used.
     RunError
-        What stops all pairs, such as a full disk.
+        An error that stops all pairs, such as a full disk.
     """
     _check_not_replaced(pairs, [config] if isinstance(config, (str, Path)) else [], out, overwrite)
     ended: dict[str, dict[str, Any]] = {}
     cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
-    _allow_files()
+    _raise_file_limit()
     with ExitStack() as stack:
         stack.enter_context(LocalFolder(out).locked())
 
@@ -98,7 +98,7 @@ def match_batch(
                 else:
                     _tidy(out / pair.name, keep_tiles, cluster.store)
                     note({pair.name: {"state": "done before", **before}})
-            except Exception as error:  # whatever is wrong with one pair, the others go on
+            except Exception as error:  # one pair's failure must not stop the others
                 note({pair.name: _failed(error)})
         for name, how in _matched(jobs, out, cluster, keep_tiles, progress):
             note({name: how})
@@ -106,7 +106,7 @@ def match_batch(
 
 
 def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Path], out: Path, overwrite: bool) -> None:
-    """Hold that no pair's input, and none of the other files that are read, is among what any pair writes."""
+    """Raise if an input of any pair, or another file that is read, is an output of any pair."""
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
     names = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     files = [name for name in names if name and os.path.isfile(name)]
@@ -122,7 +122,7 @@ def _images(pair: PairOfBatch) -> tuple[Image, Image]:
 
 
 def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
-    """What the run says that was made of a pair before, with the same settings and images; None where there is none."""
+    """Return counts and seconds of a pair's complete run, None without one; raise if settings or images differ."""
     folder = out / pair.name
     if not is_complete(folder):
         return None
@@ -131,12 +131,11 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
-    run.check_whole()
     return {name: run.report[name] for name in ("counts", "seconds")}
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job:
-    """The job of a pair, its store open and its folder locked."""
+    """Prepare the job of a pair, lock its folder and open its store."""
     job = prepare(*_images(pair), out / pair.name, settings, overwrite=overwrite, pair=pair.name)
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin(overwrite=overwrite)
@@ -144,7 +143,7 @@ def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stac
 
 
 def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
-    """Remove what a death between the files and the end of their run left; tiles that are to be kept stay."""
+    """Remove what a run left that was killed after it published its files; tiles are kept if asked for."""
     remove_scratch(folder, RUN_FILES)
     home = folder / "tiles"
     if keep_tiles or home.is_symlink() or finished_run(home) is None:
@@ -164,8 +163,8 @@ def _failed(error: Exception) -> dict[str, Any]:
     return {"state": "failed", "error": str(error) or type(error).__name__}
 
 
-def _allow_files() -> None:
-    """Let this process open as many files as it may: every pair has a lock."""
+def _raise_file_limit() -> None:
+    """Raise the limit of open files to the maximum: every pair has a lock file."""
     least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     if least != most:
         with suppress(ValueError, OSError):
@@ -173,7 +172,7 @@ def _allow_files() -> None:
 
 
 def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Sections of both, the second winning key by key."""
+    """Return the sections of both; the second wins, key by key."""
     return {
         name: {**first[name], **section} if name in first and isinstance(section, Mapping) else section
         for name, section in second.items()
@@ -183,7 +182,7 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
 def _matched(
     jobs: Mapping[str, Job], out: Path, cluster: Cluster, keep_tiles: bool, progress: Progress
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Match the tiles of all jobs and assemble each, in a thread of its own, while others are being matched."""
+    """Match the tiles of all jobs; assemble finished jobs in a thread meanwhile."""
     if not jobs:
         return
     for config in {_kernels(job.config): job.config for job in jobs.values()}.values():
@@ -212,24 +211,24 @@ def _matched(
 
 @contextmanager
 def _thread() -> Iterator[tuple[ThreadPoolExecutor, Progress]]:
-    """A thread, and the progress of what it does, which ends it where the block ends by an error."""
-    is_left = threading.Event()
+    """Yield a thread, and a progress callback that stops its work if the block raises."""
+    is_stopped = threading.Event()
 
     def check(stage: str, done: int, total: int) -> None:
-        if is_left.is_set():
-            raise RunError("the batch ended before")
+        if is_stopped.is_set():
+            raise RunError("the batch was stopped")
 
     with ThreadPoolExecutor(1) as thread:
         try:
             yield thread, check
         except BaseException:
-            is_left.set()
+            is_stopped.set()
             thread.shutdown(wait=False, cancel_futures=True)
             raise
 
 
 def _kernels(config: Config) -> str:
-    """What distinguishes the kernels that a configuration needs."""
+    """Return a key of the kernels that a configuration needs."""
     return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
@@ -247,6 +246,6 @@ def _assembled(
             report = assembled(job, match, {}, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
-    except Exception as error:  # whatever is wrong with one pair, the others go on
+    except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
     return {"state": "done", "counts": report["counts"], "seconds": report["seconds"]}

@@ -1,4 +1,4 @@
-"""Jobs of a batch system, SLURM, PBS, LSF or SGE, by dask-jobqueue."""
+"""Jobs of a batch system (SLURM, PBS, LSF or SGE) with dask-jobqueue."""
 
 import logging
 import os
@@ -13,12 +13,12 @@ from distributed import Client, Status
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
 
-# Seconds without any worker of a batch system, after there were some, at which a run ends.
+# Seconds after the last worker of a batch system left, at which a run ends.
 WORKERS_GONE = 300.0
-# Seconds from one word on the first worker, for which a run waits, to the next.
-_TOLD_EVERY = 60.0
+# Seconds between warnings while a run waits for its first worker.
+_WARN_EVERY = 60.0
 
-# Batch systems that know projects and no accounts.
+# Batch systems with projects instead of accounts.
 _CHARGE_PROJECTS = "lsf", "sge"
 
 LOOPBACK = "127.0.0.1"
@@ -27,7 +27,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def batch_system(settings: Cluster, logs: Path) -> Any:
-    """The dask-jobqueue cluster of SLURM, PBS, LSF or SGE; what is not set comes from the user's dask configuration."""
+    """Create the dask-jobqueue cluster; missing settings come from the user's dask configuration."""
     try:
         import dask_jobqueue
     except ImportError as error:
@@ -41,16 +41,16 @@ def batch_system(settings: Cluster, logs: Path) -> Any:
     submitted: set[str] = set()
     refusals: list[str] = []
     own = {"job_cls": _job_class(base.job_cls, submitted, refusals), "logged": logged}
-    # Of `workers_there`: what it judges by, when a worker was there, when the wait was told of.
-    own |= {"submitted": submitted, "refusals": refusals, "seen": None, "told": time.monotonic()}
+    # State of `current_workers`: jobs, errors, and times of the last worker and of the last warning.
+    own |= {"submitted": submitted, "refusals": refusals, "seen": None, "warned": time.monotonic()}
     try:
         return type(base.__name__, (base,), own)(**given, silence_logs=logging.CRITICAL)
-    except ValueError as error:  # of settings that neither the section nor dask's own configuration gives
+    except ValueError as error:  # a setting is neither in the section nor in dask's configuration
         raise SatIntervalsError(f"cluster {settings.kind}: {' '.join(str(error).split())}") from error
 
 
 def _given(settings: Cluster, own_logs: str | None, logs: Path) -> dict[str, Any]:
-    """What dask-jobqueue is to be called with, beside the user's dask configuration."""
+    """Return the arguments for dask-jobqueue; they win over the user's dask configuration."""
     options = {
         "queue": settings.queue,
         "project" if settings.kind in _CHARGE_PROJECTS else "account": settings.account,
@@ -68,48 +68,48 @@ def _given(settings: Cluster, own_logs: str | None, logs: Path) -> dict[str, Any
     given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
     if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
         given["scheduler_options"] = {"dashboard_address": f"{LOOPBACK}:0"}
-    # Jobs may not see the folder of a run whose tiles lie elsewhere, and their scripts take no spaces.
+    # With an external store, jobs may not see the folder of the run. Job scripts cannot have spaces.
     if own_logs is None and settings.store is None and not any(map(str.isspace, str(logs.absolute()))):
         given["log_directory"] = str(logs.absolute())
     return given
 
 
 def _job_class(base: Any, submitted: set[str], refusals: list[str]) -> type:
-    """Jobs that note here whether the batch system took them, and that can be closed in any case."""
+    """Return a job class that records submissions and refusals, and whose jobs can always be closed."""
 
     class Job(base):  # type: ignore[misc]
         async def start(self) -> None:
             try:
                 await super().start()
-            except RuntimeError as error:  # which dask keeps to itself
+            except RuntimeError as error:  # dask does not report it
                 refusals.append(str(error).rpartition("stderr:")[2])
-                self.status = Status.failed  # else it could not be closed
+                self.status = Status.failed  # otherwise it could not be closed
                 raise
             submitted.add(self.job_id)
 
         async def close(self) -> None:
             await super().close()
-            self.status = Status.closed  # dask asserts it of every job that is not garbage by then
+            self.status = Status.closed  # dask asserts this of every job that still exists
 
     return Job
 
 
 def _without_seconds(walltime: str | None) -> str | None:
-    """Hours and minutes, as LSF wants them."""
+    """Return hours and minutes, the format of LSF."""
     return ":".join(walltime.split(":")[:2]) if walltime else None
 
 
 def job_script(settings: Cluster, out: Path) -> str:
-    """The script of one job of a batch system, as it would be submitted.
+    """Return the script of one job of a batch system, without submitting it.
 
     Raises
     ------
     SatIntervalsError
-        For a cluster that submits no jobs.
+        The cluster is not a batch system.
     """
     if settings.kind in ("threads", "processes", "address"):
-        raise SatIntervalsError(f"cluster {settings.kind} submits no jobs: name slurm, pbs, lsf or sge")
-    new = [folder for folder in (out / "logs", out) if not folder.exists()]  # dask-jobqueue makes them
+        raise SatIntervalsError(f"cluster {settings.kind} submits no jobs: give slurm, pbs, lsf or sge")
+    new = [folder for folder in (out / "logs", out) if not folder.exists()]  # dask-jobqueue creates them
     with batch_system(settings, out / "logs") as cluster:
         script = str(cluster.job_script())
     for folder in new:
@@ -118,17 +118,17 @@ def job_script(settings: Cluster, out: Path) -> str:
     return script
 
 
-def workers_there(client: Client) -> dict[str, int]:
-    """Addresses and cores of the workers that a client has. Called every few seconds, it ends a wait that is in vain.
+def current_workers(client: Client) -> dict[str, int]:
+    """Return addresses and cores of a client's workers; call it every few seconds, since it ends a futile wait.
 
-    For the first worker of a batch system it waits without limit, and says so once a minute.
+    There is no time limit for the first worker of a batch system, but a warning every minute.
 
     Raises
     ------
     SatIntervalsError
-        When the batch system took no job.
+        The batch system refused all jobs.
     RunError
-        When its last worker has gone, and none has come since for WORKERS_GONE seconds.
+        The last worker left more than WORKERS_GONE seconds ago.
     """
     cores: dict[str, int] = client.nthreads()
     cluster: Any = client.cluster
@@ -141,16 +141,16 @@ def workers_there(client: Client) -> dict[str, int]:
         raise SatIntervalsError(
             f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
         )
-    elif cluster.seen is None and now - cluster.told >= _TOLD_EVERY:
-        cluster.told = now
+    elif cluster.seen is None and now - cluster.warned >= _WARN_EVERY:
+        cluster.warned = now
         _LOG.warning(
-            "no worker has come yet: jobs wait in the queue of the batch system, or ended before, of which their logs "
-            "in %s tell",
+            "no worker has started yet: jobs wait in the queue of the batch system, or ended early, see their logs in "
+            "%s",
             cluster.logged,
         )
     elif cluster.seen is not None and now - cluster.seen > WORKERS_GONE:
         raise RunError(
-            f"the last worker has gone and none has come for {WORKERS_GONE:.0f} s: of the jobs their logs in "
-            f"{cluster.logged} tell; the same command goes on from the tiles that are done"
+            f"the last worker ended and none has started for {WORKERS_GONE:.0f} s: see the logs of the jobs in "
+            f"{cluster.logged}; rerun the same command: it resumes"
         )
     return cores

@@ -22,68 +22,68 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import LOOPBACK, batch_system
 
-# Seconds for worker processes of this machine to start.
+# Seconds for local worker processes to start.
 STARTING = 120.0
-# Seconds without an answer of a scheduler at which a wait is told of.
-_TOLD_AFTER = 3.0
-_LOOPBACK_PATIENCE = 5.0
+# Seconds without an answer of a scheduler before a warning.
+_WARN_AFTER = 3.0
+_LOOPBACK_TIMEOUT = 5.0
 
 _LOG = logging.getLogger(__name__)
 
 
 @contextmanager
 def connected(settings: Cluster, out: Path) -> Iterator[Client]:
-    """A client of the cluster that the settings name; closed, with what it started, at the end.
+    """Connect a client to the cluster of the settings; close it, and what it started, at the end.
 
-    Jobs write their logs to ``out/logs`` where their tiles lie in ``out`` too, unless the user's dask configuration
-    names another folder.
+    Jobs write their logs to ``out/logs`` if their tiles are in ``out`` too, unless the user's dask configuration names
+    another folder.
 
     Raises
     ------
     SatIntervalsError
-        When a scheduler does not answer, or the extra for batch systems is not installed.
+        A scheduler does not answer, or the extra for batch systems is not installed.
     """
-    with _forgotten_waits_untold(), _client(settings, out) as client:
+    with _asyncio_timeouts_hidden(), _client(settings, out) as client:
         _LOG.info("connected to %s", client)
-        is_heard = logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG)
-        is_heard = is_heard and settings.kind not in ("threads", "address")  # in this process, and not ours
-        if is_heard or settings.kind == "processes":
-            client.register_plugin(_WorkerLog(is_heard))
-        for name in ("sat_intervals", "distributed") if is_heard else ():
+        is_debug = logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG)
+        is_debug = is_debug and settings.kind not in ("threads", "address")  # this process; the user's own workers
+        if is_debug or settings.kind == "processes":
+            client.register_plugin(_WorkerLog(is_debug))
+        for name in ("sat_intervals", "distributed") if is_debug else ():
             client.forward_logging(name)
         yield client
     _LOG.info("disconnected")
 
 
 class _WorkerLog(WorkerPlugin):
-    """Of forgotten waits worker processes say nothing either; of all else everything, if the client hears it."""
+    """Set up logging on workers: hide asyncio's timeouts, and log everything for ``--debug``."""
 
     name = "sat-intervals-log"
 
-    def __init__(self, is_heard: bool) -> None:
-        self._is_heard = is_heard
+    def __init__(self, is_debug: bool) -> None:
+        self._is_debug = is_debug
 
     def setup(self, worker: Worker) -> None:
-        """Called on every worker as it starts."""
-        logging.getLogger("asyncio").addFilter(_is_news)
-        if self._is_heard:
+        """Set up a worker as it starts."""
+        logging.getLogger("asyncio").addFilter(_is_relevant)
+        if self._is_debug:
             logging.getLogger("sat_intervals").setLevel(logging.DEBUG)
 
 
 @contextmanager
-def _forgotten_waits_untold() -> Iterator[None]:
-    """Keep to itself what asyncio says of waits that distributed forgets when it closes."""
+def _asyncio_timeouts_hidden() -> Iterator[None]:
+    """Hide asyncio's messages about timeouts that distributed never retrieves when it closes."""
     logger = logging.getLogger("asyncio")
-    news = partial(_is_news)  # one for each block: several threads may be connected
-    logger.addFilter(news)
+    relevant = partial(_is_relevant)  # one per block, since several threads may be connected
+    logger.addFilter(relevant)
     try:
         yield
     finally:
-        gc.collect(1)  # what was forgotten is told of when it is collected
-        logger.removeFilter(news)
+        gc.collect(1)  # asyncio logs them on garbage collection
+        logger.removeFilter(relevant)
 
 
-def _is_news(record: logging.LogRecord) -> bool:
+def _is_relevant(record: logging.LogRecord) -> bool:
     error = record.exc_info[1] if record.exc_info else None
     return not (isinstance(error, TimeoutError) and "never retrieved" in record.getMessage())
 
@@ -95,30 +95,30 @@ def _client(settings: Cluster, out: Path) -> Iterator[Client]:
             yield client
     elif settings.kind in ("threads", "processes"):
         with ExitStack() as stack:
-            with _undisturbed():
+            with _signals_blocked():
                 client = stack.enter_context(Client(stack.enter_context(_local(settings))))
             yield client
-            with _undisturbed():
+            with _signals_blocked():
                 stack.close()
     else:
         with batch_system(settings, out / "logs") as cluster, Client(cluster) as client:
-            # Adapting, even between equal bounds, submits a job again that ended before the run did; scaling does not.
+            # Adapting, unlike scaling, resubmits jobs that end before the run, even between equal bounds.
             cluster.adapt(minimum_jobs=settings.jobs, maximum_jobs=settings.maximum_jobs or settings.jobs)
             yield client
 
 
 def _client_of(address: str) -> Client:
-    told = threading.Timer(_TOLD_AFTER, _LOG.warning, ["waiting for the dask scheduler at %s", address])
-    told.start()
+    warning = threading.Timer(_WARN_AFTER, _LOG.warning, ["waiting for the dask scheduler at %s", address])
+    warning.start()
     try:
-        resolve_address(address)  # a host that nobody knows: dask would try it again and again
+        resolve_address(address)  # fails at once for an unknown host, which dask would keep trying
         return Client(address)
     except (OSError, ValueError) as error:
         raise SatIntervalsError(
             f"no dask scheduler answers at {address}: {getattr(error, 'strerror', None) or error}"
         ) from error
     finally:
-        told.cancel()
+        warning.cancel()
 
 
 def _local(settings: Cluster) -> LocalCluster:
@@ -127,7 +127,7 @@ def _local(settings: Cluster) -> LocalCluster:
     if processes:
         _check_loopback()
     with warnings.catch_warnings():
-        # of a machine without a network, which none of this needs
+        # no network is needed
         warnings.filterwarnings("ignore", "Couldn't detect a suitable IP address", RuntimeWarning)
         try:
             return LocalCluster(
@@ -140,7 +140,7 @@ def _local(settings: Cluster) -> LocalCluster:
                 silence_logs=logging.CRITICAL,
                 **({"death_timeout": STARTING} if processes else {}),
             )
-        except Exception as error:  # whatever keeps processes from starting, such as a full /dev/shm
+        except Exception as error:  # any error at the start of processes, such as a full /dev/shm
             if not processes:
                 raise
             cause: BaseException = error
@@ -154,33 +154,33 @@ def _local(settings: Cluster) -> LocalCluster:
 
 
 def _check_loopback() -> None:
-    """Hold that processes of this machine can talk to each other: dask would wait for them without end."""
+    """Raise if local processes cannot connect to each other: dask would wait for them forever."""
     try:
         with (
             socket.create_server((LOOPBACK, 0)) as server,
-            socket.create_connection(server.getsockname(), timeout=_LOOPBACK_PATIENCE),
+            socket.create_connection(server.getsockname(), timeout=_LOOPBACK_TIMEOUT),
         ):
             pass
     except OSError as error:
         raise SatIntervalsError(
-            f"processes cannot reach each other at {LOOPBACK}: {error.strerror or error}: bring up the loopback "
+            f"processes cannot reach each other at {LOOPBACK}: {error.strerror or error}: enable the loopback "
             "interface, or use --cluster threads"
         ) from error
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Keep signals waiting for the end of the block, and for ever from the threads and processes it begins.
+def _signals_blocked() -> Iterator[None]:
+    """Block SIGINT and SIGTERM while a cluster starts or stops; threads and processes started then never get them.
 
-    A terminal sends Ctrl-C to all processes: workers must not answer by themselves. And half a cluster cannot be
-    closed in good order.
+    A terminal sends Ctrl-C to all processes, but only the main one must react. And a cluster that is only half started
+    cannot be closed cleanly. Pending signals are raised at the end.
     """
-    came: list[int] = []
+    pending: list[int] = []
     signals = (signal.SIGINT, signal.SIGTERM)
-    resource_tracker.ensure_running()  # else begun with the first process, when it lets signals pass again
+    resource_tracker.ensure_running()  # it would start with the first process and unblock the signals
     handlers = {}
-    if threading.current_thread() is threading.main_thread():  # which answers those that other threads are given
-        handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in signals}
+    if threading.current_thread() is threading.main_thread():  # it handles signals sent to other threads too
+        handlers = {number: signal.signal(number, lambda number, _: pending.append(number)) for number in signals}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     try:
         yield
@@ -188,20 +188,20 @@ def _undisturbed() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for number, handler in handlers.items():
             signal.signal(number, handler or signal.SIG_DFL)
-        for late in came:
+        for late in pending:
             signal.raise_signal(late)
 
 
 def parse_memory(text: str) -> int:
-    """Bytes of a size such as ``4GB``, ``512 MiB`` or ``3e9``, as dask reads it.
+    """Parse a memory size such as ``4GB``, ``512 MiB`` or ``3e9`` with dask; return bytes.
 
     Raises
     ------
     ConfigError
-        When it is no size, or not above zero.
+        It is not a size, or not above zero.
     """
     try:
-        size = parse_bytes(text) if any(map(str.isdigit, text)) else 0  # dask takes "GB" for 1 GB
+        size = parse_bytes(text) if any(map(str.isdigit, text)) else 0  # dask reads "GB" as 1 GB
     except (ValueError, OverflowError):
         size = 0
     if size <= 0:
@@ -210,7 +210,7 @@ def parse_memory(text: str) -> int:
 
 
 def tiles_at_once(settings: Cluster) -> int:
-    """Tiles in work at once; of a scheduler that is there, as if on this machine."""
+    """Return the number of tiles at once; for an existing scheduler, that of this machine."""
     if settings.kind in ("threads", "processes", "address"):
         return settings.workers or usable_cores()
     return (settings.maximum_jobs or settings.jobs) * settings.cores

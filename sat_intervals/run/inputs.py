@@ -1,4 +1,4 @@
-"""Which inputs a run has: their files, what they hold, the weights of MC-CNN; and what changed since a run before."""
+"""Describe the inputs of a run (images, masks, MC-CNN weights), and compare them with those of an earlier run."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -17,35 +17,35 @@ from sat_intervals.tiling import Window
 def describe_inputs(
     left: Image, right: Image, config: Config, before: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """What run.json and the manifest say of the inputs, and of each file of the images by its name.
+    """Return the inputs for run.json and the manifest, and the `identity` of each file by name.
 
-    What they said before saves hashing files again.
+    ``before`` are the inputs of an earlier manifest: unchanged files are not hashed again.
     """
     known, files = _known(before), {}
 
-    def told(name: str) -> dict[str, Any]:
+    def identified(name: str) -> dict[str, Any]:
         if name not in files:
             files[name] = identity(name, known)
         return files[name]
 
-    inputs = {"left": _described(left, told), "right": _described(right, told)}
+    inputs = {"left": _described(left, identified), "right": _described(right, identified)}
     if isinstance(config.cost, Mccnn):
         inputs["weights"] = _weights_identity(config.cost)
     return inputs, files
 
 
 def _known(inputs: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What a manifest says of the files of its inputs, by path."""
+    """Return the identities of files in the inputs of a manifest, by path."""
     ways = [one for both in inputs.values() for one in (both, both.get("mask")) if one]
     described = [file for one in ways for file in (one, *one.get("files", ()))]
     return {file["path"]: file for file in described if "sha256" in file}
 
 
-def _described(image: Image, told: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
-    """What run.json and the manifest say of an input."""
+def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
+    """Describe an image for run.json and the manifest."""
     crs = image.georeferencing.crs
     return {
-        **_with_others(image.path, told),
+        **_with_others(image.path, identified),
         "height": image.height,
         "width": image.width,
         "band": image.band,
@@ -54,41 +54,41 @@ def _described(image: Image, told: Callable[[str], dict[str, Any]]) -> dict[str,
         "crs": crs.to_string() if crs else None,
         "use_mask": image.use_mask,
         "alpha": image.alpha,
-        "mask": _with_others(image.mask, told) if image.mask else None,
+        "mask": _with_others(image.mask, identified) if image.mask else None,
     }
 
 
-def _with_others(name: str, told: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
-    """What is told of a raster, and of the other files it is read from."""
-    return {**told(name), "files": [told(file) for file in other_files(name)]}
+def _with_others(name: str, identified: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
+    """Return the identity of a raster and of the other files it is read from."""
+    return {**identified(name), "files": [identified(file) for file in other_files(name)]}
 
 
 def _weights_identity(cost: Mccnn) -> dict[str, Any]:
-    """What run.json and the manifest say of the weights, and of what runs them."""
+    """Return the identity of the weights and the version of onnxruntime."""
     return {**identity(str(weights_file(cost.weights))), "onnxruntime": version("onnxruntime")}
 
 
 def check_weights(cost: Mccnn, wanted: Mapping[str, Any]) -> None:
-    """Hold that this process finds the weights of the run, and what runs them.
+    """Raise if this process has other weights or another onnxruntime than the run.
 
     Raises
     ------
     ChangedInputError
-        It does not.
+        Names the file and what differs.
     """
     here = _weights_identity(cost)
     for key in ("sha256", "onnxruntime"):
         if here[key] != wanted[key]:
             raise ChangedInputError(
-                f"{here['path']} differs in {key} from {wanted['path']} of the run: it was replaced, or this worker "
-                "has another"
+                f"{here['path']} differs in {key} from {wanted['path']} of the run: restore it, and give all workers "
+                "the same weights and onnxruntime"
             )
 
 
 def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: Config) -> list[str]:
-    """In what the run of a ``run.json`` differs from one of whole images with settings, a line each.
+    """List the differences between the run of a ``run.json`` and one of whole images with these settings.
 
-    Versions do not count, and neither does where tiles were matched.
+    Versions and cluster are ignored.
     """
     before = {
         "settings": load_config(report["settings"]).model_dump(mode="json", exclude={"cluster", "preset"}),

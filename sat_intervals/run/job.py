@@ -1,4 +1,4 @@
-"""A pair made ready to be matched: images opened and checked, its folder, its tiles, its store."""
+"""Prepare a pair for matching: open and check its images, folder, tiles and store."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -22,13 +22,13 @@ from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import LAYOUT, Store, finished_run, inputs_before
 from sat_intervals.tiling import Grid, Tile, Window
 
-# What no tile knows of the settings: a preset is known by what it set.
-_AFTER_THE_TILES = {"preset", "median", "regularization", "products", "cluster"}
+# Settings without effect on tiles; those of the preset itself are listed one by one.
+_NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker needs to match any tile of a pair, and what comes after.
+    """All that is needed to match any tile of a pair and to assemble its files; picklable.
 
     Attributes
     ----------
@@ -37,13 +37,13 @@ class Job:
     config
         Settings.
     store
-        Where tiles go; its grid says which there are.
+        Store and grid of the tiles.
     out
         Folder of the run.
     inputs
-        What run.json says of the images, and of the weights of MC-CNN.
+        Description of the images and of the MC-CNN weights for run.json.
     files
-        What `identity` says of each file that the images are read from, by the name it is opened by.
+        `identity` of each file that the images are read from, by the name it is opened with.
     """
 
     left: Image
@@ -56,43 +56,43 @@ class Job:
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """All that decides the bytes of a tile."""
+        """Return all that decides the bytes of a tile."""
         return _manifest(self.config, self.inputs, self.store.grid.region)
 
     @property
     def name(self) -> str:
-        """A name that this run shares with no other: all that decides the bytes of its files."""
+        """Return a unique name of the run: a digest of all that decides the bytes of its files."""
         return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster", "preset"})})
 
     def is_finished(self) -> bool:
-        """Whether the folder holds the files of this very run, which died before it removed its tiles."""
+        """Return whether the folder has the files of this run, which was killed before it removed its tiles."""
         noted = finished_run(self.store.home)
         return is_complete(self.out) and noted is not None and noted[0] == self.name
 
     def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store for what decides the bytes of a tile; to be called while its folder is locked.
+        """Open the store; call it while its folder is locked.
 
-        With ``overwrite`` the files of the run before stay until this one replaces them; it can be resumed without.
+        With ``overwrite`` the files of an earlier run are kept until this one replaces them; to resume, omit it.
         """
-        if not overwrite and is_complete(self.out):  # of this run or of one that ended before the lock was free
+        if not overwrite and is_complete(self.out):  # another run may have ended before this one got the lock
             raise holds_run(self.out, OUTPUTS)
         check_output(self.out, overwrite)
         self.store.open(self.manifest, overwrite=overwrite)
 
     def check_inputs(self) -> None:
-        """Hold that all inputs are those of the run still, the weights those that this process finds.
+        """Raise if an input changed since the start of the run, or this process has other weights.
 
         Raises
         ------
         ChangedInputError
-            With the first that is not.
+            Names the first changed input.
         """
         check_unchanged(self.files)
         if isinstance(self.config.cost, Mccnn):
             check_weights(self.config.cost, self.inputs["weights"])
 
     def waiting(self) -> list[Tile]:
-        """The tiles that are not done."""
+        """Return the tiles that are not done."""
         done = self.store.done()
         return [tile for tile in self.store.grid if tile.name not in done]
 
@@ -107,9 +107,9 @@ def prepare(
     overwrite: bool = False,
     pair: str = "",
 ) -> Job:
-    """Check all that can be checked before a pixel is read; parameters as of `match_pair`.
+    """Check all that can be checked before reading pixels; parameters as in `match_pair`.
 
-    ``pair`` keeps pairs of a batch apart that are the same in all else, where their tiles lie elsewhere.
+    ``pair`` distinguishes otherwise equal pairs of a batch in an external store.
     """
     config, out = fitted_to_jobs(load_config(config)), Path(out)
     left, right = checked_pair(left, right, config)
@@ -123,7 +123,7 @@ def prepare(
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
         name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
-    # of the runs in a local store each has a folder whose name ends with a digest
+    # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
@@ -132,28 +132,28 @@ def prepare(
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
-    """All that decides the bytes of a tile."""
+    """Return all that decides the bytes of a tile."""
     return {
         "version": version("sat-intervals"),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,
-        "settings": config.model_dump(mode="json", exclude=_AFTER_THE_TILES),
+        "settings": config.model_dump(mode="json", exclude=_NOT_OF_TILES),
         "inputs": inputs,
         "region": asdict(region),
     }
 
 
 def fitted_to_jobs(config: Config) -> Config:
-    """The settings with tiles that fit in the memory that they give a job of a batch system.
+    """Return the settings with tiles small enough for the memory of a job of a batch system.
 
     Raises
     ------
     ConfigError
-        As of `fitted` and `parse_memory`.
+        See `fitted` and `parse_memory`.
     """
     if config.cluster.memory is None:
         return config
-    # dask kills a worker that takes 95 % of its memory
+    # dask kills workers at 95 % of their memory
     return fitted(config, 9 * parse_memory(config.cluster.memory) // 10, config.cluster.cores)
 
 
@@ -168,7 +168,7 @@ def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Co
 
 
 def checked_region(left: Image, window: Window | None) -> Window:
-    """What is matched of the left image: the window that is given, or all of it."""
+    """Return the region of the left image to match: the given window, or all of it."""
     whole = Window(0, 0, left.height, left.width)
     if window is None:
         return whole
@@ -181,7 +181,7 @@ def checked_region(left: Image, window: Window | None) -> Window:
 
 
 def check_tiles(config: Config, region: Window) -> None:
-    """Refuse tiles that this process cannot hold; what jobs and the workers of a scheduler have is theirs to know."""
+    """Raise if tiles do not fit in the memory of this machine; not checked for jobs and existing schedulers."""
     if config.cluster.kind not in ("threads", "processes"):
         return
     height, width = (min(config.tiles.size, side) for side in (region.height, region.width))

@@ -1,4 +1,4 @@
-"""A pair, files to files, and what it shares with a batch: images measured, tiles matched, damaged ones again."""
+"""Match a pair, files to files, with steps shared with batches: measure images, match tiles, repair damaged ones."""
 
 import errno
 import logging
@@ -26,10 +26,9 @@ from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Window
 
-# Errors of a disk, or of a user's share of it.
-_FULL = errno.ENOSPC, errno.EDQUOT
+_FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
-# How often damaged tiles are matched again before the run gives up: a disk that damages more is broken.
+# How often damaged tiles are matched again; more damage means a broken disk.
 _TRIES = 2
 
 _LOG = logging.getLogger(__name__)
@@ -53,18 +52,18 @@ def match_pair(
     left, right
         Paths, or images opened by `open_image` with a band, a no-data value or a mask.
     out
-        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``; tiles that are done are kept there, or in
-        ``cluster.store``, until the run is complete, and an interrupted call goes on from them.
+        Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``. Finished tiles are kept there, or in
+        ``cluster.store``, until the run is complete; after an interruption the same call resumes from them.
     config
-        Settings, or what `load_config` makes them from; ``cluster`` says where tiles are matched.
+        Settings, or a source for `load_config`; ``cluster`` says where tiles are matched.
     window
         Region of the left image; by default all of it.
     keep_tiles
-        Whether the raw products of the tiles stay.
+        Whether to keep the raw products of the tiles.
     overwrite
-        Whether a run in ``out`` is replaced, once this one is complete, and tiles there are dropped.
+        Whether to delete existing tiles in ``out``, and replace a run there once this one is complete.
     progress
-        Called from time to time.
+        Called regularly with stage, done and total.
 
     Returns
     -------
@@ -73,9 +72,9 @@ def match_pair(
     Raises
     ------
     SatIntervalsError
-        Input, settings or output that cannot be used.
+        Inputs, settings or output cannot be used.
     RunError
-        Tiles that failed; no output has its final name.
+        Tiles failed; no output was published.
     """
     seconds: dict[str, float] = {}
     with logged_stage(seconds, "start"):
@@ -94,10 +93,9 @@ def match_pair(
         if not overwrite and job.is_finished():
             check_as_published(job.out)
             run = open_run(job.out)
-            run.check_whole()
             job.store.remove()
             remove_scratch(job.out, RUN_FILES)
-            _LOG.warning("the run in %s was complete; the tiles that it left are removed now", job.out)
+            _LOG.warning("the run in %s was already complete; its remaining tiles were removed", job.out)
             return run.report
         job.begin(overwrite=overwrite)
         with logged_stage(seconds, "kernels"):
@@ -115,29 +113,29 @@ def match_pair(
 def assembled(
     job: Job, match: Callable[[], None], seconds: dict[str, float], progress: Progress, *, keep_tiles: bool
 ) -> dict[str, Any]:
-    """Write the files of a run, see `assemble`; ``match`` is called for tiles that turn out to be damaged."""
+    """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles."""
     for _ in range(_TRIES):
         try:
             return assemble(job, seconds, progress, keep_tiles=keep_tiles)
         except DamagedTilesError as error:
             job.store.check(job.manifest)
-            _LOG.warning("%s; this is done now", error)
+            _LOG.warning("%s; trying this now", error)
             match()
     return assemble(job, seconds, progress, keep_tiles=keep_tiles)
 
 
 def _is_measured(job: Job) -> bool:
-    """Whether the store holds mean and standard deviation of both images, or the run does without."""
+    """Return whether the store has mean and standard deviation of both images, or the run needs none."""
     return not isinstance(job.config.cost, Mccnn) or job.store.normalization() is not None
 
 
 def measure_images(client: Client, job: Job, progress: Progress) -> None:
-    """Keep mean and standard deviation of both images in the store, where MC-CNN needs them and they are not there.
+    """Measure mean and standard deviation of both images and store them, if MC-CNN needs them and they are missing.
 
     Raises
     ------
     RunError
-        An image that cannot be read.
+        An image cannot be read.
     """
     if _is_measured(job):
         return
@@ -164,23 +162,23 @@ def _measured(client: Client, image: Image, job: Job, progress: Progress) -> Ima
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
-    """Raise a RunError that names every tile that failed, if there are any, or the input that changed."""
+    """Raise if tiles failed, with their names and reasons, or with the input that changed."""
     for error in failures.values():
         if isinstance(error, ChangedInputError):
             raise error
     if failures:
         lines = "\n".join(f"  tile {name}: {reason(error)}" for name, error in sorted(failures.items()))
         raise RunError(
-            f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept; mend the cause and run the "
-            f"same command again, with --overwrite where an input changed:\n{lines}"
+            f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept; fix the cause and rerun the "
+            f"same command: it resumes; add --overwrite if an input changed:\n{lines}"
         ) from min(failures.items())[1]
 
 
 def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[tuple[Job, dict[str, BaseException]]]:
-    """Match the tiles of jobs that are not done; yields each job as its last tile is through, with what failed.
+    """Match the unfinished tiles of jobs; yield each job after its last tile, with its failures by tile.
 
-    Tiles of several jobs are in flight at once, two a core and no more, so that the scheduler's memory does not grow
-    with the number of tiles. Workers write what they make to the store; only their word comes back.
+    Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the
+    number of tiles. Workers write the products to the store and return nothing.
     """
     waiting = [job.waiting() for job in jobs]
     left = [len(tiles) for tiles in waiting]
@@ -199,10 +197,10 @@ def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator
             progress("tiles", done, total)
             continue
         (i, tile), _, error = outcome
-        if isinstance(error, OSError) and error.errno in _FULL:  # no other tile would fare better
+        if isinstance(error, OSError) and error.errno in _FULL_DISK:  # all other tiles would fail too
             raise RunError(
-                f"{error.filename or jobs[i].store.folder}: {error.strerror}: make room and run the same command "
-                "again, it goes on from the tiles that are done"
+                f"{error.filename or jobs[i].store.folder}: {error.strerror}: free disk space and rerun the same "
+                "command: it resumes"
             ) from error
         if error is not None:
             failures[i][tile.name] = error

@@ -1,4 +1,4 @@
-"""A run before it is run: tiles, work, memory, disk, and the time it will take by a sample of it."""
+"""Plan a run: tiles, work, memory, disk, and the time estimated from a sample."""
 
 import tempfile
 from collections.abc import Iterator
@@ -16,33 +16,32 @@ from sat_intervals.run.pair import match_pair
 from sat_intervals.run.submit import reason
 from sat_intervals.tiling import Grid, Window
 
-# Side of the window at the centre of the image that is matched to tell the time.
+# Side of the sample, a window at the centre of the image.
 SAMPLE = 512
-# Bytes a pixel on the disk while a run goes on: raw products (8 to 12 as compressed), strips of the final bands, files.
+# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed), strips of the final bands, files.
 _STORE_BYTES, _STRIP_BYTES, _FILE_BYTES = 12, 18, 10
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will take.
+    """Resources that a run needs.
 
     Attributes
     ----------
     tile_size, tiles
-        Side of a core in pixels, as the memory allows, and number of tiles.
+        Side of a core in pixels, reduced to fit in memory, and number of tiles.
     workers
-        Tiles in work at once.
+        Tiles at once.
     extra_work
-        Share of the matching that goes to overlaps.
+        Work on overlaps, relative to that on cores.
     worker_bytes
-        Memory of one tile in work with its process.
+        Memory of a process with one tile at once.
     together, together_bytes
-        Tiles in work at once in one process, which are all in threads, and as many as it has cores in a job of a batch
-        system; and memory of that process.
+        Tiles at once in one process (all with threads, one per core in a job of a batch system), and its memory.
     disk_bytes
-        Scratch and files in the folder of the run.
+        Temporary and final files in the folder of the run.
     seconds
-        Expected, by the sample.
+        Time estimated from the sample.
     """
 
     tile_size: int
@@ -65,23 +64,22 @@ def plan(
     memory: int | None = None,
     workers: int | None = None,
 ) -> Plan:
-    """Say what matching a pair will take, before anything is submitted.
+    """Estimate tiles, memory, disk and time of matching a pair.
 
     Parameters
     ----------
     left, right, config, window
-        As of `match_pair`.
+        See `match_pair`.
     memory
-        Bytes that a worker may take; the tile gets smaller where it must, the search range never. By default what the
-        settings give a job.
+        Memory of a worker in bytes; tiles are made smaller to fit. By default the memory of a job in the settings.
     workers
-        Tiles in work at once; by default those of the settings, with batch systems all cores of all jobs, or one a core
-        of this machine.
+        Tiles at once; by default those of the settings (all cores of all jobs with batch systems), or one per core of
+        this machine.
 
     Raises
     ------
     SatIntervalsError
-        What cannot be matched, and memory in which no tile fits, with the figures.
+        The pair cannot be matched, or not even the smallest tile fits in the memory.
     """
     config = load_config(config)
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
@@ -107,7 +105,7 @@ def plan(
 
 
 def _work(grid: Grid, region: Window, config: Config) -> int:
-    """Pixels that the two sweeps visit, on average of both: all of the patch but the rows behind its core."""
+    """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows behind its core."""
     overlap = config.tiles.overlap
     total = 0
     for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
@@ -119,7 +117,7 @@ def _work(grid: Grid, region: Window, config: Config) -> int:
 
 
 def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
-    """Places along a grid, which may be too long to visit all, with how many are like them: those far from its ends."""
+    """Yield places along one axis of the grid and how many are alike: inner ones far from both ends are grouped."""
     ends = reach + 1
     if count <= 2 * ends:
         yield from ((place, 1) for place in range(count))
@@ -129,20 +127,20 @@ def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
 
 
 def _expected_seconds(left: Image, right: Image, config: Config, workers: int, work: int, region: Window) -> float:
-    """Seconds of a run: those of a sample, tiles scaled by their work, the rest by pixels."""
-    one = config.model_copy(update={"cluster": Cluster(workers=1)})  # nor in the store of the run itself
+    """Estimate the seconds of a run from a sample: tiles scaled by work, the rest by pixels."""
+    one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
     with tempfile.TemporaryDirectory() as folder:
         sample, seconds = _sampled(left, right, Path(folder) / "sample", one, region)
     sampled = _work(Grid(sample, config.tiles.size), region, config)
     tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / sampled
     tiles /= min(workers, len(Grid(region, config.tiles.size)))
     files = (seconds["bands"] + seconds["files"]) * (region.height * region.width) / (sample.height * sample.width)
-    images = seconds["tiles.images"]  # whole already, whatever the sample
+    images = seconds["tiles.images"]  # the sample already measures whole images
     return float(seconds["start"] + seconds["kernels"] + images + tiles + files)
 
 
 def _sampled(left: Image, right: Image, out: Path, config: Config, region: Window) -> tuple[Window, dict[str, float]]:
-    """The window at the centre, or another where nothing can be matched there, and the seconds that it took."""
+    """Match a sample at the centre, or elsewhere if that has no data; return its window and the seconds."""
     height, width = min(SAMPLE, region.height), min(SAMPLE, region.width)
     for share in (0.5, 0.25, 0.75, 0.0, 1.0):
         row = region.row + round(share * (region.height - height))
@@ -150,7 +148,7 @@ def _sampled(left: Image, right: Image, out: Path, config: Config, region: Windo
         sample = Window(row, column, height, width)
         try:
             return sample, match_pair(left, right, out, config, window=sample, overwrite=True)["seconds"]
-        except RunError as error:  # its words are of a run that can be gone on with
+        except RunError as error:  # its advice to resume does not apply to a sample
             raise RunError(f"a sample of the pair cannot be matched: {reason(error.__cause__ or error)}") from error
         except SatIntervalsError as error:
             last = error

@@ -1,7 +1,7 @@
-"""What the overlap left: neighbours compute the pixel lines beside their border twice, and these are compared.
+"""Measure seams: compare the pixel lines along tile borders, which both neighbours compute.
 
-SGM's paths have no bounded support, so a tile's products depend, a little, on how far the tile was read. The two
-lines along every inner border tell how much.
+SGM's paths have unbounded support, so the products of a tile depend slightly on its overlap. The two lines along every
+inner border show how much.
 """
 
 from collections.abc import Iterator
@@ -18,12 +18,12 @@ TOP, BOTTOM, LEFT, RIGHT = range(4)
 
 
 def seam_lines(raw: Raw, output: Window, core: Window, size: int) -> np.ndarray:
-    """The core's outermost lines and the ring's, which the neighbours own.
+    """Return the outermost lines of the core, and those of the ring around it, which belong to the neighbours.
 
     Parameters
     ----------
     raw
-        Products of the pixels of ``output``, which holds ``core`` and, on inner borders, one pixel around it.
+        Products of the pixels of ``output``: ``core`` and, along inner borders, one pixel around it.
     size
         Length of the longest line.
 
@@ -47,7 +47,7 @@ def seam_lines(raw: Raw, output: Window, core: Window, size: int) -> np.ndarray:
 
 
 class _Difference(NamedTuple):
-    """How many pixels of a border were matched, and how many of them differ."""
+    """Number of matched pixels along a border, and of those that differ."""
 
     pixels: int
     winner: int
@@ -63,7 +63,7 @@ class _Difference(NamedTuple):
 
 
 def seam_report(lines: np.ndarray, grid: Grid) -> dict[str, Any]:
-    """Shares of the pixels along inner borders whose raw winner or raw bounds the two neighbours saw differently.
+    """Return the shares of pixels along inner borders whose raw winner or bounds differ between neighbours.
 
     Parameters
     ----------
@@ -74,8 +74,8 @@ def seam_report(lines: np.ndarray, grid: Grid) -> dict[str, Any]:
 
     Returns
     -------
-    ``borders``; ``pixels``, those with a winner for either neighbour; ``winner_share`` and ``bounds_share`` over all
-    borders; ``worst``, the same of the border with the largest ``bounds_share``, None without inner borders.
+    ``borders``; ``pixels`` with a winner in either tile; ``winner_share`` and ``bounds_share`` over all borders;
+    ``worst``, the same for the border with the largest ``bounds_share``, None without inner borders.
     """
     borders = dict(_borders(lines, grid))
     total = _Difference(*(sum(counts) for counts in zip((0, 0, 0), *borders.values(), strict=True)))

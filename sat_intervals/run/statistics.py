@@ -1,10 +1,10 @@
-"""What a run says of itself in figures, gathered from the final bands strip by strip."""
+"""Count pixels of the final bands, strip by strip, for run.json."""
 
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.products import FLAGS, INVALID, REGULARIZED, Bands
+from sat_intervals.products import FLAGS, INVALID, REGULARIZED, Bands, cause
 
 # Widths are counted in steps of a hundredth of a pixel.
 _WIDTH_STEP = 0.01
@@ -15,7 +15,7 @@ class Tally:
 
     def __init__(self, count: int) -> None:
         """``count``: number of disparities, so one more than the widest interval."""
-        # How often each sum of flags occurs tells all that is asked of them.
+        # Histogram of the sums of flags, from which all counts follow.
         self._sums = np.zeros(1 << (max(flag.bit for flag in FLAGS) + 1), np.int64)
         self._widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
         self._whole = round((count - 1) / _WIDTH_STEP)
@@ -34,6 +34,9 @@ class Tally:
     def report(self) -> dict[str, Any]:
         """Counts of pixels; ``ambiguous``: valid, with the whole search range as interval.
 
+        ``flags`` counts a pixel under each of its flags. ``causes`` counts each invalid pixel once, see
+        `products.cause`: with ``valid`` they sum to ``pixels``.
+
         The median width in pixels, to 0.01, is None where there is no interval.
         """
         upto = np.cumsum(self._widths)
@@ -46,5 +49,6 @@ class Tally:
             "ambiguous": int(self._widths[self._whole]),
             "low_confidence": self._count(valid & (sums & REGULARIZED != 0)),
             "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
+            "causes": {flag.name: self._count(cause(sums) == flag.value) for flag in FLAGS if flag.invalid},
             "median_interval_width": None if median is None else round(median, 2),
         }

@@ -1,4 +1,4 @@
-"""How far a run or a batch is, from its folder alone."""
+"""Read the progress of a run or a batch from its folder."""
 
 import json
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ __all__ = ["ElsewhereError", "Status", "is_replacing", "read_report", "read_stat
 
 @dataclass(frozen=True)
 class Status:
-    """How far the tiles of a run are.
+    """Progress of the tiles of a run.
 
     Attributes
     ----------
     total, done
         Numbers of tiles.
     failed
-        Why tiles failed that are not done since, by name.
+        Why tiles failed, by name, without those done since.
     running
-        Whether a run is at work on them.
+        Whether a run is active.
     """
 
     total: int
@@ -35,26 +35,26 @@ class Status:
 
 
 def read_status(home: Path, store: str | None = None) -> Status:
-    """How far a run is, from its store alone.
+    """Read the progress of a run from its store.
 
     Parameters
     ----------
     home
-        Folder of the tiles in that of the run, wherever they lie.
+        Folder of the tiles in the folder of the run, even if they are elsewhere.
     store
-        The store that the user names; without it none but ``home`` is looked at.
+        The store that the user names; without it only ``home`` is read.
 
     Raises
     ------
     StoreError
-        Where there is no store, or it is said to be in another than the user names.
+        There is no store, or it is not the one that the user names.
     """
     there = store_of(home, store)
     return Status(len(there.grid), len(there.done()), there.failures(), LocalFolder(home).is_locked())
 
 
 def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
-    """What `match_batch` said last of the pairs in a folder; None where there is no batch."""
+    """Read the report of `match_batch` in a folder, None without one."""
     text = LocalFolder(out).read(REPORT)
     if text is None:
         return None
@@ -63,4 +63,4 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
             str(name): {"error": "", **ended, "state": str(ended["state"])} for name, ended in json.loads(text).items()
         }
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: run the batch again") from error
+        raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: rerun the batch") from error

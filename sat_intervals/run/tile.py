@@ -1,4 +1,4 @@
-"""One tile on a worker: read, match, leave behind what the strips need."""
+"""Match one tile on a worker: read, match, write the intermediate products."""
 
 import logging
 from typing import Any
@@ -23,7 +23,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]]) -> Moments:
-    """Look at a block of an image, one of ``files``, for its mean and standard deviation; runs on a worker."""
+    """Compute the moments of a block of an image, one of ``files``; runs on a worker."""
     try:
         try:
             return moments(*read_window(image, block))
@@ -35,21 +35,21 @@ def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]])
 
 
 def match_tile(job: Job, tile: Tile) -> None:
-    """Match one tile and write what it leaves behind; runs on a worker."""
+    """Match one tile and write its intermediate products; runs on a worker."""
     try:
         _match_tile(job, tile)
     except Exception as error:
         _LOG.info(
-            "tile %s failed; it is tried again, %d times at most", tile.name, job.config.cluster.retries, exc_info=True
+            "tile %s failed; it is tried again at most %d times", tile.name, job.config.cluster.retries, exc_info=True
         )
         if isinstance(error, SatIntervalsError):
-            error.__cause__ = error.__context__ = None  # GDAL's, which do not survive the way back from the worker
+            error.__cause__ = error.__context__ = None  # errors of GDAL cannot be pickled
         raise
 
 
 def _match_tile(job: Job, tile: Tile) -> None:
     job.store.check(job.manifest)
-    job.check_inputs()  # so that nothing is matched in vain
+    job.check_inputs()  # before any work
     job.store.check_space(tile)
     statistics = _checked_statistics(job)
     seconds: dict[str, float] = {}
@@ -58,7 +58,7 @@ def _match_tile(job: Job, tile: Tile) -> None:
     try:
         with timed(seconds, "read"):
             left, right = (View(window, *read_window(image, window)) for image, window in windows)
-    finally:  # a file that was replaced by a shorter one cannot be read
+    finally:  # a changed input explains a read error
         job.check_inputs()
     with timed(seconds, "match"):
         patch = match_patch((left, right), tile.core, job.store.grid.region, whole, job.config, statistics)
@@ -70,17 +70,17 @@ def _match_tile(job: Job, tile: Tile) -> None:
 
 
 def _checked_statistics(job: Job) -> PairStatistics | None:
-    """Mean and standard deviation of the images, where MC-CNN needs them."""
+    """Return mean and standard deviation of the images if MC-CNN needs them, else None."""
     if not isinstance(job.config.cost, Mccnn):
         return None
     normalization = job.store.normalization()
     if normalization is None:
-        raise RunError(f"what was measured of the images is lost in {job.store.folder}: run the same command again")
+        raise RunError(f"the image statistics in {job.store.folder} are missing: rerun the same command: it resumes")
     return PairStatistics.of_report(normalization)
 
 
 def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
-    """What the tile's core adds to the store."""
+    """Return the products of the tile's core for the store."""
     raw = patch.raw
     inner = tile.core.relative_to(patch.output).slices
     arrays = {name: getattr(raw, name)[inner] for name in ("winner", "lower", "upper", "disparity", "validity")}

@@ -1,1 +1,1 @@
-"""A finished run for people: pictures as PNG files, and a report that any browser opens."""
+"""Draw pictures (PNG) and an HTML report of a finished run."""

@@ -1,4 +1,4 @@
-"""The cost curve of one pixel, matched again from the images, and how it becomes an interval (paper eq. 5 to 9)."""
+"""Match one pixel again: its cost curve and the interval derived from it (paper eq. 5 to 9)."""
 
 from typing import NamedTuple
 
@@ -17,22 +17,22 @@ from sat_intervals.tiling import Window
 
 
 class Curve(NamedTuple):
-    """One pixel's curve and what is read off it, before medians and regularisation.
+    """The cost curve of a pixel, its disparity and interval before median filter and regularisation.
 
     Attributes
     ----------
     disparities
         Integers searched, in pixels.
     costs
-        Float64, aggregated by SGM where the run did; NaN where a candidate is impossible.
+        Float64, aggregated by SGM if the run uses it; NaN where a candidate is impossible.
     possibilities
         0 to 1, 1 at the lowest cost; NaN where a candidate is impossible.
     cut
-        Whether a disparity belongs to the alpha-cut; none do where the run has no intervals.
+        Whether a disparity belongs to the alpha-cut; all false if the run has no intervals.
     disparity
-        The winner, refined where the run did, in pixels.
+        The disparity of lowest cost, refined if the run refines, in pixels.
     lower, upper
-        The interval in pixels, None where the run has none.
+        The interval in pixels, None if the run has no intervals.
     """
 
     disparities: np.ndarray
@@ -45,7 +45,9 @@ class Curve(NamedTuple):
 
 
 def read_curve(results: Results, row: int, column: int) -> Curve:
-    """Match a pixel again with the run's overlap around it: SGM's memory beyond that makes a little difference.
+    """Match a pixel again with the run's overlap around it.
+
+    SGM's aggregation reaches beyond the overlap, so the curve may differ slightly from that of the run.
 
     Parameters
     ----------
@@ -55,7 +57,7 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     Raises
     ------
     SatIntervalsError
-        A pixel outside the results, or one that has no possible candidate.
+        The pixel is outside the results or has no possible candidate.
     """
     results.check_pixel(row, column)
     config = results.config
@@ -90,7 +92,7 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
 
 
 def _explain(results: Results, row: int, column: int) -> str:
-    """Why a pixel has no curve, by its validity flags."""
+    """Return the message why a pixel has no curve, from its validity flags."""
     validity = int(results.read(Window(row, column, 1, 1)).validity[0, 0])
     reasons = [flag.meaning for flag in FLAGS if flag.invalid and validity & flag.value]
     return f"row {row}, column {column} has no cost curve: {'; '.join(reasons)}: choose a pixel that was matched"

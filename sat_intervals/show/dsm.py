@@ -1,37 +1,49 @@
-"""A surface model: its relief as the sun would show it, heights, width of their intervals, confidence."""
+"""Draw a surface model: hillshade, height, interval width, confidence."""
 
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import PowerNorm
 from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import is_surface, read_place, read_small_layers
-from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.show.canvas import (
+    DPI,
+    INK,
+    NOTHING,
+    add_histogram,
+    fitting,
+    limits,
+    page,
+    pointed_ends,
+    say_empty,
+    widest,
+)
 
 _LONGEST = 5.5  # inches of the longer side of a map
-_STRETCHED = 5.0  # ratio of sides beyond which maps are cut to it
-_SUN = np.array([-0.5, 0.5, np.sqrt(0.5)])  # towards it: east, north, up; 45 degrees high in the north-west
-_FLATTENED = 0.3
+_STRETCHED = 5.0  # largest ratio of the sides of a map
+_SUN = np.array([-0.5, 0.5, np.sqrt(0.5)])  # direction to the sun (east, north, up): north-west, 45 degrees high
+_FLATTENED = 0.3  # factor on heights before slopes: noise of 0.1 m is steep between cells of 0.5 m
 _BAND = {band.name: index for index, band in enumerate(SURFACE)}
 
 
 def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
-    """Draw hillshade, height, interval width and confidence of a surface model, read through its overviews.
+    """Draw hillshade, height, interval width and confidence of a surface model, read from its overviews.
 
-    Where several runs overlap, what they agree on takes the place of confidence.
+    If several runs overlap, their agreement replaces confidence.
 
     Raises
     ------
     SatIntervalsError
-        A file that cannot be read, or a picture that cannot be written.
+        The file cannot be read or the picture cannot be written.
     """
     shape, place = read_place(surface)
     if not is_surface(surface):
-        raise SatIntervalsError(f"{surface} is no surface model of sat-intervals dsm: move it away or make it again")
+        raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: move it or make it again")
     assert place.transform is not None
     assert place.pixel_size is not None
     tall = float(np.clip(shape[0] / shape[1], 1 / _STRETCHED, _STRETCHED))
@@ -48,25 +60,27 @@ def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
     relief = _relief(height, across, down)
     left, top = place.transform.c, place.transform.f
     extent = (left, left + shape[1] * place.pixel_size[0], top - shape[0] * place.pixel_size[1], top)
-    last = ("Agreement of runs", "1 where intervals meet", agreement)
+    last = ("Agreement of runs", "1 where intervals overlap", agreement)
     if not np.isfinite(agreement).any():
         last = ("Confidence", "0 to 1", bands[_BAND["confidence"]])
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
     caption = f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}"
     with page(path, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
         panels = figure.subplots(2, 2).ravel()
-        _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west", ""), "gray", PowerNorm(1, 0, 1))
-        _draw(panels[1], extent, height, ("Height", "m"), "viridis", PowerNorm(1, *limits(height, (0, 1))))
-        widest = limits(widths, (0, 1))[1]
-        _draw(panels[2], extent, widths, ("Interval width", "m, square-root scale"), "magma", PowerNorm(0.5, 0, widest))
-        _draw(panels[3], extent, last[2], last[:2], "cividis", PowerNorm(1, 0, 1))
+        _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west", ""), "gray", (0, 1))
+        _draw(panels[1], extent, height, ("Height", "m"), "viridis", limits(height, (0, 1)))
+        name = "Interval width", "m, square-root scale"
+        end = widest(widths)
+        bar = _draw(panels[2], extent, widths, name, "magma", (0, end), 0.5)
+        assert bar
+        add_histogram(bar, widths, end, step=end / 40)
+        _draw(panels[3], extent, last[2], last[:2], "cividis", (0, 1))
 
 
 def _relief(height: np.ndarray, across: float, down: float) -> np.ndarray:
-    """What the sun makes of a surface whose cells are so many metres wide and high: 0 to 1, NaN beside holes.
+    """Return the hillshade of a surface, 0 to 1, NaN beside holes.
 
-    Slopes are told from cells two apart and flattened: noise of a decimetre is steep from one cell of half a metre to
-    the next.
+    ``across`` and ``down`` are the width and height of a cell in metres. Slopes are central differences.
     """
     if min(height.shape) < 2:
         return np.full(height.shape, np.nan)
@@ -81,11 +95,12 @@ def _draw(
     values: np.ndarray,
     name: tuple[str, str],
     colours: str,
-    norm: PowerNorm,
-) -> None:
-    """A layer with title and unit in ``name``, in map coordinates, with a colour bar if it has a unit."""
+    shown: tuple[float, float],
+    power: float = 1.0,
+) -> Colorbar | None:
+    """Draw a layer in map coordinates, titled ``name[0]``; with a colour bar if there is a unit, ``name[1]``."""
     panel.set_facecolor(NOTHING)
-    drawn = panel.imshow(values, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+    drawn = panel.imshow(values, extent=extent, cmap=colours, norm=PowerNorm(power, *shown), interpolation="nearest")
     panel.set_title(name[0])
     for axis in (panel.xaxis, panel.yaxis):
         axis.set_major_locator(MaxNLocator(3))
@@ -94,8 +109,10 @@ def _draw(
     panel.set_xlabel("easting (m)", fontsize=8, color=INK)
     panel.set_ylabel("northing (m)", fontsize=8, color=INK)
     say_empty(panel, values, "no value")
-    if name[1]:
-        assert panel.figure is not None
-        bar = panel.figure.colorbar(drawn, ax=panel, shrink=0.9, aspect=25, pad=0.02)
-        bar.set_label(name[1])
-        bar.ax.tick_params(labelsize=8)
+    if not name[1]:
+        return None
+    assert panel.figure is not None
+    bar = panel.figure.colorbar(drawn, ax=panel, extend=pointed_ends(values, *shown), shrink=0.9, aspect=25, pad=0.02)
+    bar.set_label(name[1])
+    bar.ax.tick_params(labelsize=8)
+    return bar

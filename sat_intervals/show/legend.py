@@ -1,12 +1,12 @@
-"""The kinds of pixel that a map tells apart, each with its colour: what pictures and reports have in common."""
+"""Define the pixel classes of maps and reports, and their colours."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sat_intervals.products import FLAGS, REGULARIZED
+from sat_intervals.products import FLAGS, REGULARIZED, cause
 
-# Okabe and Ito's colours, which colour-blind people tell apart.
+# The palette of Okabe and Ito, safe for colour-blind readers.
 BLUE, SKY, ORANGE, VERMILION, PURPLE = "#0072b2", "#56b4e9", "#e69f00", "#d55e00", "#cc79a7"
 
 _INVALID = {
@@ -20,7 +20,7 @@ _INVALID = {
 
 
 class PixelClass(NamedTuple):
-    """A kind of pixel: its colour as ``#rrggbb``, what it means, and the validity flag that makes it (0 = none)."""
+    """A class of pixels: colour (``#rrggbb``), meaning, and validity flag (0 = none)."""
 
     colour: str
     meaning: str
@@ -36,8 +36,15 @@ FIRST_INVALID = 2
 
 
 def classify(validity: np.ndarray) -> np.ndarray:
-    """The index in PIXEL_CLASSES of every pixel of a validity band, uint8; the first of several reasons wins."""
-    places = np.zeros(validity.shape, np.uint8)
-    for place in (1, *range(len(PIXEL_CLASSES) - 1, FIRST_INVALID - 1, -1)):
-        places[validity & PIXEL_CLASSES[place].flag != 0] = place
+    """Return the index into PIXEL_CLASSES of each pixel of a validity band, uint8; see `products.cause`."""
+    causes = cause(validity)
+    places = np.where(validity & REGULARIZED, 1, 0).astype(np.uint8)
+    for place in range(FIRST_INVALID, len(PIXEL_CLASSES)):
+        places[causes == PIXEL_CLASSES[place].flag] = place
     return places
+
+
+def class_counts(counts: dict[str, Any]) -> list[int]:
+    """Return the number of pixels in each of PIXEL_CLASSES from the section ``counts`` of ``run.json``."""
+    regularized = counts["low_confidence"]
+    return [counts["valid"] - regularized, regularized, *counts["causes"].values()]

@@ -1,4 +1,4 @@
-"""Lines: the interval along a row, and the cost curve of a pixel."""
+"""Draw line charts: the interval along a row, and the cost curve of a pixel."""
 
 from pathlib import Path
 
@@ -34,13 +34,13 @@ def draw_profile(
     bands = results.read(Window(row, 0, 1, results.region.width))
     valid = bands.valid
     lines = [np.where(valid, band, np.nan) for band in (bands.lower, bands.upper, bands.disparity)]
-    # A pixel is a step, seen even when its neighbours are not valid.
+    # Draw each pixel as a step, visible even between invalid neighbours.
     lines += [bands.truth, results.low(bands)]
     lower, upper, disparity, truth, low = (np.repeat(line[0, first : last + 1], 2) for line in lines)
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
     has_intervals = results.config.interval is not None
     mark = "band" if has_intervals else "black line"
-    title = f"Row {row}, columns {first} to {last}; where there is no {mark}, no pixel is valid"
+    title = f"Row {row}, columns {first} to {last}; no {mark}: no valid pixel"
     with page(path, (_WIDTH, 5.4), dpi, title) as figure:
         strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
         _draw_strip(strip, results, row, first, last, dpi)
@@ -57,13 +57,13 @@ def draw_profile(
         if not np.isfinite(disparity).any():
             search = results.config.disparity
             chart.set_ylim(search.minimum - 0.5, search.maximum + 0.5)
-        say_empty(chart, disparity, "no valid pixel here")
+        say_empty(chart, disparity, "no valid pixel")
 
 
 def draw_curve(results: Results, path: Path, row: int, column: int, dpi: int = DPI) -> None:
     """Draw a pixel's cost curve, its possibility distribution, the cut and the interval (the paper's figures 2 and 3).
 
-    Matched again from the images; below stands the interval that the run wrote, after medians and regularisation.
+    The pixel is matched again. The interval that the run wrote, after median filter and regularisation, is shown below.
     """
     curve = read_curve(results, row, column)
     pixel = results.read_pixel(row, column)
@@ -77,7 +77,8 @@ def draw_curve(results: Results, path: Path, row: int, column: int, dpi: int = D
         if curve.lower is not None:
             _draw_cut(below, curve, results)
         if np.isfinite(pixel.lower):
-            text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"  # seen though it may have no width
+            text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"
+            # The marker shows an interval of zero width.
             bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "marker": "|", "ms": 9, "mew": 3, "label": text}
             below.plot([pixel.lower, pixel.upper], [-0.08, -0.08], **bar)
         lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
@@ -101,7 +102,7 @@ def _describe(row: int, column: int, pixel: Bands) -> str:
 
 
 def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
-    """The alpha-cut of the possibilities and the interval between its ends."""
+    """Draw the alpha-cut of the possibilities and the interval derived from it."""
     assert curve.lower is not None
     assert curve.upper is not None
     assert results.config.interval is not None
@@ -111,14 +112,17 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     chart.text(1, level, f"alpha = {level:g}", transform=right, ha="right", va="bottom", color=INK)
     cut = curve.cut
     chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
-    text = f"interval of the cut, {curve.lower} to {curve.upper} px"
+    inside = curve.disparities[cut]
+    wider = curve.lower < inside.min() or curve.upper > inside.max()
+    ends = f"{curve.lower} to {curve.upper} px"
+    text = f"interval, {ends}:\ncut pushed out by refinement" if wider else f"interval of the cut, {ends}"
     chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)
     arrow = {"arrowstyle": "<->", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
     chart.annotate("", (curve.lower, 0.05), (curve.upper, 0.05), arrowprops=arrow)
 
 
 def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] | None) -> None:
-    """Names, limits and a quiet frame."""
+    """Set axis labels, limits, grid and legend."""
     chart.set(xlabel=across, ylabel=up)
     if shown:
         chart.set_xlim(shown)
@@ -129,7 +133,7 @@ def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] 
 
 
 def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, dpi: int) -> None:
-    """The left image around a part of a row, which is a dashed line."""
+    """Draw the left image around a part of a row; a dashed line marks the row."""
     columns = last - first + 1
     reach = max(1, round(columns / 26))
     top, bottom = max(0, row - reach), min(results.region.height, row + reach + 1)

@@ -1,1 +1,1 @@
-"""Tiles between the two stages of a run: manifest, records and arrays. The only home of zarr and fsspec."""
+"""Intermediate tile products: manifest, records and arrays. Only this folder imports zarr and fsspec."""

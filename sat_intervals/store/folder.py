@@ -1,4 +1,4 @@
-"""Places where a run leaves small texts and arrays: folders of this machine, prefixes of any fsspec file system."""
+"""Folders of a store: local ones, and prefixes of fsspec file systems."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -11,53 +11,53 @@ __all__ = ["Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
 
 
 class Folder(Protocol):
-    """What a store needs of the place where it lies; names are relative to it, with ``/`` between their parts.
+    """Interface of a store's folder; names are relative to it, with ``/`` between their parts.
 
-    Bytes that are no UTF-8 are read as U+FFFD, so that a damaged text fails its checksum and nothing else.
+    Invalid UTF-8 is read as U+FFFD, so that a damaged text only fails its checksum.
     """
 
     def read(self, name: str) -> str | None:
-        """Text of a file, None where there is none."""
+        """Read the text of a file, None if it does not exist."""
 
     def read_bytes(self, name: str) -> bytes | None:
-        """Content of a file, None where there is none."""
+        """Read the content of a file, None if it does not exist."""
 
     def read_all(self, folder: str) -> dict[str, str]:
-        """Texts of the JSON files in a folder, by name without ending."""
+        """Read the texts of all JSON files in a folder, by name without suffix."""
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of all files, and of links to folders, in it and in the folders below it, by name."""
+        """Return the sizes in bytes of all files and links to folders, recursively, by name."""
 
     def write(self, name: str, text: str) -> None:
-        """Write a file that is either there as a whole or not at all."""
+        """Write a file atomically."""
 
     def create(self, name: str, text: str) -> bool:
-        """Write a file as a whole unless it is there; whether it was written."""
+        """Write a file atomically unless it exists; return whether it was written."""
 
     def delete(self, name: str) -> None:
-        """Delete a file, if it is there."""
+        """Delete a file if it exists."""
 
     def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
-        """Delete many files, and folders where no file is in them then."""
+        """Delete files, then those of the folders that contain no file."""
 
     def delete_if_empty(self) -> None:
-        """Delete this folder, where nothing is in it."""
+        """Delete this folder if it is empty."""
 
     def inside(self, folder: str) -> "Folder":
-        """A folder in it."""
+        """Return a subfolder."""
 
     def make(self, folder: str) -> None:
-        """Make a folder, where folders must be made."""
+        """Create a folder if the file system needs that."""
 
     def place(self, name: str) -> Path | str:
-        """What zarr finds a name by."""
+        """Return the path or URL of a name, for zarr."""
 
     def free_bytes(self) -> int | None:
-        """Room that is left, None where nobody can tell."""
+        """Return the free space in bytes, None if unknown."""
 
 
 def folder_at(place: str | Path) -> Folder:
-    """The folder of a path or a URL."""
+    """Return the folder at a path or URL."""
     protocol, _, path = str(place).rpartition("://")
     if protocol in ("", "file", "local"):
         return LocalFolder(Path(path).absolute())

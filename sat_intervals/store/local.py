@@ -1,4 +1,4 @@
-"""A folder of this machine, or of a disk that it shares with others."""
+"""A folder on a local or shared disk."""
 
 import errno
 import fcntl
@@ -14,20 +14,20 @@ from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, check_regular
 
-# A file of this name that is regular and empty is ours; any other stays as it is.
+# The lock file is regular and empty; any other file of this name is left unchanged.
 _LOCK = ".sat-intervals.lock"
-# Seconds for which a lock is tried.
-_PATIENCE = 0.2
+# Seconds to wait for a lock.
+_TIMEOUT = 0.2
 
 
 @dataclass(frozen=True)
 class LocalFolder:
-    """See `Folder`; files get their names when they are whole. Runs keep each other out by the system's own lock."""
+    """See `Folder`. Files are renamed when complete; runs exclude each other with ``flock``."""
 
     path: Path
 
     def __str__(self) -> str:
-        """How users call it."""
+        """Return the path."""
         return str(self.path)
 
     def read(self, name: str) -> str | None:
@@ -53,7 +53,7 @@ class LocalFolder:
         found = {}
         for place, folders, files in os.walk(self.path):
             for name in (*files, *(folder for folder in folders if os.path.islink(f"{place}/{folder}"))):
-                with suppress(FileNotFoundError):  # others may be at work here
+                with suppress(FileNotFoundError):  # deleted by another process
                     found[os.path.relpath(f"{place}/{name}", self.path)] = os.lstat(f"{place}/{name}").st_size
         return found
 
@@ -69,7 +69,7 @@ class LocalFolder:
                 os.link(temporary, file)
             except FileExistsError:
                 return False
-            except OSError:  # a disk without links
+            except OSError:  # a file system without hard links
                 if file.exists():
                     return False
                 os.replace(temporary, file)
@@ -77,7 +77,7 @@ class LocalFolder:
 
     @contextmanager
     def _written(self, name: str, text: str) -> Iterator[tuple[Path, Path]]:
-        """A file with the text that lasts as long as the block, and the one that it is to become."""
+        """Write a temporary file, deleted after the block; yield it and the final path."""
         file = self.path / name
         temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
         try:
@@ -123,20 +123,20 @@ class LocalFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep every other run out until the block ends.
+        """Lock the folder against other runs for the block.
 
-        The lock dies with its process, and a folder that is then empty goes.
+        The lock ends with its process; an empty folder is deleted at the end.
 
         Raises
         ------
         SatIntervalsError
-            When another run is at work there, or the folder cannot be used.
+            Another run is active there, or the folder cannot be locked.
         """
         lock = self._lock()
         try:
             yield
         finally:
-            # whoever opened it meanwhile sees that it is gone, see _lock
+            # a process that opened it meanwhile notices the deletion, see _lock
             with suppress(FileNotFoundError):
                 ours, there = os.fstat(lock), (self.path / _LOCK).lstat()
                 if os.path.samestat(ours, there) and not ours.st_size:
@@ -145,9 +145,9 @@ class LocalFolder:
             self.delete_if_empty()
 
     def _lock(self) -> int:
-        """The descriptor of the lock's file, locked, under its name."""
+        """Open and lock the lock file; return its descriptor."""
         file = self.path / _LOCK
-        end = time.monotonic() + _PATIENCE
+        end = time.monotonic() + _TIMEOUT
         while True:
             is_late = time.monotonic() > end
             try:
@@ -155,7 +155,7 @@ class LocalFolder:
                 lock = _opened(file, os.O_RDWR | os.O_CREAT)
             except OSError as error:
                 if isinstance(error, (FileNotFoundError, FileExistsError)) and not is_late:
-                    continue  # removed by the one who left
+                    continue  # deleted by the last owner of the lock
                 raise SatIntervalsError(f"{self} cannot be written: {error.strerror}: choose another folder") from error
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -164,21 +164,21 @@ class LocalFolder:
             except FileNotFoundError:
                 pass
             except BlockingIOError as error:
-                if is_late:  # else it may be held by one who only looks whether it is
+                if is_late:  # before that, `is_locked` of another process may hold it
                     os.close(lock)
                     raise SatIntervalsError(
-                        f"another run is at work in {self}: wait for its end or choose another folder"
+                        f"another run is active in {self}: wait for its end or choose another folder"
                     ) from error
-                time.sleep(_PATIENCE / 20)
+                time.sleep(_TIMEOUT / 20)
             except OSError as error:
                 os.close(lock)
                 raise SatIntervalsError(
-                    f"{self} cannot be locked: {error.strerror}: choose a folder on a disk that has locks"
+                    f"{self} cannot be locked: {error.strerror}: choose a folder on a file system with locks"
                 ) from error
-            os.close(lock)  # it was removed, or replaced, before it was locked
+            os.close(lock)  # deleted or replaced before it was locked
 
     def is_locked(self) -> bool:
-        """Whether a run is at work there."""
+        """Return whether a run is active in the folder."""
         try:
             lock = _opened(self.path / _LOCK, os.O_RDONLY)
         except FileNotFoundError:
@@ -193,7 +193,7 @@ class LocalFolder:
 
 
 def _opened(file: Path, flags: int) -> int:
-    """The descriptor of a lock's file as it is: neither truncated nor opened through a link."""
+    """Open a lock file without truncating it or following a link; return its descriptor."""
     try:
         lock = os.open(file, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     except OSError as error:
@@ -202,5 +202,5 @@ def _opened(file: Path, flags: int) -> int:
         raise
     if not stat.S_ISREG(os.fstat(lock).st_mode):
         os.close(lock)
-        raise OSError(errno.EINVAL, f"{file.name} is no regular file")
+        raise OSError(errno.EINVAL, f"{file.name} is not a regular file")
     return lock

@@ -1,7 +1,7 @@
-"""Where the tiles of a run are: in its own folder, or in a store that a note there names.
+"""Location of a run's tiles: in its folder, or in a store named by a file there.
 
-A folder of a run may come from somebody else, and so may its note: the tool follows it only to a place inside the store
-that the user names as well, and deletes there only what bears the name of its own manifest.
+The folder of a run, and so that file, may come from someone else. It is followed only into the store that the user
+names too, and only folders named after their own manifest are deleted there.
 """
 
 import json
@@ -10,32 +10,32 @@ from pathlib import Path
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, digest, parsed
 
-# In the folder of the run where its tiles are elsewhere: it says where.
-PLACE = "store.json"
+# File in the folder of a run that names the location of its tiles, if they are elsewhere.
+PLACE = ".sat-intervals.store"
 
 
 class ElsewhereError(StoreError):
-    """Tiles that are said to be in a store that the user did not name: what is ``said``, and the way out."""
+    """Tiles in a store that the user did not name; the message is ``problem`` and the way out."""
 
-    def __init__(self, said: str, way_out: str) -> None:
-        super().__init__(f"{said}: {way_out}")
-        self.said = said
+    def __init__(self, problem: str, way_out: str) -> None:
+        super().__init__(f"{problem}: {way_out}")
+        self.problem = problem
 
 
 def place_of(home: Path, store: str | None) -> Folder:
-    """Where the tiles are of the run to whose folder ``home`` belongs.
+    """Return the folder of a run's tiles.
 
     Parameters
     ----------
     home
-        Folder of the tiles in that of the run.
+        Folder of the tiles in the folder of the run.
     store
-        The store that the user names; None without.
+        The store that the user names, or None.
 
     Raises
     ------
     ElsewhereError
-        Where the note in ``home`` names another store. Nothing was read there.
+        The file in ``home`` names another store. Nothing was read there.
     """
     noted = folder_at(home).read(PLACE)
     try:
@@ -45,18 +45,18 @@ def place_of(home: Path, store: str | None) -> Folder:
     if noted is None:
         return folder_at(home)
     if not isinstance(place, str) or "/" not in place:
-        raise StoreError(f"{home / PLACE} cannot be read: give the --store of before to go on, or --overwrite")
+        raise StoreError(f"{home / PLACE} cannot be read: give the same --store as before to resume, or --overwrite")
     above, _, name = place.rpartition("/")
     if store is None or above != str(folder_at(store)) or name in ("", ".", ".."):
         raise ElsewhereError(
-            f"the tiles of the run in {home.parent} are said to lie in {place}{f', not in {store}' if store else ''}",
-            f"if that is your store, give --store {above}; match --overwrite starts afresh and leaves them there",
+            f"{home / PLACE} places the tiles of the run in {place}{f', not in {store}' if store else ''}",
+            f"if that is your store, give --store {above}; match --overwrite starts again and keeps them there",
         )
     return folder_at(place)
 
 
 def is_own(folder: Folder) -> bool:
-    """Whether a folder of a store was made by a run: its name ends with the digest of the manifest in it."""
+    """Return whether a run made a folder of a store: its name ends with the digest of its manifest."""
     text = folder.read(MANIFEST)
     try:
         return text is not None and str(folder).endswith(digest(parsed(text, folder)))

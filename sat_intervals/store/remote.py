@@ -1,7 +1,7 @@
-"""A prefix of a file system that fsspec knows, such as a bucket of S3. The only home of fsspec.
+"""A prefix of an fsspec file system, such as an S3 bucket. Only this module imports fsspec.
 
-Objects are written whole, and a name is there as soon as its object is. Addresses and credentials of the service come
-from its own environment variables and files (``AWS_ENDPOINT_URL``, ``~/.aws``) or fsspec's.
+Objects are written atomically. Addresses and credentials come from the service's own environment variables and files
+(``AWS_ENDPOINT_URL``, ``~/.aws``) or from fsspec's.
 """
 
 import errno
@@ -21,14 +21,14 @@ class RemoteFolder:
     url: str
 
     def __str__(self) -> str:
-        """How users call it."""
+        """Return the URL."""
         return self.url
 
     @contextmanager
     def _reached(self, name: str) -> Iterator[tuple[Any, str]]:
-        """The file system and its path of a name; whatever it raises, of many libraries, is an OSError."""
+        """Yield the file system and the path of a name; errors of any library become OSError."""
         try:
-            system, root = fsspec.url_to_fs(self.url)  # one a thread and service: fsspec keeps them
+            system, root = fsspec.url_to_fs(self.url)  # cached by fsspec per thread and service
             yield system, f"{root}/{name}"
         except (FileNotFoundError, FileExistsError):
             raise
@@ -72,7 +72,7 @@ class RemoteFolder:
             system.pipe_file(path, text.encode())
 
     def create(self, name: str, text: str) -> bool:
-        """See `Folder`; one step where the service offers that, as S3 does."""
+        """See `Folder`; atomic if the service supports that, as S3 does."""
         try:
             with self._reached(name) as (system, path):
                 system.pipe_file(path, text.encode(), mode="create")
@@ -94,11 +94,11 @@ class RemoteFolder:
                 system.rm([path + name for name in names])
         for folder in folders:
             with suppress(FileNotFoundError), self._reached(folder) as (system, path):
-                if not system.find(path):  # a bucket has no folders, other services do
+                if not system.find(path):  # a bucket has no folders, but other file systems do
                     system.rm(path, recursive=True)
 
     def delete_if_empty(self) -> None:
-        """See `Folder`; a bucket stays."""
+        """See `Folder`; a bucket is kept."""
         with suppress(OSError), self._reached("") as (system, path):
             if "/" in path.strip("/"):
                 system.rmdir(path.rstrip("/"))
@@ -110,7 +110,7 @@ class RemoteFolder:
     def make(self, folder: str) -> None:
         """See `Folder`."""
         with suppress(FileExistsError), self._reached(folder) as (system, path):
-            system.mkdir(path.rstrip("/"), create_parents=False)  # with parents, s3fs would make a bucket of any name
+            system.mkdir(path.rstrip("/"), create_parents=False)  # with parents, s3fs would create a bucket
 
     def place(self, name: str) -> str:
         """See `Folder`."""
@@ -121,7 +121,7 @@ class RemoteFolder:
 
 
 def object_tag(url: str) -> dict[str, Any]:
-    """Size in bytes and ETag of an object; nothing where fsspec does not reach it."""
+    """Return size in bytes and ETag of an object; empty if fsspec cannot reach it."""
     try:
         system, path = fsspec.url_to_fs(url)
         system.invalidate_cache(path)

@@ -1,4 +1,4 @@
-"""Which files in a folder are those of a run's tiles: these go with the run, all others stay."""
+"""Recognise and delete the files of a run's tiles in a folder; other files are kept."""
 
 import json
 import re
@@ -16,22 +16,22 @@ _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
     rf"|{ARRAYS}/(?:u?int\d+/c/0|right/c|seams/c|histogram/c)/(\d+)/(\d+)(?:/0)*"
 )
-# Folders of a run. Where one of these names is a link, files of the user would be written over behind it.
+# Folders of a run. If one of them were a link, writing would replace the user's files behind it.
 _FOLDER = re.compile(
     rf"{RECORDS}|{FAILURES}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
 )
-# What a death in the middle of a write leaves: names of `LocalFolder` and of zarr, and those that they were to become.
+# Temporary names of `LocalFolder` and of zarr, which a killed process leaves, with the final name as group.
 _UNFINISHED = re.compile(r"(?:(?<=/)|^)\.([^/]+)\.[0-9a-f]{32}$"), re.compile(r"()\.[0-9a-f]{32}\.partial$")
 
 
 def drop(folder: Folder) -> None:
-    """Delete the tiles of a run in a folder, and the folder where nothing else is in it.
+    """Delete the tiles of a run in a folder, and the folder if it is then empty.
 
-    A folder without signs of a run keeps everything.
+    Nothing is deleted if there is no sign of a run.
     """
     names = _names(folder)
     if is_of_run(folder):
-        # The manifest first: without it nothing of the rest counts. The group last: it tells of a removal cut short.
+        # The manifest first, since the rest is invalid without it. The group last, to recognise an unfinished removal.
         folder.delete(MANIFEST)
         folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES))
         folder.delete_all([_GROUP], [ARRAYS])
@@ -39,30 +39,30 @@ def drop(folder: Folder) -> None:
 
 
 def check_free(folder: Folder) -> None:
-    """Refuse a folder in which a run would write over files that no run made, or through a link.
+    """Raise if a run would overwrite files in a folder that no run made, or write through a link.
 
     Raises
     ------
     StoreError
-        With the names of some.
+        Names some of the files.
     """
     if taken := sorted(name for name in folder.sizes() if _FOLDER.fullmatch(name)):
         raise StoreError(
-            f"{folder}/{taken[0]} is a file or a symbolic link, where a folder of the tiles must be: move it away or "
+            f"{folder}/{taken[0]} is a file or a symbolic link, but a folder of tiles is needed: move it away or "
             "choose another folder"
         )
     names = {name for name, size in _names(folder).items() if size}
     if not names or is_of_run(folder):
         return
-    if there := sorted(names & folder.sizes().keys()):  # else another run removed its tiles meanwhile
+    if there := sorted(names & folder.sizes().keys()):  # otherwise another run has just removed its tiles
         raise StoreError(
-            f"{folder} holds files that no run made, such as {', '.join(there[:3])}: move them away or choose "
+            f"{folder} has files that no run made, such as {', '.join(there[:3])}: move them away or choose "
             "another folder"
         )
 
 
 def _names(folder: Folder) -> dict[str, int]:
-    """Bytes of the files that have names of a run's, by name; where there is a manifest, of its tiles only."""
+    """Return the sizes of files named like those of a run, by name; with a manifest, only those of its tiles."""
     grid = None
     with suppress(StoreError):
         grid = grid_of(parsed(folder.read(MANIFEST) or "", folder), folder)
@@ -79,7 +79,7 @@ def _names(folder: Folder) -> dict[str, int]:
 
 
 def is_of_run(folder: Folder) -> bool:
-    """Whether a manifest, the arrays' description or a record tells that a run made this; one of them is enough."""
+    """Return whether a run made a folder: it has a manifest, the arrays' metadata or a record."""
     with suppress(StoreError):
         if {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys():
             return True

@@ -1,10 +1,10 @@
-"""What tiles leave behind until the run is finished: arrays, records, a manifest.
+"""Intermediate tile products: arrays, records and a manifest.
 
-A tile's arrays lie in files of its own, written by whoever computed the tile. Its record comes last and holds sizes and
-checksums of these files: a tile is done when its record is whole and its files have their sizes. Checksums are compared
-where files are read, and a tile with a damaged file is no longer done. Writing a tile again writes the same bytes. The
-manifest holds everything that decides the bytes; a store with another manifest is never mixed in. Runs with the same
-manifest may share a store that lies elsewhere than in the folder of one of them: they write the same bytes.
+The worker that matches a tile writes its arrays, each tile into its own files, and then its record with sizes and
+checksums of these files. A tile is done if its record is intact and its files have these sizes. Checksums are compared
+when files are read; a tile with a damaged file is no longer done. Writing a tile again writes the same bytes. The
+manifest has everything that decides these bytes; a store with another manifest is refused. Runs with the same manifest
+may share an external store, since they write the same bytes.
 """
 
 import errno
@@ -30,18 +30,18 @@ from sat_intervals.tiling import Grid, Tile
 Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
-# To be counted up when arrays or records change: tiles of before cannot be gone on with.
+# Increase when arrays or records change: older tiles cannot be resumed.
 LAYOUT = 5
 
-# Names of ours alone, as that of the lock: files of the user in the folder mean nothing, and stay.
-# In the folder of the run from the beginning of one that replaces another to its end.
+# Marker files in the folder of a run.
+# Present while a run replaces an earlier one.
 _REPLACING = ".sat-intervals.replacing"
-# In the folder of the run from when its files get their names until its tiles are removed: which run that is.
+# Name of the run, from the publication of its files to the removal of its tiles.
 _FINISHED = ".sat-intervals.finished"
 
 
 class DamagedTilesError(RunError):
-    """Tiles that are not what was written; they are no longer done."""
+    """Tiles that are missing or damaged; they are no longer done."""
 
 
 _LOG = logging.getLogger(__name__)
@@ -49,20 +49,20 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Store:
-    """The tiles of one run; picklable, so that every worker writes for itself.
+    """The tiles of one run; picklable, so that each worker writes its own tiles.
 
     Attributes
     ----------
     home
-        Folder of the run that the tiles belong to.
+        Folder of the tiles in the folder of the run.
     grid
         The tiles.
     count
         Number of disparities of the search range.
     ambiguities
-        Largest ambiguity a pixel can have.
+        Largest possible ambiguity of a pixel.
     elsewhere
-        Folder, in the store that the user names, where the tiles lie; by default ``home``.
+        Folder of the tiles in the store that the user names; by default ``home``.
     """
 
     home: Path
@@ -73,7 +73,7 @@ class Store:
 
     @property
     def folder(self) -> Folder:
-        """Where the tiles lie."""
+        """Return the folder of the tiles."""
         return folder_at(self.elsewhere or self.home)
 
     @property
@@ -81,21 +81,20 @@ class Store:
         return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities)
 
     def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
-        """Create the store, or go on with the one that is there; to be called while ``home`` is locked.
+        """Create the store or resume an existing one; call it while ``home`` is locked.
 
         Parameters
         ----------
         manifest
-            All that decides the bytes of a tile; ``region`` and ``settings`` tell the tiles.
+            All that decides the bytes of a tile; ``region`` and ``settings`` define the grid.
         overwrite
-            Whether what is there is dropped, and the files of a run before are to be replaced. Tiles in a store that
-            the user does not name stay.
+            Whether to delete existing tiles and replace the files of an earlier run. Tiles in a store that the user
+            does not name are kept.
 
         Raises
         ------
         StoreError
-            When the store that is there was begun with other settings, inputs or versions, or lies in another place, or
-            cannot be used.
+            The existing store has other settings, inputs or versions, is at another place, or cannot be used.
         """
         home, folder = folder_at(self.home), self.folder
         try:
@@ -106,17 +105,17 @@ class Store:
                 check_same(text, before, manifest)
                 if before != folder:
                     raise StoreError(
-                        f"the tiles of the run in {self.home.parent} lie in {before}, not in {folder}: give the same "
-                        "--store to go on, or none where there was none, --overwrite to start afresh"
+                        f"the tiles of the run in {self.home.parent} are in {before}, not in {folder}: give the same "
+                        "--store as before (or none) to resume, or --overwrite to start again"
                     )
-            folder.make("")  # so that what cannot be used is told before anything is dropped
+            folder.make("")  # fails before anything is deleted
             if overwrite and before is not None:
-                with suppress(OSError):  # what cannot be reached stays
+                with suppress(OSError):  # an unreachable store is kept
                     if before == home or is_own(before):
                         drop(before)
             if overwrite or (text is None and not self.elsewhere):
                 drop(folder)
-            if folder.read(MANIFEST) == "":  # as a power loss leaves it
+            if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
             for name in ("", RECORDS, FAILURES):
                 folder.make(name)
@@ -133,45 +132,45 @@ class Store:
                 self.check(manifest)
         except OSError as error:
             raise StoreError(
-                f"{folder} cannot be used: {error.strerror or error}: check the path or URL, the credentials, and that "
-                "the package of its file system is installed (sat-intervals[remote] for s3://)"
+                f"{folder} cannot be used: {error.strerror or error}: check the path or URL, the credentials, and "
+                "whether the package of its file system is installed (sat-intervals[remote] for s3://)"
             ) from error
 
     def _place_before(self, overwrite: bool) -> Folder | None:
-        """Where the tiles of the run before are; with ``overwrite`` None where that is not to be touched."""
+        """Return the folder of the earlier run's tiles; with ``overwrite``, None if they must be kept."""
         try:
             return place_of(self.home, self.elsewhere and self.elsewhere.rpartition("/")[0])
         except ElsewhereError as error:
             if not overwrite:
                 raise
-            _LOG.warning("%s: they stay there", error.said)
+            _LOG.warning("%s: they are kept", error.problem)
             return None
-        except StoreError:  # the note is damaged: the user says it anew
+        except StoreError:  # the place file is damaged: the user's --store replaces it
             if overwrite or self.elsewhere:
                 return self.folder
             raise
 
     def check(self, manifest: Mapping[str, Any]) -> None:
-        """Hold that the store is that of a run still: others may have removed it, or begun another in its place.
+        """Raise if the store was removed or replaced by another run.
 
         Raises
         ------
         RunError
-            When it is gone.
+            It was removed.
         StoreError
-            When it is another's.
+            It belongs to another run.
         """
         there = self.folder.read(MANIFEST)
         if there is None:
             raise RunError(
-                f"the tiles in {self.folder} are gone, as where another run of the same images and settings ended: "
-                "run the same command again, it matches them anew"
+                f"the tiles in {self.folder} are gone: another run of the same images and settings may have removed "
+                "them: rerun the same command: it matches them again"
             )
         check_same(there, self.folder, manifest)
 
     @contextmanager
     def needed(self, manifest: Mapping[str, Any]) -> Iterator[None]:
-        """A block that fails because the store is gone fails with just that, see `check`."""
+        """If the block fails because the store is gone, raise the error of `check` instead."""
         try:
             yield
         except Exception:
@@ -180,145 +179,145 @@ class Store:
             raise
 
     def done(self) -> set[str]:
-        """Names of the tiles that are complete, see `records`."""
+        """Return the names of the tiles that are done, see `records`."""
         return set(self.records())
 
     def write_arrays(self, tile: Tile, arrays: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> Checksums:
-        """Write what a tile leaves behind, see `TileArrays.write`, into the store of a manifest and no other."""
+        """Write the products of a tile, see `TileArrays.write`, if the store has this manifest."""
         self.check(manifest)
         try:
             checksums = self._arrays.write(tile, arrays)
             self.check(manifest)
         except Exception:
-            if self.folder.read(MANIFEST) is None:  # it was removed meanwhile, and what came later would stay for ever
+            if self.folder.read(MANIFEST) is None:  # removed meanwhile: delete what was written after that
                 self.folder.delete_all([f"{ARRAYS}/{name}" for name in self._arrays.files_of(tile)], [ARRAYS])
                 self.folder.delete_if_empty()
             raise
         return checksums
 
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
-        """Write what the run wants to know of a tile, and ``files``, its checksums; from now on the tile is done."""
+        """Write the record of a tile, with its checksums in ``files``; the tile is then done."""
         self.folder.write(f"{RECORDS}/{tile.name}.json", sealed(record))
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
-        """Keep what was measured of the whole images, so that all tiles of the run agree on it, whenever matched."""
+        """Write the statistics of the whole images, so that all tiles use the same."""
         self.folder.write(NORMALIZATION, sealed(normalization))
 
     def normalization(self) -> dict[str, Any] | None:
-        """What `write_normalization` kept; None where nothing was measured, or that is damaged."""
+        """Read the statistics of `write_normalization`; None if missing or damaged."""
         return unsealed(self.folder.read(NORMALIZATION))
 
     def write_failure(self, tile: str, reason: str) -> None:
-        """Remember why a tile failed, for whoever asks for the status; a record that comes later outweighs it."""
-        with suppress(OSError):  # a full disk is reason enough for a tile to fail, but not for the run to end at once
-            if self.folder.read(MANIFEST) is not None:  # else a bucket would keep it for ever
+        """Write why a tile failed, for `failures`; a later record replaces it."""
+        with suppress(OSError):  # a full disk must not end the run
+            if self.folder.read(MANIFEST) is not None:  # otherwise it would never be deleted
                 self.folder.write(f"{FAILURES}/{tile}.json", json.dumps(reason))
 
     def failures(self) -> dict[str, str]:
-        """Why tiles failed that are not done since, by name."""
+        """Return why tiles failed, by name, without those done since."""
         reasons, done = self.folder.read_all(FAILURES), self.done()
         return {name: _reason(reasons[name]) for name in sorted(reasons) if name not in done}
 
     def check_space(self, tile: Tile) -> None:
-        """Raise an OSError where the disk has no room for what a tile leaves behind, before work is put in."""
+        """Raise an OSError if the disk has no room for the products of a tile; call it before matching."""
         needed = self._arrays.bytes_of(tile)
         free = self.folder.free_bytes()
         if free is not None and free < needed:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
 
     def records(self) -> dict[str, dict[str, Any]]:
-        """The records of the tiles that are done, by name: whole ones, whose files are there in their sizes."""
+        """Return the records of tiles that are done, by name: intact ones whose files have the right sizes."""
         texts, sizes = self.folder.read_all(RECORDS), self._arrays.folder.sizes()
         found = {}
         for tile in self.grid:
             record = unsealed(texts.get(tile.name))
             files = record.get("files", {}) if record else {}
-            is_whole = files.keys() == self._arrays.files_of(tile)
-            if record and is_whole and all(sizes.get(name) == size for name, (size, _) in files.items()):
+            is_complete = files.keys() == self._arrays.files_of(tile)
+            if record and is_complete and all(sizes.get(name) == size for name, (size, _) in files.items()):
                 found[tile.name] = record
         return found
 
     def histogram(self, records: Records) -> np.ndarray:
-        """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``; errors as of `strips`."""
-        with self._sound():
+        """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as in `strips`."""
+        with self._damage_handled():
             return self._arrays.histogram(_checksums(records))
 
     def seams(self, records: Records) -> np.ndarray:
-        """The lines along the tiles' borders, see `TileArrays.seams`; errors as of `strips`."""
-        with self._sound():
+        """Return the lines along the tiles' borders, see `TileArrays.seams`; errors as in `strips`."""
+        with self._damage_handled():
             return self._arrays.seams(_checksums(records))
 
     def strips(self, rows: int, records: Records) -> Iterator[dict[str, np.ndarray]]:
-        """Raw products of the region in full-width strips of about ``rows`` rows, from the top.
+        """Yield raw products of the region in full-width strips of about ``rows`` rows, from the top.
 
         Raises
         ------
         DamagedTilesError
-            Of tiles whose files are not what was written.
+            Names the tiles with damaged files.
         """
-        with self._sound():
+        with self._damage_handled():
             yield from self._arrays.strips(rows, _checksums(records))
 
     @contextmanager
-    def _sound(self) -> Iterator[None]:
-        """Where a block meets a damaged file, look for all damaged tiles, so that they are matched again in one go."""
+    def _damage_handled(self) -> Iterator[None]:
+        """If the block meets a damaged file, delete all damaged tiles, so that one retry matches them again."""
         try:
             yield
         except DamagedFileError as error:
             records, damaged = self.records(), []
             for tile in self.grid:
-                if tile.name not in records or not self._arrays.are_sound(records[tile.name]["files"]):
+                if tile.name not in records or not self._arrays.are_intact(records[tile.name]["files"]):
                     self.folder.delete(f"{RECORDS}/{tile.name}.json")
                     self._arrays.drop(tile)
                     damaged.append(tile.name)
             names = ", ".join(damaged) or f"of {error}"
             raise DamagedTilesError(
-                f"tiles {names} in {self.folder} are damaged: the same command matches them again"
+                f"tiles {names} in {self.folder} are damaged: rerun the same command: it matches them again"
             ) from error
 
     def remove(self) -> None:
-        """Delete the tiles, and nothing else that may be in their folder."""
+        """Delete the tiles and no other files."""
         remove_tiles(self.home, self.folder)
 
 
 def remove_tiles(home: Path, place: Folder) -> None:
-    """Delete the tiles in ``place`` of the run to whose folder ``home`` belongs."""
+    """Delete a run's tiles in ``place``, and its marker files in ``home``."""
     drop(place)
     for name in (PLACE, _REPLACING, _FINISHED):
         folder_at(home).delete(name)
 
 
 def mark_finished(home: Path, run: str, stamps: Sequence[str] = ()) -> None:
-    """Note which run is about to give its files their names, after which its tiles are to be removed.
+    """Mark a run as finished, so that its tiles are removed even if it is killed before.
 
-    To be called again, with the stamps of these files, when they have their names.
+    Call it before its files are published, and again afterwards with their stamps.
     """
     folder_at(home).write(_FINISHED, "\n".join([run, *stamps]))
 
 
 def finished_run(home: Path) -> tuple[str, list[str]] | None:
-    """What `mark_finished` noted, where the tiles have not been removed since."""
+    """Return run and stamps of `mark_finished`; None if not marked or the tiles were removed since."""
     run, *stamps = (folder_at(home).read(_FINISHED) or "").split("\n")
     return (run, stamps) if run else None
 
 
 def mark_replaced(home: Path) -> None:
-    """Note that the files of the run before have been replaced, see `is_replacing`."""
+    """Mark the earlier run's files as replaced, see `is_replacing`."""
     folder_at(home).delete(_REPLACING)
 
 
 def is_replacing(home: Path) -> bool:
-    """Whether a run has begun that is to replace the files of one before, and has not done so yet."""
+    """Return whether an unfinished run is to replace the files of an earlier one."""
     return folder_at(home).read(_REPLACING) is not None
 
 
 def has_begun(home: Path) -> bool:
-    """Whether a run made this folder of tiles; that of a user may have the same name."""
+    """Return whether a run made this folder of tiles; a user's folder may have the same name."""
     return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
 
 
 def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
-    """What the manifest of the tiles that are there says of the inputs; nothing where it cannot be read."""
+    """Return the inputs in the manifest of existing tiles; empty if it cannot be read."""
     try:
         return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
     except (OSError, TypeError, ValueError):
@@ -326,7 +325,7 @@ def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
 
 
 def _checksums(records: Records) -> Checksums:
-    """Those of the files of all tiles."""
+    """Return the checksums of the files of all tiles."""
     return {name: file for record in records.values() for name, file in record["files"].items()}
 
 
@@ -334,21 +333,24 @@ def _reason(text: str) -> str:
     try:
         return str(json.loads(text))
     except (ValueError, RecursionError):
-        return "its reason cannot be read"
+        return "the reason cannot be read"
 
 
 def store_of(home: Path, store: str | None = None) -> Store:
-    """The store of the run to whose folder ``home`` belongs, to be looked at: how far it is.
+    """Open the store of a run, only to read its progress.
 
-    ``store`` is the one that the user names, see `place_of`.
+    Parameters
+    ----------
+    home, store
+        See `place_of`.
 
     Raises
     ------
     StoreError
-        Where there is none.
+        There is no store.
     """
     folder = place_of(home, store)
     text = folder.read(MANIFEST)
     if text is None:
-        raise StoreError(f"{home.parent} holds no run that began: name the folder given to match")
+        raise StoreError(f"{home.parent} has no run: give the folder that match was given")
     return Store(home, grid_of(parsed(text, folder), folder), 1, 0, str(folder))

@@ -1,4 +1,4 @@
-"""The arrays of the tiles of a run, in files that each tile writes for itself. The only home of zarr."""
+"""Zarr arrays of the tiles of a run; each tile writes its own files. Only this module imports zarr."""
 
 import asyncio
 import math
@@ -22,47 +22,47 @@ from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.store.folder import Folder
 from sat_intervals.tiling import Grid, Tile
 
-# Raw products of the pixels of a core, in two arrays by their size, whose planes are read and written in one piece.
+# Raw products of a core's pixels, in one array per type; its planes are read and written together.
 _PLANES: dict[str, dict[str, type[np.generic]]] = {
     "int16": {"winner": np.int16, "lower": np.int16, "upper": np.int16, "validity": np.uint16},
     "uint32": {"disparity": np.float32, "ambiguity": np.uint32},
 }
-# What a core has seen from the right, see `_rank`.
+# Right view of each core, see `_rank`.
 _RIGHT = "right"
-# The rank of a right pixel that no candidate was seen from.
+# Rank of a right pixel without candidates.
 _UNSEEN = np.uint32(0xFFFFFFFF)
 SIDES = ("top", "bottom", "left", "right")
-# The raw products that neighbours compare along a seam.
+# Raw products that are compared along a seam.
 SEAM_PRODUCTS = ("winner", "lower", "upper")
 
-# Rows of a shard that are compressed together, so that strips read no more than they need.
+# Rows of a shard that are compressed together; strips of these rows read only what they need.
 _ROWS_TOGETHER = 128
-# An attribute of the group, so that a folder is known for a run's where its manifest is lost.
+# Attribute of the group: marks the folder of a run even without a manifest.
 MADE_BY = {"made_by": "sat-intervals"}
 _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 
 Checksums = Mapping[str, Sequence[int]]
-"""Bytes and CRC-32 of files, by name."""
+"""Size in bytes and CRC-32 of files, by name."""
 
 
 class DamagedFileError(Exception):
-    """A file that is gone, or not what was written."""
+    """A file that is missing or damaged."""
 
 
 @dataclass(frozen=True)
 class TileArrays:
-    """Raw products of all tiles, and what the whole image needs of each; picklable.
+    """Arrays of raw products, right view, seams and histograms of all tiles; picklable.
 
     Attributes
     ----------
     folder
-        Where they lie.
+        Folder of the arrays.
     grid
         The tiles.
     count
         Number of disparities of the search range.
     ambiguities
-        Largest ambiguity a pixel can have.
+        Largest possible ambiguity of a pixel.
     """
 
     folder: Folder
@@ -75,7 +75,7 @@ class TileArrays:
         return _reach(self.grid, self.count)
 
     def create(self) -> None:
-        """Write what describes the arrays, where that is not there or damaged; every run writes the same."""
+        """Write missing or damaged metadata of the arrays; every run writes the same."""
         texts, _ = _descriptions(self.grid, self.count, self.ambiguities)
         for name, text in texts.items():
             if self.folder.read(name) != text:
@@ -83,10 +83,10 @@ class TileArrays:
                 self.folder.write(name, text)
 
     def _array(self, name: str, store: Store) -> zarr.Array[Any]:
-        """An array in a store; that it is described there too is for other tools."""
+        """Open an array of a store without reading its metadata there, which are for other tools."""
         _, metadata = _descriptions(self.grid, self.count, self.ambiguities)
         array = zarr.Array(zarr.AsyncArray(metadata[name], StorePath(store, name)))
-        # Blocks that hold nothing but fill values are written too: files that are missing tell of tiles that are.
+        # Write blocks of fill values too, so that every finished tile has all its files.
         return array.with_config({"write_empty_chunks": True})
 
     def _store(self) -> Store:
@@ -94,7 +94,7 @@ class TileArrays:
         return LocalStore(place) if isinstance(place, Path) else FsspecStore.from_url(place)
 
     def files_of(self, tile: Tile) -> set[str]:
-        """The files that hold what a tile leaves behind."""
+        """Return the names of a tile's files."""
         place = f"{tile.grid_row}/{tile.grid_column}"
         return {
             *(f"{dtype}/c/0/{place}" for dtype in _PLANES),
@@ -102,21 +102,21 @@ class TileArrays:
         }  # fmt: skip
 
     def bytes_of(self, tile: Tile) -> int:
-        """What a tile leaves behind, before compression."""
+        """Return the size of a tile's products before compression."""
         pixel = sum(np.dtype(dtype).itemsize for planes in _PLANES.values() for dtype in planes.values())
         return tile.core.height * (tile.core.width * pixel + self._reach * np.dtype(np.uint32).itemsize)
 
     def write(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> Checksums:
-        """Write what a tile leaves behind; returns the checksums of its files.
+        """Write the products of a tile; return the checksums of its files.
 
         Parameters
         ----------
         tile
-            Which tile.
+            The tile.
         arrays
             ``winner``, ``lower``, ``upper``, ``disparity``, ``ambiguity`` and ``validity`` of the core's shape;
-            ``right_cost`` and ``right_winner``, which may be missing; ``seams`` (SIDES, own line or ring,
-            SEAM_PRODUCTS, size); ``histogram``.
+            optionally ``right_cost`` and ``right_winner``; ``seams`` (SIDES, own line or ring, SEAM_PRODUCTS, size);
+            ``histogram``.
         """
         size, row, column = self.grid.size, tile.grid_row, tile.grid_column
         height, width = arrays["winner"].shape
@@ -134,42 +134,42 @@ class TileArrays:
         return store.checksums
 
     def drop(self, tile: Tile) -> None:
-        """Delete what a tile left behind."""
+        """Delete the files of a tile."""
         self.folder.delete_all(self.files_of(tile))
 
-    def are_sound(self, checksums: Checksums) -> bool:
-        """Whether files are what was written."""
+    def are_intact(self, checksums: Checksums) -> bool:
+        """Return whether files have these checksums."""
         return all(checksum(self.folder.read_bytes(name) or b"") == list(file) for name, file in checksums.items())
 
     def histogram(self, checksums: Checksums) -> np.ndarray:
-        """Ambiguities of the whole region: int64 ``(ambiguities + 1,)``; files and errors as of `strips`."""
+        """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as in `strips`."""
         stored = self._array("histogram", _CheckedStore(self._store(), checksums))
         rows = (np.asarray(stored[row]).sum(axis=0, dtype=np.int64) for row in range(self.grid.rows))
         return sum(rows, np.zeros(self.ambiguities + 1, np.int64))
 
     def seams(self, checksums: Checksums) -> np.ndarray:
-        """The lines along the tiles' borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size).
+        """Return the lines along tile borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size).
 
-        Files and errors as of `strips`.
+        Errors as in `strips`.
         """
         return np.asarray(self._array("seams", _CheckedStore(self._store(), checksums))[:])
 
     def strips(self, rows: int, checksums: Checksums) -> Iterator[dict[str, np.ndarray]]:
-        """Raw products of the region in full-width strips of about ``rows`` rows, from the top.
+        """Yield raw products of the region in full-width strips of about ``rows`` rows, from the top.
 
-        The shares of the right view are merged: smallest cost, the largest disparity at ties.
+        The right views of the tiles are merged: smallest cost, largest disparity at ties.
 
         Parameters
         ----------
         rows
-            Wanted height; a multiple of what is compressed together is taken.
+            Wanted height, rounded to a multiple of the rows that are compressed together.
         checksums
-            Of the files of all tiles. A file is checked as a whole where it is first read.
+            Checksums of the files of all tiles; each file is checked when first read.
 
         Raises
         ------
         DamagedFileError
-            Of the first file that is not what was written.
+            Names the first missing or damaged file.
         """
         step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
         store = _CheckedStore(self._store(), checksums)
@@ -183,7 +183,7 @@ class TileArrays:
             yield strip | {"right_winner": self._merged(np.asarray(stored[_RIGHT][here]))}
 
     def _merged(self, ranks: np.ndarray) -> np.ndarray:
-        """One right view ``(rows, width + count - 1)`` from the shares of all cores of the rows."""
+        """Merge the right views of a row of cores into one, ``(rows, width + count - 1)``."""
         best = np.full((ranks.shape[0], self.grid.region.width + self.count - 1), _UNSEEN)
         for column in range(self.grid.columns):
             seen = best[:, column * self.grid.size : column * self.grid.size + self._reach]
@@ -194,7 +194,7 @@ class TileArrays:
 
 @lru_cache(maxsize=16)
 def _descriptions(grid: Grid, count: int, ambiguities: int) -> tuple[dict[str, str], dict[str, Any]]:
-    """What describes the arrays: texts by name of their file, the group's first, and metadata by name of the array."""
+    """Return the metadata of the group and arrays as texts by file name, and as objects by array name."""
     texts: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(texts), zarr_format=3, attributes=MADE_BY)
     metadata: dict[str, Any] = {}
@@ -230,19 +230,19 @@ def _descriptions(grid: Grid, count: int, ambiguities: int) -> tuple[dict[str, s
 
 
 def _reach(grid: Grid, count: int) -> int:
-    """Columns of the right view that a core sees."""
+    """Return the number of columns of a core's right view."""
     return grid.size + count - 1
 
 
 def checksum(content: bytes | memoryview) -> list[int]:
-    """Bytes and CRC-32 of a file."""
+    """Return size in bytes and CRC-32 of a file."""
     return [len(content), zlib.crc32(content)]
 
 
 class _WrittenStore(WrapperStore[Store]):
-    """A store that keeps the checksums of what is written, and shows nothing of what was there before.
+    """A zarr store that records checksums of written files and hides existing ones.
 
-    zarr would merge what it finds of a file, and a damaged one, into what it writes.
+    Otherwise zarr would merge an existing file, even a damaged one, into what it writes.
     """
 
     def __init__(self, store: Store) -> None:
@@ -258,32 +258,32 @@ class _WrittenStore(WrapperStore[Store]):
 
 
 class _CheckedStore(WrapperStore[Store]):
-    """A store that reads a file as a whole and compares its checksum, at first and where it changed since on a disk."""
+    """A zarr store that checks the checksum of a file on its first read, and again if a local file has changed."""
 
     def __init__(self, store: Store, checksums: Checksums) -> None:
         super().__init__(store)
         self._checksums = checksums
-        self._sound: dict[str, tuple[int, ...]] = {}
+        self._checked: dict[str, tuple[int, ...]] = {}
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        if key in self._sound:
+        if key in self._checked:
             part = await self._store.get(key, prototype, byte_range)
-            if self._which(key) == self._sound[key]:
+            if self._stamp(key) == self._checked[key]:
                 return part
-        which = self._which(key)
+        stamp = self._stamp(key)
         whole = await self._store.get(key, prototype)
         content = b"" if whole is None else whole.to_bytes()
         if whole is None or await asyncio.to_thread(checksum, content) != list(self._checksums.get(key, ())):
             raise DamagedFileError(key)
-        self._sound[key] = which
+        self._checked[key] = stamp
         if isinstance(byte_range, RangeByteRequest):
             return whole[byte_range.start : byte_range.end]
         if isinstance(byte_range, OffsetByteRequest):
             return whole[byte_range.offset :]
         return whole if byte_range is None else whole[-byte_range.suffix :]
 
-    def _which(self, key: str) -> tuple[int, ...]:
-        """What any change of a file of this machine changes; nothing of a remote one."""
+    def _stamp(self, key: str) -> tuple[int, ...]:
+        """Return inode, size and times of a local file, which change with it; empty for a remote one."""
         if not isinstance(self._store, LocalStore):
             return ()
         with suppress(OSError):
@@ -293,12 +293,12 @@ class _CheckedStore(WrapperStore[Store]):
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
-    """Costs and winners of right pixels as one number, smaller the better: cost, and the larger disparity at ties."""
+    """Combine cost and winner of right pixels in one number, smallest for the best: cost, then larger disparity."""
     rank = cost.astype(np.uint32) << 16 | (np.iinfo(np.int16).max - winner.astype(np.int32)).astype(np.uint32)
     return np.where(cost == IMPOSSIBLE_COST, _UNSEEN, rank)
 
 
 def _winner(rank: np.ndarray) -> np.ndarray:
-    """The winners in what `_rank` made."""
+    """Return the winners of ranks, see `_rank`."""
     winner = (np.iinfo(np.int16).max - (rank & 0xFFFF).astype(np.int32)).astype(np.int16)
     return np.where(rank == _UNSEEN, np.int16(NO_DISPARITY), winner)

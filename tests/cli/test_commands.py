@@ -141,15 +141,18 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
     [
         (["--band", 4], ["left.tif has no image band 4, it has band 1 only"]),
         (["--disparity", 9, -4], ["disparity: minimum 9 is above maximum -4, swap them"]),
-        (["--disparity", 260, 300], ["disparities 260 to 300 lead every pixel", "left.tif, 260 columns", "their sign"]),
-        (["--disparity", -300, -260], ["disparities -300 to -260 lead every pixel", "right.tif, 260"]),
+        (
+            ["--disparity", 260, 300],
+            ["disparities 260 to 300 move every pixel", "left.tif (260 columns)", "their sign"],
+        ),
+        (["--disparity", -300, -260], ["disparities -300 to -260 move every pixel", "right.tif (260"]),
         (["--disparity", -200, 60], ["260 columns, fewer than the 261 disparities", "search fewer"]),
         (["--disparity", -99999, 0], ["disparity.minimum is -99999, allowed: integer >= -16000"]),
         (["--disparity", 3, "far"], ["'--disparity': 'far' is not a valid integer", "match --help"]),
         (["--left-mask", "{}/half-mask.tif"], ["half-mask.tif has 100 x 260 pixels", "left.tif 200 x 260", "size"]),
         (["--right-mask", "{}/half-mask.tif"], ["half-mask.tif has 100 x 260 pixels", "right.tif 200 x 260"]),
         (["--right-mask", "{}/absent.tif"], ["absent.tif cannot be read: No such file or directory"]),
-        (["--left-mask", ""], ["'--left-mask': it is empty: name a file"]),
+        (["--left-mask", ""], ["'--left-mask': it is empty: give a file"]),
         (["--window", 150, 0, 100, 100], ["row 150, column 0, 100 x 100 pixels: must lie inside", "200 x 260 pixels"]),
         (["--window", -1, 0, 100, 100], ["row -1, column 0, 100 x 100 pixels: must lie inside", "left.tif"]),
         (["--window", 0, 0, 0, 9], ["0 x 9 pixels: must lie inside"]),
@@ -182,7 +185,7 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
         ("interval: {alpha: 1.5}", "interval.alpha is 1.5, allowed: number > 0, <= 1"),
         ("cost: null", "cost is null, allowed: section of method, window"),
         ("median: {size: 4}", "median.size is 4, allowed: integer >= 3"),
-        ("interval: null", "regularization needs interval, which null switches off"),
+        ("interval: null", "regularization needs interval, set to null"),
         ("sgm: {p1: 8, p1: 9}", "line 1: key 'p1' appears twice"),
         ("- sgm", "holds ['sgm'], allowed: sections preset, disparity, "),
         ("sgm: {", "line 1: "),
@@ -206,12 +209,12 @@ def test_match__asks_for_a_search_range(folder, tmp_path):
 def test_match__refuses_empty_names(folder, tmp_path, place):
     arguments = matching(folder, tmp_path / "out")
     arguments[1 + place] = ""
-    assert_refused(invoke(*arguments), f"'{('LEFT', 'RIGHT', 'OUT')[place]}': it is empty: name a file or folder")
+    assert_refused(invoke(*arguments), f"'{('LEFT', 'RIGHT', 'OUT')[place]}': it is empty: give a file or folder")
 
 
 def test_match__refuses_names_that_gdal_cannot_be_told(folder, tmp_path):
     name = os.fsdecode(b"left\xff.tif")
-    assert_refused(invoke("match", name, folder / "right.tif", tmp_path), "is no UTF-8: rename it")
+    assert_refused(invoke("match", name, folder / "right.tif", tmp_path), "is not UTF-8: rename it")
 
 
 def test_match__notices_swapped_arguments(folder, tmp_path):
@@ -222,7 +225,7 @@ def test_match__notices_swapped_arguments(folder, tmp_path):
 @pytest.mark.parametrize(
     ("place", "says"),
     [
-        ("{}/left.tif", "left.tif is no folder: choose another"),
+        ("{}/left.tif", "left.tif is not a folder: choose another"),
         ("{}/left.tif/out", "left.tif/out cannot be written: Not a directory: choose another folder"),
         ("/proc/out", "/proc/out cannot be written: "),
         ("{}/" + 300 * "o", "cannot be written: File name too long: choose another folder"),
@@ -249,7 +252,7 @@ def test_match__refuses_tiles_of_which_it_cannot_tell_the_run(folder, tmp_path):
     (tmp_path / "out" / "tiles").mkdir(parents=True)
     (tmp_path / "out" / "tiles" / "manifest.json").write_text("{")
     result = invoke(*matching(folder, tmp_path / "out"))
-    assert_refused(result, "tiles holds files that no run made, such as manifest.json: move them away")
+    assert_refused(result, "tiles has files that no run made, such as manifest.json: move them away")
 
 
 def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):
@@ -268,13 +271,21 @@ def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "options", "says"),
     [
-        ({"left": "empty.tif"}, [], "all pixels of {0}/empty.tif hold no data or are masked"),
-        ({"right": "empty.tif"}, [], "all pixels of {0}/empty.tif hold no data or are masked"),
-        ({}, ["--left-mask", "{0}/masked.tif"], "all pixels of {0}/left.tif hold no data or are masked"),
-        ({}, ["--disparity", 259, 259], "nowhere do 5 x 5 usable pixels of both face each other"),
-        ({"left": "pixel.tif", "right": "pixel.tif"}, ["--disparity", 0, 0], "nowhere do 5 x 5 usable pixels"),
-        ({"left": "tiny.tif", "right": "tiny.tif"}, ["--disparity", 0, 1], "nowhere do 5 x 5 usable pixels"),
-        ({}, ["--window", 0, 0, 1, 1], "nowhere do 5 x 5 usable pixels of both face each other"),
+        ({"left": "empty.tif"}, [], "all pixels of {0}/empty.tif are no data or masked"),
+        ({"right": "empty.tif"}, [], "all pixels of {0}/empty.tif are no data or masked"),
+        ({}, ["--left-mask", "{0}/masked.tif"], "all pixels of {0}/left.tif are no data or masked"),
+        ({}, ["--disparity", 259, 259], "nowhere do both images have 5 x 5 usable pixels"),
+        (
+            {"left": "pixel.tif", "right": "pixel.tif"},
+            ["--disparity", 0, 0],
+            "nowhere do both images have 5 x 5 usable pixels",
+        ),
+        (
+            {"left": "tiny.tif", "right": "tiny.tif"},
+            ["--disparity", 0, 1],
+            "nowhere do both images have 5 x 5 usable pixels",
+        ),
+        ({}, ["--window", 0, 0, 1, 1], "nowhere do both images have 5 x 5 usable pixels"),
     ],
     ids=["left", "right", "mask", "range", "pixel", "tiny", "window"],
 )
@@ -294,7 +305,9 @@ def test_match__names_the_tiles_that_a_truncated_file_fails(folder, tmp_path, cl
     result = command(*matching(folder, out, *options, left="cut.tif"))
     assert (result.returncode, result.stdout) == (1, "")
     first, *lines = result.stderr.splitlines()
-    assert re.fullmatch(r"sat-intervals: (\d+) of 20 tiles failed, .*run the same command again, with --ov.*:", first)
+    assert re.fullmatch(
+        r"sat-intervals: (\d+) of 20 tiles failed, .*rerun the same command: it resumes; add --ov.*:", first
+    )
     assert int(first.split()[1]) == len(lines)
     failed = {re.fullmatch(r"  tile (\d_\d): (.*)", line)[1] for line in lines}
     kept = {path.stem for path in (out / "tiles" / "records").glob("[0-9]*.json")}
@@ -381,7 +394,7 @@ def test_log_file__keeps_what_debug_shows_and_what_it_held(folder, tmp_path):
     assert len([message for _, message in words if "tile 3_4 failed: " in message]) == 1
     retries = load_config(folder / "settings.yaml").cluster.retries
     tries = [message for _, message in words if message.startswith("tile 3_4 failed; ")]
-    assert tries == [f"tile 3_4 failed; it is tried again, {retries} times at most"] * (1 + retries)
+    assert tries == [f"tile 3_4 failed; it is tried again at most {retries} times"] * (1 + retries)
     assert "Traceback (most recent call last)" in kept
     assert "\nsat_intervals.errors.RunError: " in kept
     command(*arguments)
@@ -472,7 +485,7 @@ def test_match__ended_by_a_signal_leaves_tiles_and_the_next_try_goes_on(folder, 
     returned, _, errors = ended_by(number, arguments, out)
     assert (returned, errors) == (
         status,
-        f"sat-intervals: {word}; the same command goes on from the tiles that are done\n",
+        f"sat-intervals: {word}; rerun the same command: it resumes\n",
     )
     assert [path.name for path in out.iterdir()] == ["tiles"]
     before = {path: path.stat().st_mtime_ns for path in out.glob("tiles/records/[0-9]*.json")}
@@ -489,7 +502,7 @@ def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, t
     arguments = matching(folder, out, "--tile-size", 64, "--cluster", "processes", "--workers", 2)
     returned, _, errors = ended_by(signal.SIGINT, arguments, out, together=True)
     assert returned == 130
-    assert "sat-intervals: interrupted; the same command goes on" in errors
+    assert "sat-intervals: interrupted; rerun the same command" in errors
     assert "Traceback" not in errors
     assert "Ctrl" not in errors
     assert_nothing_final(out)
@@ -507,8 +520,8 @@ def test_match__on_a_disk_that_the_files_fill_fails_and_goes_on_once_there_is_ro
     full = command(*arguments)
     assert (full.returncode, full.stdout) == (1, "")
     assert re.fullmatch(
-        rf"sat-intervals: {out}/(intervals|validity)\.tif cannot be written: No space left on device.*: make room .*; "
-        r"the same command goes on from the tiles, all of which are done",
+        rf"sat-intervals: {out}/(intervals|validity)\.tif cannot be written: No space left on device.*: free disk "
+        r"space .*; rerun the same command: it resumes from the tiles, which are all done",
         full.stderr.splitlines()[-1],  # GDAL's TIFF library has a word of its own before that, and no way to stop it
     )
     assert [path.name for path in out.iterdir()] == ["tiles"]
@@ -531,6 +544,8 @@ def test_match__prints_plain_lines_and_a_table(done):
     assert "writing files" in lines
     assert lines[-3:] == [str(out / name) for name in ("intervals.tif", "validity.tif", "run.json")]
     report = json.loads((out / "run.json").read_text())
+    assert set(report["counts_meaning"]) <= set(report["counts"])
+    assert report["counts"]["flags"]["regularized"] >= report["counts"]["low_confidence"] > 0
     share = 100 * report["counts"]["valid"] / report["counts"]["pixels"]
     assert re.search(rf"^valid pixels +{share:.1f} %$", result.stdout, re.MULTILINE)
     assert re.search(r"^median interval width +\d+\.\d\d px$", result.stdout, re.MULTILINE)
@@ -540,7 +555,7 @@ def test_match__prints_plain_lines_and_a_table(done):
 
 
 def test_match__quiet_prints_nothing(folder, tmp_path):
-    result = command(*matching(folder, tmp_path / "out", "--quiet"))
+    result = command(*matching(folder, tmp_path / "out", "-q"))
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
 
@@ -767,7 +782,7 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "left.tif", "right.tif", "truth.tif"])
     last = result.stdout.splitlines()[-1]
     found = re.fullmatch(
-        r"The interval holds the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", last
+        r"The interval contains the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", last
     )
     scene = make_scene(150, 180, seed=4)
     with rasterio.open(out / "truth.tif") as file:

@@ -73,7 +73,7 @@ def test_main__names_a_malformed_dask_configuration(tmp_path):
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert str(tmp_path / "distributed.yaml") in line
-    assert line.endswith("mend it, or point DASK_CONFIG elsewhere")
+    assert line.endswith("fix it, or set DASK_CONFIG to another")
 
 
 @pytest.mark.process
@@ -94,12 +94,21 @@ def test_explained__a_failed_allocation_is_a_lack_of_memory(error):
     assert "not enough memory: choose a smaller --tile-size or fewer --workers" in line
 
 
-def test_main__ends_quietly_when_its_reader_goes():
+@pytest.mark.parametrize("arguments", [["config"], ["--help"], ["--version"], ["match", "--help"]])
+def test_main__ends_quietly_when_its_reader_goes(arguments):
     read, written = os.pipe()
     os.close(read)
-    result = subprocess.run([COMMAND, "config"], stdout=written, stderr=subprocess.PIPE, check=False, timeout=60)
+    result = subprocess.run([COMMAND, *arguments], stdout=written, stderr=subprocess.PIPE, check=False, timeout=60)
     os.close(written)
     assert (result.returncode, result.stderr) == (141, b"")
+
+
+def test_main__keeps_the_status_of_an_error_when_the_reader_of_stderr_goes():
+    read, written = os.pipe()
+    os.close(read)
+    result = subprocess.run([COMMAND, "match", "a", "b"], stdout=written, stderr=written, check=False, timeout=60)
+    os.close(written)
+    assert result.returncode == 2
 
 
 def test_main__ends_quietly_when_the_reader_of_its_progress_goes(tmp_path):
@@ -148,7 +157,7 @@ def test_read_batch__names_what_cannot_be_read_and_names_that_are_too_long(tmp_p
     with pytest.raises(SatIntervalsError, match=r"nope.csv cannot be read: No such file or directory: "):
         read_batch(tmp_path / "nope.csv")
     (tmp_path / "pairs.csv").write_text(f"name,left,right\n{201 * 'a'},l,r\n")
-    with pytest.raises(SatIntervalsError, match=r"row 1: name 'a+' cannot be .*, take another, of 200 bytes at most$"):
+    with pytest.raises(SatIntervalsError, match=r"row 1: name 'a+' cannot be .*: choose another of at most 200 bytes$"):
         read_batch(tmp_path / "pairs.csv")
 
 
@@ -163,13 +172,13 @@ def test_load_config__warns_once_of_penalties_that_are_not_of_the_preset(caplog)
     for _ in range(2):
         load_config(load_config(satellite, mccnn))
     (record,) = caplog.records
-    assert "preset satellite sets no penalties for cost.method mccnn" in record.getMessage()
+    assert "preset satellite has no penalties for cost.method mccnn" in record.getMessage()
     assert "--preset satellite-mccnn" in record.getMessage()
 
 
 def test_load_config__refuses_a_preset_that_would_change_nothing_of_a_config():
     config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 9}})
-    with pytest.raises(SatIntervalsError, match="preset 'urban' would change nothing of a Config"):
+    with pytest.raises(SatIntervalsError, match="preset 'urban' has no effect on a Config"):
         load_config(config, {"preset": "urban"})
     assert load_config(config, {"preset": "satellite"}) == config
 
@@ -213,7 +222,7 @@ def test_open_image__warns_of_further_pages(tmp_path, caplog):
     caplog.set_level(logging.WARNING)
     open_image(path)
     (record,) = caplog.records
-    assert f"{path} has 2 pages: the first is taken; name another as GTIFF_DIR:2:{path}" in record.getMessage()
+    assert f"{path} has 2 pages: the first is used; name another as GTIFF_DIR:2:{path}" in record.getMessage()
     assert open_image(f"GTIFF_DIR:2:{path}").height == 9
 
 

@@ -145,7 +145,7 @@ def test_load_config__other_penalties_beside_a_preset_need_their_own_span() -> N
     assert message(RANGE | {"preset": "satellite-mccnn", "sgm": {"p2": 7}}).startswith("sgm lacks span: constant ")
     config = settings(preset="satellite-mccnn", sgm={"p2": 7, "span": 60})
     assert (config.sgm.p1, config.sgm.span) == (Decimal("0.6"), 60)
-    assert message(RANGE | {"preset": "mccnn", "sgm": {"p1": 0.6}}).startswith("sgm: span is missing: the default, 16")
+    assert message(RANGE | {"preset": "mccnn", "sgm": {"p1": 0.6}}).startswith("sgm: span is missing: its default, 16")
 
 
 def test_load_config__another_kind_of_penalties_beside_a_preset_takes_p1_and_p2_only() -> None:
@@ -302,10 +302,10 @@ REFUSED = [
     (
         "ambiguity",
         {"p1": 1, "p99": 9, "normalization": "range"},
-        "ambiguity: p1 and p99 stand for percentiles: leave them out with normalization range",
+        "ambiguity: p1 and p99 are percentiles: leave them out with normalization range",
     ),
-    ("ambiguity", None, "regularization needs ambiguity, which null switches off: give ambiguity or set"),
-    ("interval", None, "regularization needs interval, which null switches off: give interval or set"),
+    ("ambiguity", None, "regularization needs ambiguity, set to null: give ambiguity or set"),
+    ("interval", None, "regularization needs interval, set to null: give interval or set"),
     ("interval", {"alpha": 0}, "interval.alpha is 0, allowed: number > 0, <= 1"),
     ("interval", {"alpha": 1.01}, "interval.alpha is 1.01, allowed: number > 0, <= 1"),
     ("interval", {"alpha": "0.9"}, "interval.alpha is '0.9', allowed: number > 0, <= 1"),
@@ -417,7 +417,9 @@ def test_load_config__unreadable_file_is_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing.yaml"
     assert message(missing) == f"{missing}: No such file or directory"
     preset = tmp_path / "mccnn.yaml"
-    assert message(preset).endswith("mccnn.yaml: No such file or directory (--preset mccnn takes it from the package)")
+    assert message(preset).endswith(
+        "mccnn.yaml: No such file or directory (give --preset mccnn for the preset of the package)"
+    )
     assert message(tmp_path) == f"{tmp_path}: Is a directory"
 
 

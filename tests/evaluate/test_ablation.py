@@ -148,7 +148,7 @@ def test_ablate_pair__matches_once(folder, monkeypatch):
 def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
     (pair,) = find_pairs([folder])
     search = {"minimum": pair.minimum, "maximum": pair.maximum}
-    with pytest.raises(SatIntervalsError, match="regularization is null: the ablation compares"):
+    with pytest.raises(SatIntervalsError, match="regularization is null, but the ablation needs it"):
         ablate_pair(pair, {"disparity": search, "regularization": None})
     with rasterio.open(pair.truth) as file:
         profile = file.profile | {"height": 89}

@@ -232,7 +232,7 @@ def test_evaluate_run__equals_the_slow_twin(pair, run, tmp_path, monkeypatch):
     same(found, expected, abs=0.003)  # of the bias, which decides where the truth lies in its interval
 
     monkeypatch.setattr("sat_intervals.results._STRIP", 9 * 90)
-    monkeypatch.setattr("sat_intervals.evaluate.disparity._JUDGED_PIXELS", 4 * 90)
+    monkeypatch.setattr("sat_intervals.evaluate.disparity._PIXELS", 4 * 90)
     same(
         evaluate_run(run, mask=tmp_path / "mask.tif", tolerance=0.25, remove_bias=True) | {"cost": 0},
         found | {"cost": 0},
@@ -320,8 +320,11 @@ def test_find_pairs__says_what_is_wrong_with_a_folder(tmp_path, meta, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("left,right,minimum,maximum\na,b,1,2\n", "row 1 lacks truth: needed is a row a pair, with left, right, truth"),
-        ("left,right,truth,minimum,maximum\n", "pairs.csv holds no pairs: needed is a row a pair, with left, right"),
+        (
+            "left,right,minimum,maximum\na,b,1,2\n",
+            "row 1 lacks truth: give a list of pairs, each with left, right, truth",
+        ),
+        ("left,right,truth,minimum,maximum\n", "pairs.csv holds no pairs: give a list of pairs, each with left, right"),
         ("left,right,truth,minimum,maximum,name\na,b,c,1,2,x\n./a,b,c,1,2,y\n", "/a is given 2 times: give it once"),
         ("left,right,truth,minimum,maximum\na,b,c,1,x\n", "row 1: minimum '1', maximum 'x', needed: integers"),
         (
@@ -361,6 +364,15 @@ def test_command__says_that_nothing_is_judged(run, tmp_path):
     status, text, _ = command("evaluate", run, "--mask", tmp_path / "nowhere.tif")
     assert status == 0
     assert "no valid pixel has a known truth: check truth and mask" in text
+
+
+def test_command__suggests_a_tolerance_for_a_truth_of_whole_pixels(run, pair, tmp_path):
+    with rasterio.open(pair / "truth.tif") as dataset:
+        write(tmp_path / "whole.tif", np.rint(dataset.read(1)), float("nan"))
+    assert command("evaluate", run)[2] == ""
+    says = f"warning: the truth of {run} has whole pixels only: try --tolerance 0.5\n"
+    assert command("evaluate", run, "--json", "--truth", tmp_path / "whole.tif")[2] == says
+    assert command("evaluate", run, "--truth", tmp_path / "whole.tif", "--tolerance", "0.5")[2] == ""
 
 
 def test_command__prints_the_form_of_json(run):
@@ -433,17 +445,17 @@ def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["RUN", "--accurate"], "--accurate is for pairs to be matched, every OUT is a run that was: leave it out"),
-        (["RUN", "--config", "nope.yaml"], "--config nope.yaml is for pairs to be matched"),
-        (["RUN", "--cost", "census"], "--cost census is for pairs to be matched"),
+        (["RUN", "--accurate"], "--accurate applies to pairs, but every OUT is a finished run: leave it out"),
+        (["RUN", "--config", "nope.yaml"], "--config nope.yaml applies to pairs"),
+        (["RUN", "--cost", "census"], "--cost census applies to pairs"),
         (["RUN", "OTHER/../out"], "out is given 2 times: give it once"),
         (["PAIR", "PAIR/../one"], "2 pairs or runs are called|/one/left.tif is given 2 times: give it once"),
         (["PAIR", "PAIR"], "2 pairs or runs are called .*/one: give each its own name"),
-        (["PAIR", "--config", "OFF"], "off.yaml: interval is null, but intervals are to be judged: leave it on"),
+        (["PAIR", "--config", "OFF"], "off.yaml: interval is null, but evaluate needs intervals: leave it on"),
         (["PAIR", "--config", "nope.yaml"], "nope.yaml"),
         (
             ["nothere.csv"],
-            "nothere.csv cannot be read: No such file or directory: needed is a row a pair",
+            "nothere.csv cannot be read: No such file or directory: give a list of pairs",
         ),
     ],
 )

@@ -125,16 +125,19 @@ def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
     for words, message in (
         ([], "Missing argument 'OUT...'"),
         (["--dsm", model], "--dsm and --reference go together"),
-        ([tmp_path, "--dsm", model, "--reference", away], "judge one kind at a time"),
+        ([tmp_path, "--dsm", model, "--reference", away], "evaluate one of them at a time"),
         (["--dsm", tmp_path / "none.tif", "--reference", away], "none.tif"),
         (["--dsm", model, "--reference", away], "give a reference of the same place"),
-        (["--dsm", model, "--reference", nowhere], "does not say where it lies"),
+        (["--dsm", model, "--reference", nowhere], "has no CRS or is not north up"),
         (
             ["--dsm", feet, "--reference", model],
-            "feet.tif is no surface model of sat-intervals dsm: is it the --reference?",
+            "feet.tif is not a surface model of sat-intervals dsm: is it the --reference?",
         ),
         (["--dsm", model, "--reference", feet], "differ by 500 m or more in the median: check that both are metres"),
-        (["--dsm", model, "--reference", feet, "--tolerance", "5"], "--tolerance is for runs and pairs, not for --dsm"),
+        (
+            ["--dsm", model, "--reference", feet, "--tolerance", "5"],
+            "--tolerance applies to runs and pairs, not to --dsm",
+        ),
     ):
         result = invoke("evaluate", *words)
         assert result.exit_code == 2, result.output

@@ -268,7 +268,7 @@ def test_make_surface__heights_count_from_a_geoid(tmp_path):
 
 def test_make_surface__refuses_a_geoid_that_ends_before_the_points(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 200_000], [-0.5, -0.5], [100.0, 100.0])
-    with pytest.raises(SatIntervalsError, match=r"ends before the points of .*: give one that covers them"):
+    with pytest.raises(SatIntervalsError, match=r"does not cover the points of .*: give one that covers them"):
         surface_of([out], tmp_path, geoid=write_geoid(tmp_path / "geoid.tif", 49.5))
 
 
@@ -280,7 +280,7 @@ def test_projection__refuses_what_is_no_map_in_metres(crs):
 
 def test_projection__takes_a_number_and_no_heights():
     assert Projection("32637").crs == "EPSG:32637"
-    with pytest.raises(SatIntervalsError, match=r"has heights too: give a map alone, and a geoid by --geoid"):
+    with pytest.raises(SatIntervalsError, match=r"includes heights: give a horizontal CRS, and a geoid with --geoid"):
         Projection("EPSG:32637+5773")
 
 
@@ -302,7 +302,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
     (tmp_path / "geoid.txt").write_text("no grid")
     cases = [
         ([plain], [], "has no points.tif: run sat-intervals triangulate on it first"),
-        ([old], [], "is of an earlier run"),
+        ([old], [], "belongs to an earlier run"),
         ([empty], [], "no valid pixel"),
         (far, [], "choose a coarser --resolution, or runs of one place"),
         ([far[0]], ["--resolution", "-1"], "resolution is -1 m: give one above 0, up to 10000"),
@@ -311,12 +311,12 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         (
             [far[0]],
             ["--output", str(far[0] / "points.tif")],
-            "is no surface model to be replaced: choose another --output",
+            "exists and is not a surface model: choose another --output",
         ),
-        ([far[0]], ["--output", str(tmp_path)], "is no surface model to be replaced: choose another --output"),
+        ([far[0]], ["--output", str(tmp_path)], "exists and is not a surface model: choose another --output"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "says -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(tmp_path / "none.gtx")], "none.gtx: no such file"),
-        ([far[0]], ["--crs", "EPSG:4326"], "is no map in metres"),
+        ([far[0]], ["--crs", "EPSG:4326"], "is not a map in metres"),
         ([tmp_path / "nowhere"], [], "give the folder of a finished run"),
     ]
     for outs, options, message in cases:

@@ -100,7 +100,7 @@ def test_cars_plugin__of_another_version_leaves_cars_alone(tmp_path):
         capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "this CARS cannot match with sat_intervals, which needs CARS 1.3" in done.stderr
+    assert "sat_intervals needs CARS 1.3 and cannot be used with this version" in done.stderr
 
 
 @pytest.mark.peer("cars")

@@ -175,7 +175,9 @@ def test_match_arrays__refuses_what_is_no_pair_of_images(left, right, message):
 
 @pytest.mark.parametrize(("minimum", "maximum"), [(8, 12), (-12, -8)])
 def test_match_arrays__refuses_a_range_that_meets_no_right_pixel(minimum, maximum):
-    with pytest.raises(SatIntervalsError, match=f"disparities {minimum} to {maximum} lead every pixel .*, 8 columns"):
+    with pytest.raises(
+        SatIntervalsError, match=rf"disparities {minimum} to {maximum} move every pixel .* \(8 columns\)"
+    ):
         match_arrays(IMAGE, IMAGE, {"disparity": {"minimum": minimum, "maximum": maximum}})
     match_arrays(IMAGE, IMAGE, {"disparity": {"minimum": 7, "maximum": 7}})
 

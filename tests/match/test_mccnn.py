@@ -216,11 +216,11 @@ def test_config__span_is_declared_and_held_to_what_can_be():
     assert settings(-9, 0, sgm=None).cost_span == 250
     with pytest.raises(SatIntervalsError, match=r"sgm\.span is 60, allowed: <= 48 with p2 4"):
         settings(-9, 0, sgm={"p2": 4, "span": 60})
-    with pytest.raises(SatIntervalsError, match=r"sgm\.gradients raw looks at the right image at disparity 0"):
+    with pytest.raises(SatIntervalsError, match=r"sgm\.gradients raw reads the right image at disparity 0"):
         settings(1, 9, sgm={"gradients": "raw", "span": 16})
     with pytest.raises(SatIntervalsError, match=r"sgm\.p2 is 70, allowed: <= 63 with cost\.method mccnn"):
         settings(-9, 0, sgm={"p2": 70, "span": 16})
-    with pytest.raises(SatIntervalsError, match=r"sgm.*: span is missing: the default, 16, .* another p1 and p2: give"):
+    with pytest.raises(SatIntervalsError, match=r"sgm.*: span is missing: its default, 16, .* another p1 and p2: give"):
         settings(-9, 0, sgm={"p1": 2.3, "p2": 42.3, "v": 1.5, "d": 0.08})
     assert settings(-9, 0, sgm={"p1": 0.5, "d": 0.08}) == settings(-9, 0)
     with pytest.raises(SatIntervalsError, match=r"sgm lacks p1 and p2 and span: constant penalties have no defaults"):
@@ -306,7 +306,7 @@ def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, ne
     left, right = masked_images(70, 140)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
     images[1].write_bytes(images[1].read_bytes()[:-4000])
-    with pytest.raises(RunError, match=r"right\.tif could not be measured: .*the file may be cut short"):
+    with pytest.raises(RunError, match=r"right\.tif could not be measured: .*the file may be truncated"):
         match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
 
 

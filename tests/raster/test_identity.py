@@ -119,7 +119,7 @@ def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(we
     put({"right.tif": bytes(changed)}, web_server.folder)
     status, output = ended(run)
     assert (status, output.count("\n")) == (1, 1)
-    assert "right.tif was replaced or changed while the run worked on it" in output
+    assert "right.tif was replaced or changed during the run" in output
     assert [path.name for path in out.iterdir()] == ["tiles"]
 
 

@@ -386,7 +386,7 @@ def test_read_window__names_a_file_cut_short_and_the_place(tmp_path, options):
     np.testing.assert_array_equal(pixels, noise[:50, :50])
     with pytest.raises(InputError) as failure:
         read_window(image, Window(240, 100, 100, 50))
-    message(failure, path, "rows 240 to 299", "columns 100 to 149", "cut short")
+    message(failure, path, "rows 240 to 299", "columns 100 to 149", "truncated")
 
 
 def test_read_window__names_a_mask_cut_short(tmp_path):
@@ -619,7 +619,7 @@ def test_output_writer__refuses_a_name_that_is_no_files_before_the_work(tmp_path
     (tmp_path / "validity.tif").mkdir()
     with pytest.raises(OutputError) as failure:
         produce(tmp_path, products, publish=False)
-    message(failure, tmp_path / "validity.tif", "it is no file: choose another name")
+    message(failure, tmp_path / "validity.tif", "it is not a regular file: choose another name")
 
 
 def test_output_writer__of_others_in_a_folder_disturbs_none_and_of_the_same_is_refused(tmp_path):
@@ -628,7 +628,7 @@ def test_output_writer__of_others_in_a_folder_disturbs_none_and_of_the_same_is_r
 
     bands = np.zeros((6, 20, 30), np.float32)
     with writer("a.tif") as one, writer("b.tif") as other:
-        with pytest.raises(SatIntervalsError, match="another run is at work in"), writer("a.tif"):
+        with pytest.raises(SatIntervalsError, match="another run is active in"), writer("a.tif"):
             pass
         one.write(0, bands)
         one.publish()
@@ -679,7 +679,7 @@ def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_pa
 @pytest.mark.parametrize(
     ("size", "others", "reason"),
     [
-        (4 << 20, 0, "has 4.2 MB left, the bands need 5.2 MB"),
+        (4 << 20, 0, "has 4.2 MB free, the bands need at least 5.2 MB"),
         (6 << 20, 2 << 20, "No space left on device"),
         (6 << 20, 0, "No space left on device"),
         (9 << 20, 0, "No space left on device"),

@@ -154,7 +154,7 @@ def test_match_batch__goes_on_with_the_others_where_a_report_cannot_be_read(imag
 def test_match_batch__refuses_a_folder_where_another_batch_is_at_work(images, tmp_path):
     with (
         LocalFolder(tmp_path).locked(),
-        pytest.raises(SatIntervalsError, match="another run is at work in"),
+        pytest.raises(SatIntervalsError, match="another run is active in"),
     ):
         match_batch(read_batch(rows(images)), tmp_path)
 
@@ -215,7 +215,7 @@ def test_match_batch__holds_the_folders_of_its_pairs(images, tmp_path):
     with LocalFolder(tmp_path / "pair1" / "tiles").locked():
         report = match_batch(read_batch(rows(images)), tmp_path)
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
-    assert "another run is at work in" in report["pair1"]["error"]
+    assert "another run is active in" in report["pair1"]["error"]
 
 
 def test_match_batch__keeps_the_tiles_of_equal_pairs_apart_and_goes_on_where_those_of_one_vanish(images, tmp_path):
@@ -248,7 +248,7 @@ def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, 
     assert {end["state"] for end in report.values()} == {"failed"}
     assert hashes(tmp_path / "pair1") == before
     told = invoke("status", tmp_path / "pair1")
-    assert "1 of 1 tiles done, 0 failed, 0 left; no run is at work" in told.stdout
+    assert "1 of 1 tiles done, 0 failed, 0 left; no run is active" in told.stdout
     report = match_batch(pairs, tmp_path, {"median": None})
     assert {end["state"] for end in report.values()} == {"done"}
     assert hashes(tmp_path / "pair1") != before
@@ -326,13 +326,21 @@ def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(ima
         ("a.csv", "name,left\nx,l.tif\n", "row 1 lacks right"),
         ("a.csv", "name,left,right\nx,l,r\nx,l,r\n", "a.csv: 2 pairs or runs are called x"),
         ("a.csv", "name,left,right\nx,l,r,1\n", "more values than columns"),
-        ("a.csv", "name,left,right\n../x,l,r\n", "row 1: name '../x' cannot be that of the pair's folder"),
+        ("a.csv", "name,left,right\n../x,l,r\n", "row 1: name '../x' cannot be a folder's name"),
         ("a.csv", "name,left,right\nx,l,r\nlogs,l,r\n", "row 2: name 'logs' cannot be"),
         ("a.csv", "name,left,right,sgm.p2\nx,l,r,[3\n", r"row 1: sgm.p2 is '\[3': while parsing"),
-        ("a.csv", "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n", "row 1: sgm.p2 is '3': the row gives sgm as a whole"),
-        ("a.csv", "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n", "row 1: sgm is 'null': the row gives parts of sgm"),
-        ("a.csv", "name,left,right,sgm.p2,sgm.p2\nx,l,r,1,2\n", "column sgm.p2 is there twice"),
-        ("a.csv", "name,left,right,cluster.kind\nx,l,r,slurm\n", "row 1: cluster is one for all pairs"),
+        (
+            "a.csv",
+            "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n",
+            "row 1: sgm.p2 is '3': the row also gives sgm as a whole",
+        ),
+        (
+            "a.csv",
+            "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n",
+            "row 1: sgm is 'null': the row also gives parts of sgm",
+        ),
+        ("a.csv", "name,left,right,sgm.p2,sgm.p2\nx,l,r,1,2\n", "column sgm.p2 appears twice"),
+        ("a.csv", "name,left,right,cluster.kind\nx,l,r,slurm\n", "row 1: all pairs share one cluster"),
         ("a.csv", 'name,left,right\n"x\ny",l,r\n', r"row 1: name 'x\\ny' cannot be"),
         ("a.yaml", "- {name: x, left: l, left: m, right: r}", "key 'left' appears twice"),
         ("a.yaml", "- {name: 2024-13-45, left: l, right: r}", "cannot be read"),
@@ -411,6 +419,8 @@ def test_plan__prints_what_a_run_will_take(images):
     assert result.exit_code == 0, result.stderr
     assert "expected time, 3 tiles at once" in result.stdout
     assert "smaller than set, to fit" in result.stdout
+    assert re.search(r"memory of a worker: +\d+ MB, fits in 400 MB\n", result.stdout)
+    assert re.search(r"with 3 tiles at once: +\d+ MB, does not fit in 400 MB: give --workers [12]\n", result.stdout)
     refused = invoke("plan", *pair, "--memory", "100MB")
     assert refused.exit_code == 2
     assert "but 100 MB are given" in refused.stderr
@@ -457,5 +467,5 @@ def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     (out / "tiles" / "records" / "1_1.json").unlink()
     Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
     result = invoke("status", out)
-    assert "10 of 12 tiles done, 1 failed, 1 left; no run is at work" in result.stdout
+    assert "10 of 12 tiles done, 1 failed, 1 left; no run is active" in result.stdout
     assert "tile 0_1: no more disk" in result.stdout

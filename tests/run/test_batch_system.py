@@ -18,7 +18,7 @@ from helpers import COMMAND, hashes, wait_until
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError
-from sat_intervals.run.batch_system import job_script, workers_there
+from sat_intervals.run.batch_system import current_workers, job_script
 
 
 @contextmanager
@@ -168,11 +168,11 @@ def sbatch(folder: Path, script: str) -> str:
 
 def test_match__waits_for_the_first_worker_and_says_so(slurm, pair, tmp_path):
     programs = sbatch(tmp_path, 'exec $SBATCH --begin=now+15 "$@"')
-    with submitted(pair, tmp_path, programs=programs, constants={"_TOLD_EVERY": 4, "WORKERS_GONE": 5}, is_quiet=False):
+    with submitted(pair, tmp_path, programs=programs, constants={"_WARN_EVERY": 4, "WORKERS_GONE": 5}, is_quiet=False):
         pass
     lines = (tmp_path / "log").read_text().splitlines()
     assert 1 <= len(lines) <= 20
-    assert all("no worker has come yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
+    assert all("no worker has started yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
     assert_complete(pair, tmp_path / "out")
 
 
@@ -184,30 +184,32 @@ def test_match__ends_when_the_last_worker_has_gone_and_goes_on_after(slurm, pair
         (job,) = jobs()
         subprocess.run(["scancel", job], check=True, timeout=30)
     (line,) = (tmp_path / "log").read_text().splitlines()
-    assert "the last worker has gone and none has come for 5 s" in line
+    assert "the last worker ended and none has started for 5 s" in line
     assert str(tmp_path / "out" / "logs") in line
-    assert "the same command goes on from the tiles that are done" in line
+    assert "rerun the same command: it resumes" in line
     match_pair(pair / "left.tif", pair / "right.tif", tmp_path / "out", pair / "settings.yaml")
     assert_complete(pair, tmp_path / "out")
 
 
-def test_workers_there__says_once_a_minute_that_no_worker_has_come_and_ends_minutes_after_the_last(monkeypatch, caplog):
+def test_current_workers__says_once_a_minute_that_no_worker_has_come_and_ends_minutes_after_the_last(
+    monkeypatch, caplog
+):
     seconds, cores = [0.0], {}
     monkeypatch.setattr(time, "monotonic", lambda: seconds[0])
-    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs", seen=None, told=0.0)
+    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs", seen=None, warned=0.0)
     client = SimpleNamespace(cluster=system, nthreads=lambda: cores)
     for seconds[0] in range(0, 3600, 2):
-        assert workers_there(client) == {}
+        assert current_workers(client) == {}
     assert len(caplog.messages) == 59
     assert "/logs" in caplog.messages[0]
     cores["one"] = 2
-    assert sum(workers_there(client).values()) == 2
+    assert sum(current_workers(client).values()) == 2
     cores.clear()
     seconds[0] += 300
-    assert workers_there(client) == {}
+    assert current_workers(client) == {}
     seconds[0] += 1
-    with pytest.raises(RunError, match=r"none has come for 300 s: .* /logs tell; the same command goes on"):
-        workers_there(client)
+    with pytest.raises(RunError, match=r"none has started for 300 s: .* /logs; rerun the same command"):
+        current_workers(client)
     assert len(caplog.messages) == 59
 
 

@@ -135,7 +135,9 @@ def test_match__ends_where_a_disk_damages_whatever_is_written(scene, tmp_path, m
     settings = yaml.safe_load((scene / "settings.yaml").read_text())
     with monkeypatch.context() as patch:
         patch.setattr(run, "match_tile", and_damage)
-        with pytest.raises(RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: the same command matches them"):
+        with pytest.raises(
+            RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: rerun the same command: it matches them"
+        ):
             match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
     match(scene, tmp_path / "out")
@@ -210,10 +212,10 @@ def test_match__finds_its_tiles_where_the_note_of_their_place_is_damaged(scene, 
     store = ("--store", tmp_path / "store", "--keep-tiles")
     match(scene, tmp_path / "out", *store)
     (tmp_path / "out" / "run.json").unlink()
-    note = tmp_path / "out" / "tiles" / "store.json"
+    note = tmp_path / "out" / "tiles" / ".sat-intervals.store"
     note.write_text(text, encoding="latin-1")
     said = match(scene, tmp_path / "out", status=2)
-    assert f"{note} cannot be read: give the --store of before to go on, or --overwrite" in said
+    assert f"{note} cannot be read: give the same --store as before to resume, or --overwrite" in said
     records = {file: file.stat().st_mtime_ns for file in (tmp_path / "store").glob("*/records/*")}
     assert len(records) == 6
     match(scene, tmp_path / "out", *store)
@@ -263,7 +265,7 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
         match_pair(scene / "left.tif", scene / "right.tif", out, settings)
     assert list(tmp_path.rglob("records/*.json"))
     assert match(scene, out, *store) == (
-        f"sat-intervals: the run in {out} was complete; the tiles that it left are removed now\n"
+        f"sat-intervals: the run in {out} was already complete; its remaining tiles were removed\n"
     )
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
     assert not list(tmp_path.rglob("arrays.zarr"))
@@ -282,7 +284,7 @@ def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tm
         match(scene, out, status=1)
     damage(out / name, how)
     said = match(scene, out, status=2)
-    assert f"{out / name} was changed after the run, whose tiles are still there: delete it" in said
+    assert f"{out / name} was changed after the run, but the tiles still exist: delete it" in said
     assert (out / name).stat().st_size == 0 or how != "empty"
     (out / name).unlink()
     match(scene, out)
@@ -293,7 +295,7 @@ def test_match__keeps_the_tiles_of_a_dead_run_whose_files_were_changed(scene, tm
 MARKS = [".sat-intervals.finished", ".sat-intervals.replacing"]
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "store.json", *MARKS, "arrays.zarr/zarr.json"])
+@pytest.mark.parametrize("name", ["manifest.json", ".sat-intervals.store", *MARKS, "arrays.zarr/zarr.json"])
 def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
     tiles = unfinished(scene, tmp_path / "out")
     (tiles / name).unlink(missing_ok=True)
@@ -320,7 +322,14 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
     shutil.rmtree(tiles)
     shutil.rmtree(out)
-    names = ["notes.txt", "records/notes.json", "failures/all.json", "arrays.zarr/int16/table", "arrays.zarr/.zattrs"]
+    names = [
+        "notes.txt",
+        "store.json",
+        "records/notes.json",
+        "failures/all.json",
+        "arrays.zarr/int16/table",
+        "arrays.zarr/.zattrs",
+    ]
     mine = with_files(tiles, names)
     top = [
         "records/0_0.json", "failures/0_0.json", "arrays.zarr/zarr.json", "normalization.json", "manifest.json"
@@ -346,7 +355,7 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
 def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
     mine = with_files(tmp_path / "out" / "tiles", [name])
     said = match(scene, tmp_path / "out", *options, status=2)
-    assert f"{tmp_path}/out/tiles holds files that no run made, such as {name}: move them away" in said
+    assert f"{tmp_path}/out/tiles has files that no run made, such as {name}: move them away" in said
     assert_kept(mine)
 
 
@@ -404,7 +413,7 @@ def test_open_run__of_a_report_without_sizes_opens(scene, tmp_path):
     report = json.loads((tmp_path / "out" / "run.json").read_text())
     del report["files"]
     (tmp_path / "out" / "run.json").write_text(json.dumps(report))
-    open_run(tmp_path / "out").check_whole()
+    open_run(tmp_path / "out")
 
 
 def test_match__keeps_empty_files_in_a_folder_without_signs_of_a_run(scene, tmp_path):
@@ -424,3 +433,13 @@ def test_match__names_a_folder_where_a_file_of_a_tile_must_be(scene, tmp_path, n
     result = invoke(*command, "--quiet")
     assert result.exit_code == 1
     assert f"tile 1_0: {tmp_path}/out/tiles/{name}: Is a directory" in result.stderr.splitlines()[1]
+
+
+@pytest.mark.parametrize("command", ["evaluate OUT", "report OUT", "plot OUT", "export OUT TARGET --to otb"])
+def test_commands__refuse_a_result_of_which_a_bit_flipped(scene, tmp_path, command):
+    shutil.copytree(scene / "kept", tmp_path / "OUT")
+    damage(tmp_path / "OUT" / "intervals.tif", "bit")
+    result = invoke(*(tmp_path / word if word.isupper() else word for word in command.split()))
+    assert f"{tmp_path}/OUT/intervals.tif is not what the run published; it is damaged" in result.stderr
+    assert result.exit_code == 2
+    assert not (tmp_path / "TARGET").exists()

@@ -107,7 +107,7 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
                 swap(folder / name, (folder / ("other.tif" if name == "right.tif" else "masked.tif")).read_bytes())
 
     images = open_image(folder / "left.tif", mask=mask), open_image(right)
-    with pytest.raises(ChangedInputError, match=rf"{name}.* was replaced or changed while the run worked") as error:
+    with pytest.raises(ChangedInputError, match=rf"{name}.* was replaced or changed during the run") as error:
         match_pair(*images, folder / "out", settings, progress=progress)
     assert "\n" not in str(error.value)
     assert isinstance(error.value, RunError)
@@ -301,7 +301,7 @@ def test_export__ends_where_another_run_replaces_the_one_it_reads(finished, tmp_
         return read(run, window)
 
     monkeypatch.setattr(Run, "read_bands", and_replace)
-    with pytest.raises(RunError, match="was replaced while it was read: run the command again"):
+    with pytest.raises(RunError, match="was replaced while it was read: rerun the command"):
         export(finished, "otb", tmp_path / "target")
     assert not list((tmp_path / "target").glob("*.tif"))
 
@@ -372,7 +372,9 @@ def test_locked__keeps_what_is_not_its_lock(tmp_path, kind):
         work()
         assert lock.read_text() == "mine"
     else:
-        with pytest.raises(SatIntervalsError, match=r"cannot be written: (.*symbolic link|Is a dir|.*no regular file)"):
+        with pytest.raises(
+            SatIntervalsError, match=r"cannot be written: (.*symbolic link|Is a dir|.*not a regular file)"
+        ):
             work()
     assert os.path.lexists(lock)
     assert (precious.read_text(), (folder / ".lock").read_text()) == ("mine", "mine")
@@ -496,17 +498,17 @@ def test_commands__follow_no_note_of_a_received_folder(pair, elsewhere, kind):
     out = folder / "batch" / "out"
     images = folder / "left.tif", folder / "right.tif"
     (out / "tiles").mkdir(parents=True)
-    (out / "tiles" / "store.json").write_text(json.dumps(noted))
+    (out / "tiles" / ".sat-intervals.store").write_text(json.dumps(noted))
     before = contents(precious)
     command = ["match", *images, out, "--config", folder / "settings.yaml", "--quiet"]
-    says = f"are said to lie in {noted}", f"give --store {noted.rpartition('/')[0]}"
+    says = f"places the tiles of the run in {noted}", f"give --store {noted.rpartition('/')[0]}"
     refused(command, *says)
     refused(["status", out], *says)
     result = invoke(*command, "--overwrite")
     assert (result.exit_code, result.stderr.count("\n")) == (0, 1)
-    assert f"are said to lie in {noted}: they stay there" in result.stderr
+    assert f"places the tiles of the run in {noted}: they are kept" in result.stderr
     (out / "tiles").mkdir()
-    (out / "tiles" / "store.json").write_text(json.dumps(noted))
+    (out / "tiles" / ".sat-intervals.store").write_text(json.dumps(noted))
     report = match_batch([PairOfBatch("out", *map(str, images))], folder / "batch", settings)
     assert report["out"]["state"] == "done before"
     (out / "run.json").unlink()
@@ -521,7 +523,7 @@ def test_match__with_the_noted_store_deletes_only_what_its_manifest_names(pair, 
     folder, settings = pair
     precious, _, _ = elsewhere
     (folder / "out" / "tiles").mkdir(parents=True)
-    (folder / "out" / "tiles" / "store.json").write_text(json.dumps(str(precious)))
+    (folder / "out" / "tiles" / ".sat-intervals.store").write_text(json.dumps(str(precious)))
     before = contents(precious)
     settings["cluster"]["store"] = str(precious.parent)
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings, overwrite=True)
@@ -533,7 +535,11 @@ def test_status__looks_into_the_store_that_is_named(pair):
     settings["cluster"]["store"] = str(folder / "store")
     job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     job.begin()
-    refused(["status", folder / "out"], f"said to lie in {job.store.elsewhere}", f"give --store {folder / 'store'}")
+    refused(
+        ["status", folder / "out"],
+        f"places the tiles of the run in {job.store.elsewhere}",
+        f"give --store {folder / 'store'}",
+    )
     result = invoke("status", folder / "out", "--store", folder / "store")
     assert (result.exit_code, "0 of 9 tiles done" in result.output) == (0, True), result.output
 
@@ -682,7 +688,5 @@ def test_commands__say_that_the_working_directory_is_gone(tmp_path, words):
         ["sh", "-c", script, "sh", COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
-    assert (
-        done.stderr.splitlines()[-1] == "sat-intervals: the working directory is gone: change to a folder that is there"
-    )
+    assert done.stderr.splitlines()[-1] == "sat-intervals: the working directory was deleted: change to another folder"
     assert "Traceback" not in done.stderr

@@ -120,6 +120,7 @@ def test_match_pair__writes_a_complete_report(pair, tmp_path):
     assert counts["valid"] == (validity & INVALID == 0).sum()
     for name, flag in report["validity_bits"].items():
         assert counts["flags"][name] == np.count_nonzero(validity & (1 << flag["bit"]))
+    assert counts["valid"] + sum(counts["causes"].values()) == counts["pixels"]
     assert report["inputs"]["left"]["bytes"] == left.stat().st_size
     assert report["cost_span"] == 448
     assert load_config(report["settings"]) == load_config(settings)
@@ -219,7 +220,7 @@ def test_match_pair__ends_where_another_run_of_the_same_removes_the_tiles(pair, 
             match_pair(left, right, tmp_path / "other", settings)
             assert not list(store.iterdir())
 
-    with pytest.raises(RunError, match=rf"^the tiles in {store}/\w{{32}} are gone, .*: run the same command again.*$"):
+    with pytest.raises(RunError, match=rf"^the tiles in {store}/\w{{32}} are gone: .*: rerun the same command.*$"):
         match_pair(left, right, tmp_path / "out", settings, progress=progress)
     assert not list((tmp_path / "out").glob("*.*"))
     assert not list(store.iterdir())
@@ -322,7 +323,7 @@ def test_match_pair__says_which_image_is_empty(pair, tmp_path):
     shutil.copy(left, empty)
     with rasterio.open(empty, "r+") as file:
         file.write(np.zeros(file.shape, "uint16"), 1)
-    with pytest.raises(SatIntervalsError, match=r"empty\.tif hold no data"):
+    with pytest.raises(SatIntervalsError, match=r"empty\.tif are no data"):
         match_pair(left, empty, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
 

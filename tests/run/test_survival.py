@@ -220,7 +220,7 @@ def test_match__asked_to_end_leaves_no_worker_and_says_how_to_go_on(pair, tmp_pa
         workers = command.workers()
         command.process.send_signal(number)
         assert command.end(20) == status
-        assert "the same command goes on" in command.output
+        assert "rerun the same command: it resumes" in command.output
         assert len(command.output.splitlines()) == 1, command.output
         _, alive = psutil.wait_procs(workers, 10)
         assert not alive
@@ -305,7 +305,7 @@ def test_match__ends_when_the_scheduler_dies_and_goes_on_elsewhere(pair, tmp_pat
         command.wait_for_tiles(3)
         kill_tree(process)
         assert command.end() == 1, command.output
-        assert "the dask scheduler is gone; the same command goes on" in command.output
+        assert "the dask scheduler is gone; rerun the same command" in command.output
         assert len(command.output.splitlines()) == 1, command.output
     assert_nothing_final(out)
     with started(pair, out) as command:
@@ -356,7 +356,7 @@ def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tm
             )
             assert re.search(alone, log.read_text())
             assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
-            assert "give workers more, or choose smaller tiles" in command.output
+            assert "give workers more memory, or choose smaller tiles" in command.output
         assert_nothing_final(out)
         assert done_tiles(out) == {"0_1", "1_0", "1_1"}
         with worker(address, tmp_path), started(uneven, out, "--cluster", address) as command:
@@ -384,7 +384,7 @@ def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, di
         with suppress(OSError):
             ballast.write_bytes(bytes(free))
         assert command.end() == 1, command.output
-        assert "No space left on device: make room and run the same command again" in command.output
+        assert "No space left on device: free disk space and rerun the same command" in command.output
         assert len(command.output.splitlines()) == 1, command.output
     assert_nothing_final(out)
     assert len(done_tiles(out)) >= 5
@@ -401,7 +401,7 @@ def test_match__refuses_a_folder_where_another_run_is_at_work(pair, tmp_path):
         first.process.send_signal(signal.SIGSTOP)
         with started(pair, tmp_path / "out", "--overwrite") as second:
             assert second.end() == 2
-            assert "another run is at work in" in second.output
+            assert "another run is active in" in second.output
         first.process.send_signal(signal.SIGCONT)
         assert first.end() == 0, first.output
     assert_complete(pair, tmp_path / "out")

@@ -20,14 +20,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sat_intervals import match_pair
+from sat_intervals.cli.console import Console
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import FLAGS, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED
+from sat_intervals.products import FLAGS, INVALID, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED, Bands
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
+from sat_intervals.run.statistics import Tally
+from sat_intervals.show.canvas import widest
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.show.dsm import _relief, draw_surface
-from sat_intervals.show.legend import ORANGE, PIXEL_CLASSES, SKY, VERMILION, classify
+from sat_intervals.show.legend import FIRST_INVALID, ORANGE, PIXEL_CLASSES, SKY, VERMILION, class_counts, classify
 from sat_intervals.show.maps import draw_errors, draw_overview
 from sat_intervals.show.profile import draw_curve, draw_profile
 from sat_intervals.tiling import Window
@@ -85,9 +88,9 @@ def test_plot__without_truth_or_options_makes_the_overview_alone(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--columns", "1", "5"], "give its --row too"),
+        (["--columns", "1", "5"], "give --row too"),
         (["--row", "99"], "row 99, column 0 is outside the results in .*: rows are 0 to 39, columns 0 to 49"),
-        (["--row", "3", "--columns", "7", "4"], "columns 7 to 4 are the wrong way round"),
+        (["--row", "3", "--columns", "7", "4"], "columns 7 to 4 are in the wrong order"),
         (["--row", "3", "--columns", "7", "50"], "column 50 is outside"),
         (["--pixel", "0", "-1"], "column -1 is outside"),
         (["--truth", "nowhere.tif"], "nowhere.tif cannot be read"),
@@ -154,6 +157,34 @@ def test_draw_overview__shows_every_kind_in_its_colour(tmp_path):
     assert min(shares) > 0.005
 
 
+def with_several_flags(height, width):
+    """Bands and a validity band in which pixels have several flags."""
+    bands, validity, _ = random_bands(height, width)
+    validity |= np.random.default_rng(1).choice([0, *(flag.value for flag in FLAGS)], validity.shape).astype(np.uint16)
+    bands[:3, validity & INVALID != 0] = np.nan
+    return bands, validity
+
+
+def test_class_counts__agree_with_the_map():
+    bands, validity = with_several_flags(70, 90)
+    tally = Tally(31)
+    tally.add(Bands(*bands, validity))
+    counts = tally.report()
+    assert class_counts(counts) == np.bincount(classify(validity).ravel(), minlength=len(PIXEL_CLASSES)).tolist()
+    assert counts["valid"] + sum(counts["causes"].values()) == validity.size < sum(counts["flags"].values())
+
+
+def test_draw_overview__shows_the_shares_of_the_terminal(tmp_path, words, capsys):
+    out = write_run(tmp_path, *with_several_flags(900, 1000))
+    results = open_results(out)
+    draw_overview(results, tmp_path / "overview.png", dpi=40)  # of fewer pixels than it counts
+    Console(quiet=False).summary(results.report | {"seconds": {"total": 1}}, out)
+    printed = re.findall(r"^(valid pixels|  .*?) +(\d+\.\d) %$", capsys.readouterr().out, re.MULTILINE)
+    shares = [float(word.split("(")[-1].split()[0]) for word in words if re.search(r"\(\d+\.\d\s%\)$", word)]
+    assert shares[FIRST_INVALID:] == [float(share) for _, share in printed[1:]]
+    assert sum(float(share) for _, share in printed) == pytest.approx(100, abs=0.4)
+
+
 def test_draw_errors__colours_the_misses(tmp_path):
     bands, validity = no_bands(100, 100)
     bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
@@ -193,6 +224,7 @@ def drawn(monkeypatch):
 def test_draw_errors__holds_a_strip_at_a_time(tmp_path):
     height, width = 12_000, 200
     results = open_results(write_run(tmp_path, *random_bands(height, width)))
+    draw_errors(results, tmp_path / "errors.png", dpi=50)  # what is imported and kept is not counted
     tracemalloc.start()
     draw_errors(results, tmp_path / "errors.png", dpi=50)
     peak = tracemalloc.get_traced_memory()[1]
@@ -250,8 +282,8 @@ def test_plot__without_intervals_claims_none(tmp_path, words):
     assert done.output.split() == [str(out / "overview.png"), str(out / "profile.png")]
     assert {"truth", "disparity"} < set(words)
     assert "interval" not in words
-    assert "Row 20, columns 0 to 49; where there is no black line, no pixel is valid" in words
-    with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: none can be wrong"):
+    assert "Row 20, columns 0 to 49; no black line: no valid pixel" in words
+    with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: errors need them"):
         draw_errors(open_results(out), tmp_path / "errors.png")
 
 
@@ -285,10 +317,10 @@ def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tm
     write_surface(out, np.ones((20, 20)), runs="earlier")
     done = invoke("plot", out, "--dpi", "40")
     assert done.exit_code == 0, done.output
-    assert done.stderr == f"{out / 'dsm.tif'} is of an earlier run and not drawn: run sat-intervals dsm again\n"
+    assert done.stderr == f"{out / 'dsm.tif'} belongs to an earlier run and is not drawn: rerun sat-intervals dsm\n"
     assert not (out / "dsm.png").exists()
     shutil.copy(out / "validity.tif", tmp_path / "dsm.tif")
-    with pytest.raises(SatIntervalsError, match=r"dsm\.tif is no surface model of sat-intervals dsm"):
+    with pytest.raises(SatIntervalsError, match=r"dsm\.tif is not a surface model of sat-intervals dsm"):
         draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png")
 
 
@@ -337,8 +369,32 @@ def test_draw_overview__of_a_few_wide_intervals_is_not_dark(tmp_path, words):
     draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
     assert "px, square-root scale" in words
     assert {"row", "column"} < set(words)
-    dark = np.rint(255 * np.array(colormaps["magma"](2 / 21)[:3])).astype(int)
+    dark = colormaps["magma"](2 / 21, bytes=True)[:3]
     assert share_of(pixels_of(tmp_path / "overview.png"), tuple(dark)) < 0.01
+
+
+def test_draw_overview__scales_widths_to_a_percentile_beside_their_histogram(tmp_path, monkeypatch):
+    bands, validity = no_bands(100, 100)
+    bands[:3], validity[:] = np.array([0, -1, 1]).reshape(3, 1, 1), 0
+    bands[2, 60:85], bands[2, 95:] = 3, 10  # 70 % 2 px wide, 25 % 4 px, 5 % 11 px
+    drawn = []
+    stairs = Axes.stairs
+    monkeypatch.setattr(Axes, "stairs", lambda self, *a, **more: drawn.append(a) or stairs(self, *a, **more))
+    draw_overview(open_results(write_run(tmp_path, bands, validity)), tmp_path / "overview.png")
+    assert widest(bands[2] - bands[1]) == 4
+    ((shares, edges),) = drawn
+    np.testing.assert_allclose(shares, [0.001, 0.001, 0.7, 0.001, 0.25])  # 0 to 1 px, 1 to 2 px and so on
+    np.testing.assert_allclose(edges[:5], np.sqrt(np.arange(5) / 4))
+    brightest = colormaps["magma"](1.0, bytes=True)[:3]
+    assert share_of(pixels_of(tmp_path / "overview.png"), brightest) > 0.02
+
+
+def test_draw_curve__says_why_the_interval_is_wider_than_the_cut(run, tmp_path, words):
+    curve = read_curve(open_results(run), 60, 90)
+    inside = curve.disparities[curve.cut]
+    assert (curve.lower, curve.upper) != (inside.min(), inside.max())
+    draw_curve(open_results(run), tmp_path / "curve.png", 60, 90, dpi=50)
+    assert f"interval, {curve.lower} to {curve.upper} px:\ncut pushed out by refinement" in words
 
 
 def test_read_curve__is_the_curve_of_the_run(run):
@@ -423,7 +479,7 @@ def test_open_results__refuses_what_is_no_report(tmp_path):
     out = write_run(tmp_path, *random_bands(4, 5))
     for content in (b'{"\xff": 1}', b"[]", b"3", b"{"):
         (out / "run.json").write_bytes(content)
-        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: run match again"):
+        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: rerun match"):
             open_results(out)
 
 
@@ -433,11 +489,11 @@ def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
     report = json.loads((out / "run.json").read_text())
     report["tiles"]["region"]["height"] = 99999
     (out / "run.json").write_text(json.dumps(report))
-    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of 4 x 5 .* run.json 4 of 99999 x 5: run"):
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 of 99999 x 5: rerun"):
         open_results(out)
     write_run(tmp_path, bands, validity)
     write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)
-    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of 4 x 5 pixels, by run.json 4 of 4 x 5"):
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of .* run.json says 4 of 4 x 5"):
         open_results(out)
     write_run(tmp_path, bands, validity)
     (out / "validity.tif").unlink()
@@ -452,7 +508,7 @@ def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
     with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 40 x 50, the run 40 x 50"):
         open_results(out)
     write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
-    with pytest.raises(SatIntervalsError, match="41 x 50 pixels, when it was matched it had 40 x 50"):
+    with pytest.raises(SatIntervalsError, match="41 x 50 pixels, but had 40 x 50 when it was matched"):
         open_results(out)
 
 
@@ -467,10 +523,10 @@ def test_open_results__refuses_other_pixels_than_those_of_the_run(tmp_path, name
     os.utime(file, (0, 0))
     open_results(tmp_path / "out")  # the same file, copied
     write_layer(file, np.ones((40, 50), np.uint16), 0, PLACE)
-    with pytest.raises(SatIntervalsError, match=f"{name} is not the file that was matched: put that image back"):
+    with pytest.raises(SatIntervalsError, match=f"{name} has changed since it was matched: restore it"):
         open_results(tmp_path / "out")
     file.write_bytes(kept[:-1] + b"x")  # of the same size
-    with pytest.raises(SatIntervalsError, match=f"{name} is not the file that was matched: put that image back"):
+    with pytest.raises(SatIntervalsError, match=f"{name} has changed since it was matched: restore it"):
         open_results(tmp_path / "out")
 
 

@@ -131,6 +131,16 @@ def test_package_data__holds_the_parts_of_the_page():
     assert shipped == {file for file in folder.iterdir() if file.is_file() and file.suffix != ".py"}
 
 
+def test_write_report__shows_the_main_figures_without_scripts(tmp_path):
+    bands, validity, truth = random_bands(60, 80)
+    path, page = reported(tmp_path, bands, validity, truth)
+    static = re.search(r"<noscript>\n(.*)</noscript>", path.read_text(encoding="utf-8"), re.DOTALL)[1]
+    assert f"<td>{100 * page['evaluation']['all']['accuracy']:.1f} % of the valid pixels with a truth</td>" in static
+    shares = re.findall(r"<td>(\d+\.\d) % of the pixels</td>", static)
+    assert sum(map(float, shares)) == pytest.approx(100, abs=0.4)
+    assert page["histograms"]["classes"] == np.bincount(classify(validity).ravel()).tolist()
+
+
 # ---- In a browser ------------------------------------------------------------------------------------------
 class Page:
     """A report, opened from the disk."""
@@ -172,7 +182,7 @@ def page(browser, tmp_path):
 def test_page__tells_what_the_run_tells(page):
     assert page.browser.title == "left.tif: disparity intervals"
     assert "60 rows by 80 columns, disparities \u221220 to 10 px" in page.text("#about")
-    assert "intervals that hold the truth" in page.text("#headline")
+    assert "intervals that contain the truth" in page.text("#headline")
     for selector, words in (
         ("#validity", "rejected by cross-checking: occlusion"),
         ("#tiles", "6 tiles of 27 x 27 pixels"),
@@ -183,6 +193,25 @@ def test_page__tells_what_the_run_tells(page):
     ):
         assert words in page.text(selector)
     assert page.browser.execute_script("return document.querySelectorAll('svg[role=img][aria-label]').length") == 4
+
+
+def test_page__says_loading_until_it_is_ready_and_leaves_out_settings_without_a_value(page):
+    assert not page.browser.find_elements(By.CSS_SELECTOR, "#loading")
+    assert "walltime" not in page.text("#run")
+    assert "none" not in page.text("#run").split()
+
+
+def test_page__without_scripts_shows_a_table(browser, tmp_path):
+    path, _ = reported(tmp_path, *random_bands(60, 80))
+    browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    try:
+        browser.get(path.as_uri())
+        text = browser.find_element(By.TAG_NAME, "body").text
+    finally:
+        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+    assert "need JavaScript" in text
+    assert "median interval width" in text
+    assert "Loading" not in text
 
 
 def test_page__click_on_the_map_shows_that_row(page):

@@ -100,7 +100,7 @@ def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
     with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
         wait_for_tiles(first, store, 3)
         with halted(first):
-            assert "a run is at work" in status_of(out, store)
+            assert "a run is active" in status_of(out, store)
     done = records(store)
     assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out, store)
     with started(pair, out, store, "--keep-tiles") as again:
@@ -124,7 +124,7 @@ def test_match__shares_a_bucket_with_the_same_run_and_ends_when_that_removes_the
                 worker.resume()
             status, output = ended(first)
     assert status == 1
-    assert re.search(rf"^sat-intervals: the tiles in {store}/\w{{32}} are gone, .*: run the same command", output, re.M)
+    assert re.search(rf"^sat-intervals: the tiles in {store}/\w{{32}} are gone: .*: rerun the same", output, re.M)
     assert [path.name for path in out.iterdir()] == ["tiles"]
     assert objects(store) == {}
 
@@ -139,7 +139,8 @@ def test_match__never_forgets_where_tiles_lie(bucket, pair, tmp_path):
         status, output = ended(run)
     assert status == 2
     assert re.search(
-        rf"said to lie in {first}/(\w+), not in {second}: if that is your store, give --store {first}", output
+        rf"places the tiles of the run in {first}/(\w+), not in {second}: if that is your store, give --store {first}",
+        output,
     )
     with started(pair, out, second, "--overwrite") as run:
         wait_until(lambda: list(second.glob("*/records/[0-9]*")) or run.poll() is not None, "tiles")

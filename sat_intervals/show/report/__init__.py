@@ -1,4 +1,4 @@
-"""One page that shows a finished run to people: ``report.html``, for any browser, without a network."""
+"""Write ``report.html``, a self-contained page of a finished run for any browser."""
 
 from sat_intervals.show.report.page import write_report
 

@@ -1,4 +1,4 @@
-"""What the page shows of the pixels: counts of all of them, and some rows and columns themselves."""
+"""Gather the pixels of the page: histograms over all of them, and every n-th row and column."""
 
 import base64
 import gzip
@@ -11,25 +11,28 @@ from sat_intervals.products import Bands
 from sat_intervals.results import Results
 from sat_intervals.show.legend import FIRST_INVALID, PIXEL_CLASSES, classify
 
-_PIXELS = 500_000  # on the page, at 5 to 8 bytes each once compressed and written as text
+_PIXELS = 500_000  # on the page, 5 to 8 bytes each when compressed and encoded
 _WIDTH_BARS, _CONFIDENCE_BARS = 60, 25
-_STEPS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # pixels of disparity that a bar of widths may stand for
+_STEPS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # bar widths of the histogram of interval widths, px
 _FINEST = 1 / 64  # pixels of disparity
 
 
 class Counts:
-    """Histograms of interval width and of confidence over all pixels, gathered strip by strip."""
+    """Histograms of interval width, confidence and pixel class over all pixels, gathered strip by strip."""
 
     def __init__(self, count: int) -> None:
-        """``count``: number of disparities searched."""
+        """Start with empty histograms; ``count`` is the number of disparities searched."""
         self._step = next(step for step in _STEPS if count / step <= _WIDTH_BARS or step == _STEPS[-1])
         bars = math.ceil(count / self._step)
         self._widths = {name: np.zeros(bars, np.int64) for name in ("high", "low")}
         self._confidences = {name: np.zeros(_CONFIDENCE_BARS, np.int64) for name in ("valid", "rejected")}
+        self._classes = np.zeros(len(PIXEL_CLASSES), np.int64)
 
     def add(self, bands: Bands, low: np.ndarray) -> None:
-        """Count the pixels of some rows; ``low`` are those of low confidence."""
-        valid = classify(bands.validity) < FIRST_INVALID
+        """Count the pixels of some rows; ``low`` is the mask of low confidence."""
+        classes = classify(bands.validity)
+        self._classes += np.bincount(classes.ravel(), minlength=self._classes.size)
+        valid = classes < FIRST_INVALID
         width = bands.upper - bands.lower
         measured = valid & np.isfinite(width)
         for name, chosen in (("high", measured & ~low), ("low", measured & low)):
@@ -39,12 +42,13 @@ class Counts:
             _count(bands.confidence[chosen] * _CONFIDENCE_BARS, self._confidences[name])
 
     def report(self) -> dict[str, Any]:
-        """Counts in bars of ``step``, the first of which begins at 0; the last has whatever lies beyond, too."""
+        """Return counts per pixel class and per bar of ``step``; the last bar includes all values beyond."""
         widths = {name: bars.tolist() for name, bars in self._widths.items()}
         confidences = {name: bars.tolist() for name, bars in self._confidences.items()}
         return {
             "width": {"step": self._step, "bars": widths},
             "confidence": {"step": 1 / _CONFIDENCE_BARS, "bars": confidences},
+            "classes": self._classes.tolist(),
         }
 
 
@@ -53,7 +57,7 @@ def _count(places: np.ndarray, bars: np.ndarray) -> None:
 
 
 class Pixels:
-    """Every n-th row and column of a run, as the page draws them."""
+    """Every n-th row and column of a run, encoded for the page."""
 
     def __init__(self, results: Results) -> None:
         height, width = results.shape
@@ -62,12 +66,12 @@ class Pixels:
         self._strips: list[list[np.ndarray]] = []
 
     def add(self, row: int, bands: Bands, low: np.ndarray) -> None:
-        """Keep some pixels of the rows from ``row`` on; ``low`` are those of low confidence."""
+        """Keep every n-th of the rows from ``row`` on; ``low`` is the mask of low confidence."""
         chosen = np.s_[-row % self._step :: self._step, :: self._step]
         self._strips.append([band[chosen].copy() for band in (*bands, low)])
 
     def report(self) -> dict[str, Any]:
-        """Layers of codes: the value of a code is ``first + code * step``, and the largest code stands for none."""
+        """Return layers of codes: a code means ``first + code * step``, the largest one a missing value."""
         *layers, low = (np.concatenate(strips) for strips in zip(*self._strips, strict=True))
         bands = Bands(*layers)
         kind = classify(bands.validity)
@@ -76,7 +80,7 @@ class Pixels:
         disparities = {name: np.where(valid, getattr(bands, name), np.nan) for name in ("disparity", "lower", "upper")}
         if np.isfinite(bands.truth).any():
             disparities["truth"] = bands.truth
-        # Room for a truth outside the search range, by as much again on either side.
+        # Leave room for a truth outside the search range: its extent once more on either side.
         first = self._search.minimum - self._search.count
         step = max(_FINEST, 3 * self._search.count / 65534)
         black, white = _ends(bands.image)
@@ -97,7 +101,7 @@ class Pixels:
 
 
 def _ends(image: np.ndarray) -> tuple[float, float]:
-    """Grey values that become black and white: all but the outermost hundredths lie between them."""
+    """Return the grey values drawn as black and white, percentiles 1 and 99."""
     known = image[np.isfinite(image)]
     if known.size == 0:
         return 0.0, 1.0

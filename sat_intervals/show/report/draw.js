@@ -1,15 +1,15 @@
 "use strict";
-// What the other scripts share: elements, numbers in words, axes and bar charts.
+// Shared by the other scripts: elements, number formats, axes, legends and tables.
 
 const contents = JSON.parse(document.getElementById("contents").textContent);
 const find = (id) => document.getElementById(id);
 
-/** An element with attributes and children (elements or text). */
+/** Make an HTML element with attributes and children (elements or text). */
 function element(name, attributes = {}, ...children) {
   return filled(document.createElement(name), attributes, children);
 }
 
-/** The same, of an SVG drawing. */
+/** Make an SVG element. */
 function svg(name, attributes = {}, ...children) {
   return filled(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
 }
@@ -24,14 +24,14 @@ const grouped = (value) => value.toLocaleString("en-US");
 const fixed = (value, digits) => (Number.isFinite(value) ? value.toFixed(digits).replace("-", "\u2212") : "none");
 const short = (value) => String(Number(value.toPrecision(6))).replace("-", "\u2212");
 
-/** A share of 1 as a percentage, with more digits where it is small; "none" of nothing. */
+/** Format a share (0 to 1) as a percentage, small ones with more digits; "none" if it is missing. */
 function percent(share) {
   if (share === null || !Number.isFinite(share)) return "none";
   const value = 100 * share;
   return `${value === 0 || value >= 0.1 ? value.toFixed(1) : value.toPrecision(2)} %`;
 }
 
-/** Round numbers between two values, about so many. */
+/** Return about `count` round numbers between two values. */
 function ticks(first, last, count) {
   const raw = (last - first) / count || 1;
   const power = 10 ** Math.floor(Math.log10(raw));
@@ -41,7 +41,7 @@ function ticks(first, last, count) {
   return found;
 }
 
-/** A drawing of the width of its place, redrawn when that changes: `draw(width)` gives the children. */
+/** Add a drawing as wide as its parent, redrawn when that changes; `draw(width)` returns its children. */
 function drawing(place, height, label, draw) {
   const picture = svg("svg", { role: "img", "aria-label": label, height });
   place.append(picture);
@@ -54,7 +54,7 @@ function drawing(place, height, label, draw) {
   return redraw;
 }
 
-/** Scales and axes of a chart: functions from values to places, and the elements to draw first. */
+/** Return the scales of a chart (functions from values to positions) and the elements of its axes. */
 function chart(width, height, across, up, names) {
   const box = { left: 58, right: width - 8, top: 8, bottom: height - 38 };
   const x = (value) => box.left + ((value - across[0]) / (across[1] - across[0])) * (box.right - box.left);
@@ -77,7 +77,7 @@ function chart(width, height, across, up, names) {
   return { x, y, box, parts };
 }
 
-/** Entries of a legend: `[text, colour, whether a line]`. */
+/** Make the entries of a legend from `[text, colour, whether a line]`. */
 function legend(entries) {
   return entries.map(([text, colour, line]) => {
     const style = line ? `border-color: ${colour}` : `background: ${colour}`;
@@ -85,7 +85,7 @@ function legend(entries) {
   });
 }
 
-/** A table; cells are text, numbers to the right, or elements. */
+/** Make a table; cells are text, numbers (aligned right) or elements. */
 function table(head, rows) {
   const cell = (value, kind) => {
     const number = typeof value === "number";

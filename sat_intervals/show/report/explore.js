@@ -1,4 +1,4 @@
-// The map, its layers, and the profile of the row chosen on it.
+// The map, its layers, and the profile of the selected row.
 
 const pixels = contents.pixels;
 const search = contents.run.settings.disparity;
@@ -8,14 +8,15 @@ const COLOURS = {
   magma: ["#000004", "#1d1147", "#51127c", "#832681", "#b73779", "#e75263", "#fc8961", "#fec488", "#fcfdbf"],
   cividis: ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#e1cc55", "#fee838"],
 };
-const STRETCHED = 5; // ratio of sides beyond which the map's pixels are no longer square
+const STRETCHED = 5; // largest ratio of the sides of the map; pixels of longer ones are not square
 const NOTHING = "#dedede";
 const MISSES = [["truth above the interval", "#d55e00"], ["truth below the interval", "#56b4e9"]];
 const hasIntervals = contents.run.settings.interval !== null;
-const data = {}; // values of every layer, row by row
-const chosen = { row: 0, column: 0 };
+const WIDEST = 0.9; // quantile of the widths at the end of their scale
+const data = {}; // values of each layer, row by row
+const selected = { row: 0, column: 0 };
 
-/** A layer's values, NaN for none. */
+/** Decode a layer; NaN means a missing value. */
 async function unpacked({ first, step, bits, codes }) {
   const packed = Uint8Array.from(atob(codes), (letter) => letter.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
@@ -26,7 +27,7 @@ async function unpacked({ first, step, bits, codes }) {
 
 const rgb = (colour) => [1, 3, 5].map((start) => parseInt(colour.slice(start, start + 2), 16));
 
-/** From a place on a scale of colours, 0 to 1, to red, green and blue. */
+/** Return a function from a position on a colour scale (0 to 1) to red, green and blue. */
 function scaleOf(stops) {
   const ends = stops.map(rgb);
   const shades = Array.from({ length: 256 }, (_, step) => {
@@ -38,15 +39,20 @@ function scaleOf(stops) {
   return (place) => (Number.isFinite(place) ? shades[Math.round(255 * Math.min(Math.max(place, 0), 1))] : nothing);
 }
 
-/** All but the outermost hundredths of the values. */
-function limits(values, otherwise) {
+/** Return quantiles of the finite values; undefined if there are none. */
+function quantiles(values, ...shares) {
   const known = values.filter(Number.isFinite).sort();
-  if (!known.length) return otherwise;
-  const [low, high] = [0.01, 0.99].map((share) => known[Math.round(share * (known.length - 1))]);
+  return shares.map((share) => known[Math.round(share * (known.length - 1))]);
+}
+
+/** Return percentiles 1 and 99 of the values. */
+function limits(values, otherwise) {
+  const [low, high] = quantiles(values, 0.01, 0.99);
+  if (low === undefined) return otherwise;
   return low < high ? [low, high] : [low - 0.5, high + 0.5];
 }
 
-/** What the map can show: a name, values, and the scale or the kinds that give them colours. */
+/** Return the layers of the map: name, values, and colour scale or classes with colours. */
 function makeLayers() {
   const { first, step } = pixels.layers.image;
   const width = data.upper.map((upper, i) => upper - data.lower[i]);
@@ -55,17 +61,17 @@ function makeLayers() {
     { name: "Disparity", unit: "px", values: data.disparity, colours: COLOURS.viridis,
       shown: limits(data.disparity, [search.minimum, search.maximum]) },
     { name: "Confidence", values: data.confidence, colours: COLOURS.cividis, shown: [0, 1] },
-    { name: "Validity", values: data.kind, kinds: pixels.kinds.map((kind) => [kind.meaning, kind.colour]) },
+    { name: "Validity", values: data.kind, kinds: pixels.kinds.map((kind) => [kind.meaning, kind.colour]), counts: contents.histograms.classes },
   ];
   if (hasIntervals) {
-    const shown = [0, limits(width, [0, 1])[1]];
+    const shown = [0, quantiles(width, WIDEST)[0] || 1];
     layers.splice(2, 0, { name: "Interval width", unit: "px, square-root scale", values: width, colours: COLOURS.magma, shown, power: 0.5 });
   }
   if (data.truth && hasIntervals) layers.push({ name: "Misses", values: data.missed, kinds: [null, ...MISSES] });
   return layers;
 }
 
-/** The colour of every pixel of a layer: a function of its value and its place. */
+/** Return the colour of a pixel of a layer as a function of its value and its index. */
 function painter(layer) {
   if (!layer.kinds) {
     const scale = scaleOf(layer.colours);
@@ -73,7 +79,7 @@ function painter(layer) {
     return (value) => scale(place(value) ** (layer.power ?? 1));
   }
   const kinds = layer.kinds.map((kind) => kind && rgb(kind[1]));
-  const pale = scaleOf(["#333333", "#bbbbbb"]); // the left image, where there is no kind
+  const pale = scaleOf(["#333333", "#bbbbbb"]); // the left image where a pixel has no class
   const { first, step } = pixels.layers.image;
   return (value, i) => kinds[value] ?? pale((data.image[i] - first) / (254 * step));
 }
@@ -88,12 +94,13 @@ function paint(layer) {
   find("key").replaceChildren(...keyOf(layer));
 }
 
-/** What the colours of a layer mean: kinds with the shares of the pixels shown, or the ends of the scale. */
+/** Return the key of a layer: its classes with their shares of all pixels (or of those shown), or its colour scale. */
 function keyOf(layer) {
   const title = element("h3", {}, layer.unit ? `${layer.name} (${layer.unit})` : layer.name);
   if (layer.kinds) {
-    const counts = layer.kinds.map((_, kind) => layer.values.reduce((sum, value) => sum + (value === kind), 0));
-    const entries = layer.kinds.map((kind, i) => kind && [`${kind[0]} (${percent(counts[i] / layer.values.length)})`, kind[1]]);
+    const counts = layer.counts ?? layer.kinds.map((_, kind) => layer.values.reduce((sum, value) => sum + (value === kind), 0));
+    const total = counts.reduce((sum, count) => sum + count, 0);
+    const entries = layer.kinds.map((kind, i) => kind && [`${kind[0]} (${percent(counts[i] / total)})`, kind[1]]);
     return [title, element("div", { class: "legend" }, ...legend(entries.filter((entry, i) => entry && counts[i])))];
   }
   if (!layer.values.some(Number.isFinite)) return [title, element("p", { class: "quiet" }, "No pixel has a value.")];
@@ -110,10 +117,10 @@ function keyOf(layer) {
   ];
 }
 
-/** The chosen row of a layer. */
-const rowOf = (layer) => layer.subarray(chosen.row * pixels.columns, (chosen.row + 1) * pixels.columns);
+/** Return the selected row of a layer. */
+const rowOf = (layer) => layer.subarray(selected.row * pixels.columns, (selected.row + 1) * pixels.columns);
 
-/** Runs of neighbouring values, `[first, behind the last]`, for which a test holds. */
+/** Return runs `[first, end)` of consecutive values that pass a test. */
 function runs(values, test) {
   const found = [];
   values.forEach((value, column) => {
@@ -124,7 +131,7 @@ function runs(values, test) {
   return found;
 }
 
-/** A path along known values, a step a pixel; with other values that run back along them, the area between. */
+/** Return the SVG path of the finite values, one step per pixel; with `back`, the area between both. */
 function steps(values, back, edge, y) {
   const path = (line, first, last) =>
     Array.from(line.subarray(first, last), (value, i) => [first + i, first + i + 1].map((side) => `${edge(side)},${y(value).toFixed(1)}`)).flat();
@@ -144,7 +151,7 @@ function drawProfile(width) {
   const sections = runs(low, (value) => value === 1).map(([first, last]) =>
     svg("rect", { x: edge(first), y: box.top, width: edge(last) - edge(first), height: box.bottom - box.top, fill: "var(--low)" }));
   const line = (values, colour) => svg("path", { d: steps(values, null, edge, y), fill: "none", stroke: colour, "stroke-width": 1.4 });
-  const mark = x(chosen.column * pixels.step);
+  const mark = x(selected.column * pixels.step);
   const none = svg("text", { x: width / 2, y: 24, "text-anchor": "middle" }, "no valid pixel in this row");
   return [
     ...sections,
@@ -157,10 +164,10 @@ function drawProfile(width) {
   ];
 }
 
-/** The chosen pixel in words. */
+/** Describe the selected pixel in words. */
 function describe() {
-  const i = chosen.row * pixels.columns + chosen.column;
-  const parts = [`Row ${chosen.row * pixels.step}, column ${chosen.column * pixels.step}: ${pixels.kinds[data.kind[i]].meaning}`];
+  const i = selected.row * pixels.columns + selected.column;
+  const parts = [`Row ${selected.row * pixels.step}, column ${selected.column * pixels.step}: ${pixels.kinds[data.kind[i]].meaning}`];
   if (Number.isFinite(data.disparity[i])) parts.push(`disparity ${fixed(data.disparity[i], 2)} px`);
   if (Number.isFinite(data.lower[i])) parts.push(`interval ${fixed(data.lower[i], 1)} to ${fixed(data.upper[i], 1)} px`);
   if (Number.isFinite(data.confidence[i])) parts.push(`confidence ${fixed(data.confidence[i], 2)}`);
@@ -168,24 +175,24 @@ function describe() {
   return parts.join(", ");
 }
 
-/** Show another pixel: its row's profile, its figures, its place on the map. */
+/** Select a pixel: show the profile of its row, its values, its position on the map. */
 function choose(row, column, redraw) {
-  chosen.row = Math.min(Math.max(row, 0), pixels.rows - 1);
-  chosen.column = Math.min(Math.max(column, 0), pixels.columns - 1);
-  const place = { row: chosen.row * pixels.step, column: chosen.column * pixels.step };
+  selected.row = Math.min(Math.max(row, 0), pixels.rows - 1);
+  selected.column = Math.min(Math.max(column, 0), pixels.columns - 1);
+  const place = { row: selected.row * pixels.step, column: selected.column * pixels.step };
   for (const name of ["row", "column"]) {
-    find(name).value = chosen[name];
+    find(name).value = selected[name];
     find(name).setAttribute("aria-valuetext", place[name]);
     find(`${name}-number`).textContent = place[name];
   }
-  find("row-mark").style.top = `${(100 * (chosen.row + 0.5)) / pixels.rows}%`;
-  find("column-mark").style.left = `${(100 * (chosen.column + 0.5)) / pixels.columns}%`;
+  find("row-mark").style.top = `${(100 * (selected.row + 0.5)) / pixels.rows}%`;
+  find("column-mark").style.left = `${(100 * (selected.column + 0.5)) / pixels.columns}%`;
   find("pixel").textContent = describe();
   find("command").textContent = `sat-intervals plot ${contents.folder} --row ${place.row} --pixel ${place.row} ${place.column}`;
   redraw();
 }
 
-/** The map, of the shape of the images unless they are thin, and its buttons. */
+/** Set up the map, shaped like the images unless they are thin, and its buttons. */
 function showMap() {
   const map = find("map");
   Object.assign(map.firstElementChild, { width: pixels.columns, height: pixels.rows });
@@ -195,7 +202,7 @@ function showMap() {
   if (tall > 1.6) map.style.width = `${160 / tall}%`;
   find("thinned").textContent =
     (pixels.step > 1 ? `This page holds one row in ${pixels.step} and one column in ${pixels.step}. ` : "") +
-    "Click on the map or move the sliders to see another row.";
+    "Click on the map or move the sliders to select another row.";
   const layers = makeLayers();
   for (const layer of layers) {
     const input = element("input", { type: "radio", name: "layer", ...(layer === layers[0] && { checked: "" }) });
@@ -205,14 +212,14 @@ function showMap() {
   paint(layers[0]);
 }
 
-/** The profile, and what chooses its row: the sliders and the map. */
+/** Set up the profile, and the sliders and clicks that select its row. */
 function showProfile() {
   const entries = [["disparity", "var(--ink)", true], ["low confidence", "var(--low)"]];
   if (hasIntervals) entries.unshift(["interval", "var(--band)"]);
   if (data.truth) entries.push(["truth", "var(--truth)", true]);
-  const gaps = element("span", { class: "quiet" }, `where there is no ${hasIntervals ? "band" : "black line"}, no pixel is valid`);
+  const gaps = element("span", { class: "quiet" }, `no ${hasIntervals ? "band" : "black line"}: no valid pixel`);
   find("profile-key").append(...legend(entries), gaps);
-  const redraw = drawing(find("profile"), 320, "Interval, disparity and truth along the chosen row", drawProfile);
+  const redraw = drawing(find("profile"), 320, "Interval, disparity and truth along the selected row", drawProfile);
   Object.assign(find("row"), { max: pixels.rows - 1 });
   Object.assign(find("column"), { max: pixels.columns - 1 });
   for (const name of ["row", "column"]) {
@@ -232,5 +239,6 @@ async function explore() {
   names.forEach((name, place) => (data[name] = layers[place]));
   showMap();
   showProfile();
+  find("loading").remove();
   document.documentElement.dataset.ready = "";
 }

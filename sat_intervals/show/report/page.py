@@ -1,7 +1,9 @@
-"""The page itself: a template of the package, with its style, its script and its contents put into it."""
+"""Fill the template of the page with style, script and contents."""
 
 import json
+import re
 import shlex
+from html import escape
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -10,11 +12,12 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import whole_file
 from sat_intervals.results import Results
+from sat_intervals.show.legend import PIXEL_CLASSES
 from sat_intervals.show.report.contents import Counts, Pixels
 
 
 def write_report(results: Results) -> Path:
-    """Write ``report.html`` into the folder of a run; memory follows a strip of rows, whatever the size of the images.
+    """Write ``report.html`` into the folder of a run; holds one strip of rows in memory.
 
     Returns
     -------
@@ -23,16 +26,17 @@ def write_report(results: Results) -> Path:
     Raises
     ------
     SatIntervalsError
-        Rows that cannot be read, or a file that cannot be written.
+        The run cannot be read or the file cannot be written.
     """
     path = results.out / "report.html"
     results.check_kept([path], [results.truth.image.path if results.truth else None])
-    # Inside a script element a "<" of the contents could be taken for its end.
-    contents = json.dumps(_contents(results), separators=(",", ":")).replace("<", "\\u003c")
+    contents = _contents(results)
+    # A "<" in the contents could end the script element.
+    data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
     page = _asset("report.html")
     script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
-    for name, text in (("style", _asset("report.css")), ("script", script), ("contents", contents)):
-        page = page.replace(f"/* {name} */", text)
+    parts = {"summary": _summary(contents), "style": _asset("report.css"), "script": script, "contents": data}
+    page = re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], page)
     try:
         with whole_file(path) as new:
             new.write_text(page, encoding="utf-8")
@@ -46,7 +50,7 @@ def _asset(name: str) -> str:
 
 
 def _contents(results: Results) -> dict[str, Any]:
-    """All that the script of the page shows."""
+    """Return all data of the page."""
     counts, pixels = Counts(results.config.disparity.count), Pixels(results)
     for row, bands in results.strips():
         low = results.low(bands)
@@ -62,3 +66,22 @@ def _contents(results: Results) -> dict[str, Any]:
         "truth": truth,
         "evaluation": evaluate_run(results.out, truth) if truth and results.config.interval else None,
     }
+
+
+def _summary(contents: dict[str, Any]) -> str:
+    """Return the main figures of a run as rows of an HTML table, for browsers without scripts."""
+    run, counts = contents["run"], contents["run"]["counts"]
+    region, search, width = run["tiles"]["region"], run["settings"]["disparity"], counts["median_interval_width"]
+    rows = {
+        "left image": run["inputs"]["left"]["path"],
+        "size": f"{region['height']} x {region['width']} pixels",
+        "search range": f"{search['minimum']} to {search['maximum']} px",
+        "median interval width": "none" if width is None else f"{width} px",
+    }
+    for kind, count in zip(PIXEL_CLASSES, contents["histograms"]["classes"], strict=True):
+        if count:
+            rows[kind.meaning] = f"{100 * count / counts['pixels']:.1f} % of the pixels"
+    accuracy = contents["evaluation"] and contents["evaluation"]["all"]["accuracy"]
+    if accuracy is not None:
+        rows["intervals that contain the truth"] = f"{100 * accuracy:.1f} % of the valid pixels with a truth"
+    return "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows.items())

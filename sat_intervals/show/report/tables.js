@@ -1,4 +1,4 @@
-// Headline, histograms, evaluation, validity, tiles, and what the run says of itself.
+// Headline, histograms, evaluation, validity, tiles, and the report of the run.
 
 const run = contents.run;
 
@@ -12,17 +12,17 @@ function showHeadline() {
   const figures = [
     ["valid pixels", percent(valid / all)],
     ["median interval width", median === null ? "none" : `${median} px`],
-    ["low confidence, of valid", percent(low / valid)],
+    ["low confidence, of valid pixels", percent(low / valid)],
     ["time", `${fixed(run.seconds.total, 1)} s`],
   ];
   const judged = contents.evaluation?.all;
-  if (judged?.count) figures.unshift(["intervals that hold the truth", percent(judged.accuracy)]);
+  if (judged?.count) figures.unshift(["intervals that contain the truth", percent(judged.accuracy)]);
   find("headline").append(
     ...figures.map(([name, value]) => element("div", {}, element("dt", {}, name), element("dd", {}, value))),
   );
 }
 
-/** A histogram of two kinds of pixels as outlines over a logarithmic axis, and its numbers. */
+/** Draw histograms of two classes of pixels on a logarithmic axis, with a table of their counts. */
 function showHistogram(place, { step, bars }, kinds, names) {
   const total = kinds.reduce((sum, [name]) => sum + bars[name].reduce((all, count) => all + count, 0), 0);
   const floor = 1e-4;
@@ -53,10 +53,10 @@ function showHistogram(place, { step, bars }, kinds, names) {
 function showHistograms() {
   const { width, confidence } = contents.histograms;
   showHistogram(find("widths"), width, [["high", "high confidence", "var(--band)"], ["low", "low confidence", "var(--truth)"]], {
-    title: "Interval width of all valid pixels", across: "width (px)",
+    title: "Interval width of valid pixels", across: "width (px)",
   });
   showHistogram(find("confidences"), confidence, [["valid", "valid", "var(--band)"], ["rejected", "not valid", "var(--truth)"]], {
-    title: "Confidence of all pixels that were searched", across: "confidence",
+    title: "Confidence of searched pixels", across: "confidence",
   });
 }
 
@@ -69,22 +69,22 @@ function showEvaluation() {
     figures.mean_width === null ? "none" : `${fixed(figures.mean_width, 2)} px`, size(figures.relative_overestimation ?? null),
   ];
   const rows = [row("all", judged.all), row("high confidence", judged.high), row("low confidence", judged.low)];
-  const head = ["valid pixels", "count", "accuracy: hold the truth", "relative size", "mean width", "relative overestimation"];
+  const head = ["valid pixels", "count", "accuracy: contain the truth", "relative size", "mean width", "relative overestimation"];
   find("evaluation").hidden = false;
   find("evaluation").append(
-    element("p", {}, "Truth: ", element("code", {}, contents.truth), ". Disparities wrong by more than 1 px: ",
-      `${percent(judged.bad1)}, by more than 3 px: ${percent(judged.bad3)}; truths outside the search range: ${percent(judged.truth_outside_range)}.`),
+    element("p", {}, "Truth: ", element("code", {}, contents.truth), ". Disparity errors above 1 px: ",
+      `${percent(judged.bad1)}, above 3 px: ${percent(judged.bad3)}; truths outside the search range: ${percent(judged.truth_outside_range)}.`),
     table(head, rows),
-    element("p", { class: "quiet" }, "Relative size is the median width over the width of the search range. The level alpha is one of possibility, not a probability that is promised."),
+    element("p", { class: "quiet" }, "Relative size is the median width over the width of the search range. The level alpha is a possibility, not a guaranteed probability."),
   );
   if (judged.deciles.length) showDeciles(judged.deciles);
 }
 
-/** How often intervals hold the truth, from the tenth of the pixels of least confidence up. */
+/** Show how often intervals contain the truth, by decile of confidence, lowest first. */
 function showDeciles(deciles) {
   const text = (group) => group.confidence.map((value) => fixed(value, 2)).join(" to ");
   find("evaluation").append(
-    element("h3", {}, "By confidence, in tenths of the pixels"),
+    element("h3", {}, "By decile of confidence"),
     table(["confidence", "count", "accuracy", "mean width"], deciles.map((group) => [
       text(group), group.count, shareCell(group.accuracy, 120), `${fixed(group.mean_width, 2)} px`,
     ])),
@@ -96,13 +96,14 @@ function shareCell(share, longest) {
 }
 
 function showValidity() {
-  const rows = Object.entries(run.validity_bits).map(([name, flag]) => {
-    const count = run.counts.flags[name];
-    return [String(flag.bit), name.replaceAll("_", " "), flag.meaning, flag.invalid ? "yes" : "", count, shareCell(count / run.counts.pixels, 120)];
-  });
+  const { pixels: all, valid, flags, causes } = run.counts;
+  const rows = Object.entries(run.validity_bits).map(([name, flag]) => [
+    String(flag.bit), name.replaceAll("_", " "), flag.meaning, flags[name], flag.invalid ? shareCell(causes[name] / all, 120) : "",
+  ]);
   find("validity").append(
-    element("p", {}, `${percent(run.counts.valid / run.counts.pixels)} of ${grouped(run.counts.pixels)} pixels are valid. A pixel may have several flags.`),
-    table(["bit", "flag", "meaning", "pixel invalid", "pixels", "share"], rows),
+    element("p", {}, `${percent(valid / all)} of ${grouped(all)} pixels are valid. A pixel may have several flags; the first ` +
+      "that makes it invalid is its cause. Valid pixels and causes add up to 100 %."),
+    table(["bit", "flag", "meaning", "pixels with the flag", "cause, of all pixels"], rows),
   );
 }
 
@@ -111,29 +112,29 @@ function showTiles() {
   const seams = run.overlap_left;
   const place = find("tiles");
   if (rows * columns === 1) {
-    place.append(element("p", {}, `One tile of at most ${size} x ${size} pixels: there are no seams.`));
+    place.append(element("p", {}, `One tile of at most ${size} x ${size} pixels: no seams.`));
     return;
   }
   place.append(element("p", {},
-    `${grouped(rows * columns)} tiles of ${size} x ${size} pixels, read with ${overlap} px around them. Neighbours match the ` +
-    `pixels along their ${grouped(seams.borders)} common borders twice: of ${grouped(seams.pixels)}, ${percent(seams.winner_share)} ` +
-    `have another disparity and ${percent(seams.bounds_share)} another bound, before filters. More overlap leaves less.`));
+    `${grouped(rows * columns)} tiles of ${size} x ${size} pixels, read with an overlap of ${overlap} px. Adjacent tiles both match ` +
+    `the pixels along their ${grouped(seams.borders)} common borders. Of these ${grouped(seams.pixels)} pixels, before filters, ` +
+    `${percent(seams.winner_share)} differ in disparity and ${percent(seams.bounds_share)} in a bound. A larger overlap reduces this.`));
   const differs = seams.winner_share > 0 || seams.bounds_share > 0;
   const figure = element("figure", { style: "max-width: 420px" });
   place.append(figure);
   drawing(figure, tilesHeight(420), "Grid of tiles", (width) => drawTiles(width, differs ? seams.worst.between : null));
   if (!differs) return;
-  const worst = `the border where most differs: ${percent(seams.worst.winner_share)} of the disparities, ` +
+  const worst = `the border with most differences: ${percent(seams.worst.winner_share)} of the disparities, ` +
     `${percent(seams.worst.bounds_share)} of the bounds of ${grouped(seams.worst.pixels)} pixels`;
   place.append(
     element("p", { class: "legend" }, ...legend([[worst, "var(--truth)", true]])),
-    element("p", { class: "quiet" }, "A run keeps the sums and this border, not the figures of every border."),
+    element("p", { class: "quiet" }, "A run keeps the totals and this border only."),
   );
 }
 
 const tilesHeight = (width) => Math.min(420, Math.max(60, Math.round((width * run.tiles.region.height) / run.tiles.region.width)));
 
-/** The borders of the tiles; the one between two tiles, named row_column, in colour. */
+/** Draw the borders of the tiles; `worst` names two tiles (row_column) whose common border is coloured. */
 function drawTiles(wide, worst) {
   const { rows, columns, size, region: { height, width } } = run.tiles;
   const tall = tilesHeight(420);
@@ -153,23 +154,24 @@ function drawTiles(wide, worst) {
 
 function showRun() {
   const place = find("run");
-  const words = (value) => (value === null ? "none" : typeof value === "object" ? JSON.stringify(value) : String(value));
+  const words = (value) => (typeof value === "object" ? JSON.stringify(value) : String(value));
+  const given = (values) => Object.entries(values).filter(([, value]) => value !== null && value.length !== 0);
   const section = ([name, values]) => (values === null || typeof values !== "object"
     ? [[name, values ?? "off", ""]]
-    : Object.entries(values).map(([key, value], i) => [i ? "" : name, key, words(value)]));
+    : given(values).map(([key, value], i) => [i ? "" : name, key, words(value)]));
   const seconds = Object.entries(run.seconds).map(([stage, value]) => [
     stage.includes(".") ? `${stage.replace(".", ", ")} (sum over workers)` : stage, `${fixed(value, 2)} s`,
   ]);
   const inputs = Object.entries(run.inputs).flatMap(([side, input]) =>
-    Object.entries(input).map(([key, value], i) => [i ? "" : side, key, key === "mask" && value ? value.path : words(value)]));
+    given(input).map(([key, value], i) => [i ? "" : side, key, key === "mask" ? value.path : words(value)]));
   const columns = element("div", { class: "pair" },
     element("div", {}, element("h3", {}, "Settings"), table([], Object.entries(run.settings).flatMap(section))),
     element("div", {}, element("h3", {}, "Times"), table([], seconds), element("h3", {}, "Versions"), table([], Object.entries(run.versions))));
-  place.append(columns, element("h3", {}, "Inputs"), table([], inputs));
+  place.append(columns, element("h3", {}, "Inputs"), table([], inputs), element("p", { class: "quiet" }, "Settings without a value are left out."));
 }
 
 explore().catch((error) => {
-  find("thinned").textContent = `The map cannot be drawn: ${error.message}. Open the page in a browser of 2023 or later.`;
+  find("loading").textContent = `The map cannot be drawn: ${error.message}. Use a browser of 2023 or later.`;
   throw error;
 });
 showHeadline();
