@@ -202,6 +202,7 @@ def test_usable_memory_and_cores__are_at_most_those_of_a_cgroup(tmp_path, contro
     assert found == expected
 
 
+@pytest.mark.process
 def test_match__refuses_tiles_that_do_not_fit_in_what_a_job_may_use(tmp_path):
     write_layer(tmp_path / "image.tif", np.ones((4096, 4096), np.uint8), 0, north_up(32631, 0, 0, 0.5))
     pair = [tmp_path / "image.tif", tmp_path / "image.tif", tmp_path / "out", "--disparity", "-255", "0"]

@@ -48,6 +48,7 @@ def limited(*, address_space):
     return partial(resource.setrlimit, resource.RLIMIT_AS, (address_space, address_space))
 
 
+@pytest.mark.process
 def test_main__names_a_limit_of_the_address_space():
     result = ended("match", "a", "b", "c", "--disparity", 0, 4, preexec_fn=limited(address_space=10**9))
     assert result.stderr == (
@@ -64,6 +65,7 @@ def test_main__names_a_variable_that_numba_cannot_start_with(threads, monkeypatc
     assert f"NUMBA_NUM_THREADS is {threads!r}: set it to a number above 0, or not at all" in result.stderr
 
 
+@pytest.mark.process
 def test_main__names_a_malformed_dask_configuration(tmp_path):
     (tmp_path / "distributed.yaml").write_text("a: [1\n b: }")
     image = write(tmp_path / "image.tif", np.ones((9, 9), np.uint8))
@@ -94,6 +96,7 @@ def test_explained__a_failed_allocation_is_a_lack_of_memory(error):
     assert "not enough memory: choose a smaller --tile-size or fewer --workers" in line
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("arguments", [["config"], ["--help"], ["--version"], ["match", "--help"]])
 def test_main__ends_quietly_when_its_reader_goes(arguments):
     read, written = os.pipe()
@@ -111,6 +114,7 @@ def test_main__keeps_the_status_of_an_error_when_the_reader_of_stderr_goes():
     assert result.returncode == 2
 
 
+@pytest.mark.process
 def test_main__ends_quietly_when_the_reader_of_its_progress_goes(tmp_path):
     image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
     read, written = os.pipe()
@@ -121,6 +125,7 @@ def test_main__ends_quietly_when_the_reader_of_its_progress_goes(tmp_path):
     assert (result.returncode, result.stderr) == (141, b"")
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("argument", ["config", "--help", "--version"])
 def test_main__says_that_stdout_cannot_be_written(argument):
     with open("/dev/full", "wb") as full:

@@ -92,6 +92,7 @@ def read(path):
             return np.where(dataset.read_masks(1) > 0, dataset.read(1).astype(np.float64), np.nan)
 
 
+@pytest.mark.peer
 def test_cars_plugin__of_another_version_leaves_cars_alone(tmp_path):
     (tmp_path / "cars").mkdir()
     (tmp_path / "cars" / "__init__.py").write_text("import sat_intervals.interop.cars_plugin\n")

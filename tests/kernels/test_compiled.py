@@ -98,6 +98,7 @@ if __name__ == "__main__":
     assert {Path(place).parent for *_, place in (first, second, worker)} == {tmp_path / "sat-intervals" / FINGERPRINT}
 
 
+@pytest.mark.process
 def test_cached__functions_of_others_stay_out_of_its_folder(tmp_path):
     (tmp_path / "stranger.py").write_text(
         "from numba import njit\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"
@@ -108,6 +109,7 @@ def test_cached__functions_of_others_stay_out_of_its_folder(tmp_path):
     assert Path(path).parent == cache
 
 
+@pytest.mark.process
 def test_cached__where_none_can_be_kept_leaves_nothing_behind(tmp_path):
     used = use_a_kernel("print(*use())", NUMBA_CACHE_DIR="/proc/no-folder", TMPDIR=str(tmp_path))
     assert used == ["0", "1", "None"]
