@@ -196,7 +196,7 @@ def test_current_workers__says_once_a_minute_that_no_worker_has_come_and_ends_mi
 ):
     seconds, cores = [0.0], {}
     monkeypatch.setattr(time, "monotonic", lambda: seconds[0])
-    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs", seen=None, told=0.0)
+    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs", seen=None, warned=0.0)
     client = SimpleNamespace(cluster=system, nthreads=lambda: cores)
     for seconds[0] in range(0, 3600, 2):
         assert current_workers(client) == {}
