@@ -10,7 +10,9 @@ from sat_intervals.cli.options import path, run_options, settings_options, with_
 
 @click.command(short_help="Make a scene with exact truth, match it and compare.")
 @click.argument("out", callback=path)
-@click.option("--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True)
+@click.option(
+    "--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True, help="Size in pixels."
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the scene.")
 @settings_options
 @run_options

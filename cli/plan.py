@@ -55,13 +55,14 @@ def plan(
     made = make_plan(*images(left, right), config, window=window, memory=limit)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     one, together = _verdicts(made, limit, config.cluster.kind)
+    at_once = "1 tile" if made.workers == 1 else f"{made.workers} tiles"
     lines = {
         "tiles": f"{made.tiles} of {made.tile_size} px{smaller}, overlap {config.tiles.overlap} px",
         "extra work of the overlap": f"{100 * made.extra_work:.0f} %",
         "memory of a worker": f"{made.worker_bytes / 1e6:.0f} MB{one}",
         f"  with {made.together} tiles at once": f"{made.together_bytes / 1e6:.0f} MB{together}",
         "disk in the folder of the run": f"{made.disk_bytes / 1e9:.1f} GB at most",
-        f"expected time, {made.workers} tiles at once": f"{_duration(made.seconds)}, with cores such as this machine's",
+        f"expected time, {at_once} at once": f"{_duration(made.seconds)}, with cores such as this machine's",
     }
     if made.together == 1:
         del lines["  with 1 tiles at once"]

@@ -13,13 +13,18 @@ from sat_intervals.cli.options import store_option
 def status(out: Path, store: str | None) -> None:
     """Show how many tiles of the run in OUT are done, failed and left, during the run or after it ended.
 
-    For the folder of a batch, show this for each pair, and why pairs failed.
+    The files of a complete run are compared with their checksums. For the folder of a batch, show the progress of each
+    pair, and why pairs failed, without reading the files.
     """
     from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.results import open_run
+    from sat_intervals.run.output import is_complete
     from sat_intervals.run.status import ElsewhereError, read_report
 
     pairs = read_report(out)
     if pairs is None:
+        if is_complete(out):
+            open_run(out)  # raises if a file was damaged since
         _show(out, store)
         return
     for name, ended in pairs.items():

@@ -2,7 +2,7 @@
 
 Nothing here is shared with the kernels but the table of constants. Letters: r row, c column, k disparity
 index, d = minimum + k disparity, R = window // 2. Left pixel (r, c) at index k faces ``right[r, c + k]``:
-right arrays have ``columns + count - 1`` columns. Section numbers are those of the method.
+right arrays have ``columns + count - 1`` columns. Section numbers are those of METHOD.md.
 
 Costs are int64 ``(rows, columns, count)`` with IMPOSSIBLE_COST at impossible candidates; indices of
 disparities are int64 with -1 where there is none.
@@ -224,7 +224,7 @@ def low_confidence(confidence, threshold, kernel):
 
 
 def textureless(view, minimum, count, window):
-    """Section 4: no usable window of the pixel and of its candidates changes along a row."""
+    """Section 1: no usable window of the pixel and of its candidates changes along a row."""
     radius = window // 2
     result = np.zeros(view.left.shape, bool)
 
@@ -491,11 +491,11 @@ def match_arrays(left, right, left_state, right_state, config):
         refined[:] = False
     flags = validity(left_state, left_windows, right_windows, refined)
     lower, upper = (np.full(winner.shape, np.nan, np.float32) for _ in range(2))
-    doubtful = searched & textureless(view, minimum, config.disparity.count, config.cost.window)
+    untextured = searched & textureless(view, minimum, config.disparity.count, config.cost.window)
     if config.interval is not None:
         bounds = alpha_cut(volume, config.interval.alpha, cost_span, extend=config.refinement is not None)
         lower, upper = (np.where(searched, b + minimum, np.nan).astype(np.float32) for b in bounds)
-        lower[doubtful], upper[doubtful] = minimum, maximum
+        lower[untextured], upper[untextured] = minimum, maximum
     raw = SimpleNamespace(volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags)
 
     flags = flags.copy()
@@ -507,7 +507,7 @@ def match_arrays(left, right, left_state, right_state, config):
     confidence = np.full(winner.shape, np.nan, np.float32)
     if config.ambiguity is not None and searched.any():
         amounts = ambiguity(volume, config.ambiguity.eta_max, config.ambiguity.eta_step, cost_span)
-        amounts[doubtful] = len(etas(config.ambiguity.eta_max, config.ambiguity.eta_step)) * config.disparity.count
+        amounts[untextured] = len(etas(config.ambiguity.eta_max, config.ambiguity.eta_step)) * config.disparity.count
         confidence = normalize(amounts, searched, *percentiles_of(amounts, searched, config))
 
     if config.median is not None:

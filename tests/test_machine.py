@@ -150,7 +150,7 @@ def test_usable_memory_and_cores__are_the_least_of_all_limits(tmp_path, monkeypa
     assert machine.usable_cores() == len(os.sched_getaffinity(0))
 
 
-def told(what, prepare=None, root="/"):
+def printed(what, prepare=None, root="/"):
     """What a new process says of its memory or cores, after it called ``prepare``."""
     code = f"from pathlib import Path; from sat_intervals import machine; machine._ROOT = Path({str(root)!r}); "
     command = [sys.executable, "-c", code + f"print(machine.{what}())"]
@@ -158,11 +158,11 @@ def told(what, prepare=None, root="/"):
 
 
 def test_usable_memory__is_at_most_the_address_space():
-    assert told("usable_memory", partial(resource.setrlimit, resource.RLIMIT_AS, (2**28, 2**28))) == 2**28
+    assert printed("usable_memory", partial(resource.setrlimit, resource.RLIMIT_AS, (2**28, 2**28))) == 2**28
 
 
 def test_usable_cores__are_at_most_those_of_the_affinity():
-    assert told("usable_cores", partial(os.sched_setaffinity, 0, {min(os.sched_getaffinity(0))})) == 1
+    assert printed("usable_cores", partial(os.sched_setaffinity, 0, {min(os.sched_getaffinity(0))})) == 1
 
 
 def real_cgroup(controller):
@@ -192,10 +192,10 @@ def test_usable_memory_and_cores__are_at_most_those_of_a_cgroup(tmp_path, contro
         for file, text in known.items():
             file.write_text(str(text))
         if known:
-            found = told(what, lambda: (folder / "cgroup.procs").write_text(str(os.getpid())))
+            found = printed(what, lambda: (folder / "cgroup.procs").write_text(str(os.getpid())))
         else:
             inside = {f"a/{name}": text for name, text in limits.items()}
-            found = told(what, root=made_up(tmp_path, "0::/a", [V2.format("/")], inside))
+            found = printed(what, root=made_up(tmp_path, "0::/a", [V2.format("/")], inside))
     finally:
         if folder:
             folder.rmdir()

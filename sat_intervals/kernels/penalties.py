@@ -110,7 +110,7 @@ def _step_back(i, down):
 
 @njit(nogil=True)
 def _differences(image, r, row, column, differences):
-    """Absolute differences of a row to the pixels at an offset; 0 where these lie outside: paths start there."""
+    """Absolute differences of a row to the pixels at an offset; 0 where these are outside: paths start there."""
     columns = image.shape[1]
     differences[:] = 0
     if 0 <= r + row < image.shape[0]:

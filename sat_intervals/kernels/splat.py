@@ -20,7 +20,7 @@ def empty_cells(rows: int, columns: int) -> np.ndarray:
 
 @cached
 def splat(column, row, height, lower, upper, confidence, radius, cells):
-    """Add points to the cells they fall in and to all cells whose centre lies within a radius.
+    """Add points to the cells they fall in and to all cells whose centre is within a radius.
 
     The weight of a point at a distance of ``d`` cells is ``exp(-d^2 / 2)``, constant from 30 cells on.
 

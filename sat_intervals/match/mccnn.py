@@ -1,6 +1,6 @@
 """Features of MC-CNN fast from an ONNX file (Zbontar and LeCun 2016). The only home of onnxruntime.
 
-The network maps one normalised band, ``(rows, columns)``, to a unit vector for every pixel whose 11 x 11 window lies
+The network maps one normalised band, ``(rows, columns)``, to a unit vector for every pixel whose 11 x 11 window is
 inside: ``(features, rows - 10, columns - 10)``, a convolution without padding.
 """
 

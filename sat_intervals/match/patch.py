@@ -60,7 +60,7 @@ def patch_areas(core: Window, image: Window, config: Config) -> list[Area]:
 
 
 def _right_area(core: Window, image: Window, config: Config) -> Area:
-    """Area of the right pixels that face a core, with their overlap; they may lie outside the right image."""
+    """Area of the right pixels that face a core, with their overlap; they may be outside the right image."""
     search, overlap = config.disparity, config.tiles.overlap
     reach = facing(core, search.minimum, search.maximum)
     rows = Window(image.row, reach.column - overlap, image.height, reach.width + 2 * overlap)

@@ -175,7 +175,7 @@ def checked_region(left: Image, window: Window | None) -> Window:
     if window.height < 1 or window.width < 1 or window.clipped(whole) != window:
         raise SatIntervalsError(
             f"window at row {window.row}, column {window.column}, {window.height} x {window.width} pixels: "
-            f"must lie inside {left.path}, {left.height} x {left.width} pixels"
+            f"must be inside {left.path}, {left.height} x {left.width} pixels"
         )
     return window
 

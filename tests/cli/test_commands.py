@@ -153,9 +153,9 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
         (["--right-mask", "{}/half-mask.tif"], ["half-mask.tif has 100 x 260 pixels", "right.tif 200 x 260"]),
         (["--right-mask", "{}/absent.tif"], ["absent.tif cannot be read: No such file or directory"]),
         (["--left-mask", ""], ["'--left-mask': it is empty: give a file"]),
-        (["--window", 150, 0, 100, 100], ["row 150, column 0, 100 x 100 pixels: must lie inside", "200 x 260 pixels"]),
-        (["--window", -1, 0, 100, 100], ["row -1, column 0, 100 x 100 pixels: must lie inside", "left.tif"]),
-        (["--window", 0, 0, 0, 9], ["0 x 9 pixels: must lie inside"]),
+        (["--window", 150, 0, 100, 100], ["row 150, column 0, 100 x 100 pixels: must be inside", "200 x 260 pixels"]),
+        (["--window", -1, 0, 100, 100], ["row -1, column 0, 100 x 100 pixels: must be inside", "left.tif"]),
+        (["--window", 0, 0, 0, 9], ["0 x 9 pixels: must be inside"]),
         (["--tile-size", 100], ["tiles.size is 100, allowed: integer >= 64, ", "multiple of 64"]),
         (["--overlap", 2], ["tiles.overlap is 2, allowed: >= 3 with cost.window 5"]),
         (["--workers", 0], ["'--workers': 0 is not in the range x>=1"]),
@@ -212,7 +212,7 @@ def test_match__refuses_empty_names(folder, tmp_path, place):
     assert_refused(invoke(*arguments), f"'{('LEFT', 'RIGHT', 'OUT')[place]}': it is empty: give a file or folder")
 
 
-def test_match__refuses_names_that_gdal_cannot_be_told(folder, tmp_path):
+def test_match__refuses_names_that_are_not_utf8(folder, tmp_path):
     name = os.fsdecode(b"left\xff.tif")
     assert_refused(invoke("match", name, folder / "right.tif", tmp_path), "is not UTF-8: rename it")
 
@@ -323,10 +323,10 @@ def test_match__names_the_tiles_that_a_truncated_file_fails(folder, tmp_path, cl
 def test_match__shows_a_traceback_only_when_asked(folder, tmp_path):
     arguments = matching(folder, tmp_path / "out", right="lower.tif")
     assert_refused(invoke(*arguments))
-    told = invoke(*arguments, "--debug")
-    assert told.exit_code == 2
-    assert "Traceback (most recent call last)" in told.stderr
-    assert told.stderr.splitlines()[-1].startswith("sat-intervals: ")
+    shown = invoke(*arguments, "--debug")
+    assert shown.exit_code == 2
+    assert "Traceback (most recent call last)" in shown.stderr
+    assert shown.stderr.splitlines()[-1].startswith("sat-intervals: ")
 
 
 @pytest.mark.parametrize(
@@ -657,11 +657,11 @@ def test_match__reports_what_it_was_given(folder, done, scene):
     assert report["settings"]["disparity"] == search(scene)
     assert (report["tiles"]["rows"], report["tiles"]["columns"]) == (4, 5)
     for side in ("left", "right"):
-        told, path = report["inputs"][side], folder / f"{side}.tif"
-        assert (told["path"], told["bytes"], told["crs"]) == (str(path), path.stat().st_size, "EPSG:32631")
-        assert (told["height"], told["width"], told["dtype"]) == (200, 260, "uint16")
+        shown, path = report["inputs"][side], folder / f"{side}.tif"
+        assert (shown["path"], shown["bytes"], shown["crs"]) == (str(path), path.stat().st_size, "EPSG:32631")
+        assert (shown["height"], shown["width"], shown["dtype"]) == (200, 260, "uint16")
         digest = subprocess.run(["sha256sum", path], capture_output=True, text=True, check=True).stdout.split()[0]
-        assert told["sha256"] == digest
+        assert shown["sha256"] == digest
 
 
 @pytest.mark.parametrize("right", ["elsewhere.tif", "narrow.tif", "nowhere.tif"])
@@ -750,7 +750,7 @@ def test_config__prints_settings_that_match_takes(folder, tmp_path, preset):
     assert load_config(report["settings"]) == settings
 
 
-def test_config__prints_the_defaults_unless_told_otherwise():
+def test_config__prints_the_defaults_without_options():
     assert invoke("config").stdout == preset_text("paper")
     assert_refused(invoke("config", "--preset", "sea"), "'--preset': 'sea' is not one of 'paper', 'satellite', ")
 

@@ -1,4 +1,4 @@
-"""Causes that do happen, each told in one line with the way out."""
+"""Errors that happen in practice: each is one line with the way out."""
 
 import logging
 import os

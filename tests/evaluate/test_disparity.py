@@ -411,9 +411,9 @@ def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
             for p in find_pairs([folder])
         )
     )
-    status, text, told = command("evaluate", tmp_path / "pairs.csv", run, "--json")
+    status, text, shown = command("evaluate", tmp_path / "pairs.csv", run, "--json")
     assert status == 0
-    assert told == "matching one\nmatching two\n"
+    assert shown == "matching one\nmatching two\n"
     reports = json.loads(text)
     assert list(reports) == ["one", "two", str(run)]
     assert reports["one"] == reports[str(run)]
@@ -437,9 +437,9 @@ def test_command__errors_are_one_line(run, tmp_path):
 @pytest.mark.parametrize("value", ["nan", "inf", "-1"])
 @pytest.mark.parametrize("name", ["evaluate", "ablate"])
 def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
-    status, _, told = command(name, run, "--tolerance", value)
-    assert (status, told.count("\n")) == (2, 1)
-    assert "Invalid value for '--tolerance'" in told
+    status, _, shown = command(name, run, "--tolerance", value)
+    assert (status, shown.count("\n")) == (2, 1)
+    assert "Invalid value for '--tolerance'" in shown
 
 
 @pytest.mark.parametrize(
@@ -464,9 +464,9 @@ def test_command__refuses_before_it_matches(run, pair, tmp_path, arguments, says
     names = {"RUN": run, "OTHER/": f"{run}/", "PAIR": pair, "OFF": tmp_path / "off.yaml"}
     for name, place in names.items():
         arguments = [argument.replace(name, str(place)) for argument in arguments]
-    status, _, told = command("evaluate", *arguments)
-    assert (status, told.count("\n")) == (2, 1)
-    assert re.search(says, told.strip())
+    status, _, shown = command("evaluate", *arguments)
+    assert (status, shown.count("\n")) == (2, 1)
+    assert re.search(says, shown.strip())
 
 
 # ---- Real pairs --------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def test_make_surface__the_envelope_holds_every_point_and_the_mean_lies_inside(t
     assert_allclose(narrow[0], wide[0])
 
 
-def test_make_surface__a_point_reaches_the_cell_it_falls_in_whatever_the_radius(tmp_path):
+def test_make_surface__a_point_reaches_the_cell_it_falls_in_at_any_radius(tmp_path):
     out = write_points(tmp_path / "a", [0.05, 5.9], [-0.05, -5.95], [10.0, 20.0], confidence=np.nan)
     surface, place, _ = surface_of([out], tmp_path, radius=0.1)
     row, column = cell_of(place, LEFT + np.array([0.05, 5.9]), TOP - np.array([0.05, 5.95]))

@@ -113,7 +113,7 @@ def test_census__compares_float64_in_float64():
 
 
 def test_census__reads_strided_patches():
-    # Windows are read out of larger arrays; every second column is no contiguous array.
+    # Windows are read out of larger arrays; every second column is not a contiguous array.
     wide = np.random.default_rng(0).integers(0, 9, (11, 30)).astype(np.float32)
     part = wide[2:, 1:21:2]
     codes, copied = census(part, usable(part), 5), census(part.copy(), usable(part), 5)

@@ -50,7 +50,7 @@ def test_match__interval_worked_example():
     # Census 5 without SGM: span 24; alpha .9: costs up to floor(2.4) = 2 above the least.
     #     9 3 5 9     cut -1 0; at -1 stands the least, so it is pushed out: -2 0
     #     4 4 4 7     cut -2 0; both ends have the least: -3 is beyond the range, so -2 1
-    #     . 2 6 4     cut -1 1, whatever lies between; -1 is pushed out, to the impossible -2: -2 1
+    #     . 2 6 4     cut -1 1, whatever is between; -1 is pushed out, to the impossible -2: -2 1
     raw = of_curves(CURVES, -2)
     assert raw.lower.tolist() == [[-2], [-2], [-2]]
     assert raw.upper.tolist() == [[0], [1], [1]]

@@ -77,7 +77,7 @@ def test_weights_file__is_found_without_importing_its_package():
     assert load_network(file) is load_network(file)
 
 
-def test_weights_file__missing_extra_is_told(monkeypatch):
+def test_weights_file__names_the_missing_extra(monkeypatch):
     def nowhere(name):
         raise metadata.PackageNotFoundError(name)
 
@@ -86,7 +86,7 @@ def test_weights_file__missing_extra_is_told(monkeypatch):
         weights_file(None)
 
 
-def test_network__missing_onnxruntime_is_told(network_file, monkeypatch):
+def test_network__names_the_missing_onnxruntime(network_file, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(SatIntervalsError, match=r"needs onnxruntime: pip install sat-intervals\[mccnn\]"):
         Network(network_file)
@@ -276,8 +276,8 @@ def test_match_pair__processes_and_threads_make_the_same_bytes_and_pages(tmp_pat
         config = settings(-4, 6, tiles={"size": 64, "overlap": 20}, cluster={"kind": kind, "workers": 2})
         match_pair(*images, tmp_path / kind, config)
     assert hashes(tmp_path / "threads") == hashes(tmp_path / "processes")
-    told = invoke("report", tmp_path / "processes")
-    assert told.exit_code == 0, told.output
+    shown = invoke("report", tmp_path / "processes")
+    assert shown.exit_code == 0, shown.output
     assert "mccnn" in (tmp_path / "processes" / "report.html").read_text()
 
 

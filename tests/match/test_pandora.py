@@ -1,4 +1,4 @@
-"""The real peer: Pandora with its plugins libSGM and MC-CNN beside ours on real pairs (method: section 12).
+"""The real peer: Pandora with its plugins libSGM and MC-CNN beside ours on real pairs (METHOD.md, section 12).
 
 Both sides get the same files, no-data value and settings. Unless a test says otherwise it compares the
 *whole* pixels: those whose whole search range is possible. The agreed bars are 99.99 % of the samples and
@@ -36,7 +36,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),
 ]
 
-# Middlebury without no data; real Pleiades, of which a third is no data, 0.
+# Middlebury without no data; real Pleiades, of which a third is no data (0).
 PAIRS = ("mb2003_cones", "phr_picanteo_pre")
 
 PIPELINE = {
@@ -274,7 +274,7 @@ def test_features__have_the_cosines_of_pandora(pandora, shared_data, tmp_path, k
     for k, d in enumerate(range(minimum, maximum + 1)):
         ours = (left[:, :, -d:] * right[:, :, : right.shape[2] + d]).sum(axis=0)
         near = np.abs(ours - theirs[5:-5, 5 - d : -5, k]) <= 2e-3
-        # the reference loses the last columns, up to 7, whatever their disparity
+        # the reference loses the last columns, up to 7, at any disparity
         assert near[:, :-7].mean() >= equal
 
 

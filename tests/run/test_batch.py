@@ -92,8 +92,8 @@ def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(
     assert first.exit_code == 1
     assert "1 of 3 pairs failed" in first.stderr
     assert "nowhere.tif" in first.stderr
-    told = invoke("status", tmp_path / "out")
-    assert told.stdout.startswith(f"{tmp_path / 'out' / 'broken'}: failed: {images / 'nowhere.tif'}")
+    shown = invoke("status", tmp_path / "out")
+    assert shown.stdout.startswith(f"{tmp_path / 'out' / 'broken'}: failed: {images / 'nowhere.tif'}")
     written = (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns
     rows(images)
     second = invoke(*arguments)
@@ -101,8 +101,8 @@ def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(
     assert (tmp_path / "out" / "pair1" / "intervals.tif").stat().st_mtime_ns == written
     report = json.loads((tmp_path / "out" / "batch.json").read_text())
     assert {end["state"] for end in report.values()} == {"done before"}
-    told = invoke("status", tmp_path / "out")
-    assert told.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
+    shown = invoke("status", tmp_path / "out")
+    assert shown.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
 
 
 def test_match_batch__never_takes_another_run_for_its_own(images, tmp_path):
@@ -247,8 +247,8 @@ def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, 
         report = match_batch(pairs, tmp_path, {"median": None}, overwrite=True)
     assert {end["state"] for end in report.values()} == {"failed"}
     assert hashes(tmp_path / "pair1") == before
-    told = invoke("status", tmp_path / "pair1")
-    assert "1 of 1 tiles done, 0 failed, 0 left; no run is active" in told.stdout
+    shown = invoke("status", tmp_path / "pair1")
+    assert "1 of 1 tiles done, 0 failed, 0 left; no run is active" in shown.stdout
     report = match_batch(pairs, tmp_path, {"median": None})
     assert {end["state"] for end in report.values()} == {"done"}
     assert hashes(tmp_path / "pair1") != before

@@ -127,7 +127,7 @@ def test_match__heals_what_is_damaged_before_it_is_assembled(scene, tmp_path, mo
     assert_same(scene, tmp_path / "out")
 
 
-def test_match__ends_where_a_disk_damages_whatever_is_written(scene, tmp_path, monkeypatch):
+def test_match__ends_where_a_disk_damages_all_files_written(scene, tmp_path, monkeypatch):
     def and_damage(job, tile):
         match_tile(job, tile)
         damage(job.store.home / f"arrays.zarr/uint32/c/0/{tile.grid_row}/{tile.grid_column}", "bit")
@@ -375,10 +375,10 @@ def test_match_batch__takes_no_damaged_result_for_done(scene, tmp_path, name, ho
     assert match_batch(pairs, tmp_path, scene / "settings.yaml")["kept"]["state"] == "done before"
     damage(tmp_path / "kept" / name, how)
     before = (tmp_path / "kept" / name).read_bytes()
-    told = match_batch(pairs, tmp_path, scene / "settings.yaml", keep_tiles=True)["kept"]
-    assert told["state"] == "failed"
-    assert f"{tmp_path}/kept/{name} " in told["error"]
-    assert told["error"].endswith(f"move {tmp_path}/kept away, or match again with --overwrite")
+    shown = match_batch(pairs, tmp_path, scene / "settings.yaml", keep_tiles=True)["kept"]
+    assert shown["state"] == "failed"
+    assert f"{tmp_path}/kept/{name} " in shown["error"]
+    assert shown["error"].endswith(f"move {tmp_path}/kept away, or match again with --overwrite")
     assert (tmp_path / "kept" / name).read_bytes() == before
     match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)
     assert_same(scene, tmp_path / "kept")
@@ -435,7 +435,9 @@ def test_match__names_a_folder_where_a_file_of_a_tile_must_be(scene, tmp_path, n
     assert f"tile 1_0: {tmp_path}/out/tiles/{name}: Is a directory" in result.stderr.splitlines()[1]
 
 
-@pytest.mark.parametrize("command", ["evaluate OUT", "report OUT", "plot OUT", "export OUT TARGET --to otb"])
+@pytest.mark.parametrize(
+    "command", ["evaluate OUT", "report OUT", "plot OUT", "export OUT TARGET --to otb", "status OUT"]
+)
 def test_commands__refuse_a_result_of_which_a_bit_flipped(scene, tmp_path, command):
     shutil.copytree(scene / "kept", tmp_path / "OUT")
     damage(tmp_path / "OUT" / "intervals.tif", "bit")

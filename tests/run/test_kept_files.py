@@ -1,4 +1,4 @@
-"""Files of the user: inputs, what lies in a folder by chance, and a good run are never lost, whatever is asked."""
+"""The user's files are never lost: inputs, other files in a folder, and complete runs."""
 
 import json
 import os

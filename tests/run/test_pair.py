@@ -93,7 +93,7 @@ def test_match_pair__tiles_without_sgm_equal_one_tile_everywhere(pair, tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["threads", pytest.param("processes", marks=pytest.mark.process)])
-def test_match_pair__gives_the_same_bytes_whatever_the_workers(pair, tmp_path, kind):
+def test_match_pair__gives_the_same_bytes_for_all_workers(pair, tmp_path, kind):
     left, right, settings = pair
     settings = in_tiles(settings, 128, overlap=20)
     match_pair(left, right, tmp_path / "one", settings | {"cluster": {"workers": 1}})

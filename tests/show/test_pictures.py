@@ -1,4 +1,4 @@
-"""Pictures: made, of the right size, not blank, showing what they claim, whatever the results."""
+"""Pictures: right size, not blank, showing what they claim, for results of all kinds."""
 
 import json
 import os
@@ -261,11 +261,11 @@ def test_draw_profile__shows_a_pixel_that_stands_alone(tmp_path):
 @pytest.fixture
 def words(monkeypatch):
     """Labels of legends, titles of pages and maps, and names of axes, as they are given."""
-    told = []
+    texts = []
 
     def noting(thing, name):
-        told_to = getattr(thing, name)
-        monkeypatch.setattr(thing, name, lambda self, *a, **more: told.append(str(a[0])) or told_to(self, *a, **more))
+        original = getattr(thing, name)
+        monkeypatch.setattr(thing, name, lambda self, *a, **more: texts.append(str(a[0])) or original(self, *a, **more))
 
     for thing, name in (
         (Artist, "set_label"),
@@ -273,7 +273,7 @@ def words(monkeypatch):
         *((Axes, name) for name in ("set_title", "set_xlabel", "set_ylabel")),
     ):
         noting(thing, name)
-    return told
+    return texts
 
 
 def test_plot__without_intervals_claims_none(tmp_path, words):

@@ -181,8 +181,8 @@ def test_match__reads_images_in_a_bucket_and_knows_them_by_size_and_etag(bucket,
     assert_complete(pair, tmp_path / "out")
     inputs = json.loads((tmp_path / "out" / "run.json").read_text())["inputs"]
     for side in ("left", "right"):
-        told = s3().head_object(Bucket="bucket", Key=f"images/{side}.tif")
-        assert (inputs[side]["bytes"], inputs[side]["etag"]) == (told["ContentLength"], told["ETag"])
+        shown = s3().head_object(Bucket="bucket", Key=f"images/{side}.tif")
+        assert (inputs[side]["bytes"], inputs[side]["etag"]) == (shown["ContentLength"], shown["ETag"])
 
 
 @pytest.mark.parametrize(
