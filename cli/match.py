@@ -56,9 +56,7 @@ def match(
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
 
-    if disparity is None and config_file is None:
-        raise click.UsageError("Missing search range: give --disparity MIN MAX, or --config with a file that has it.")
-    config = load_config(config_file, with_range(given, disparity))
+    config = load_config(config_file, with_range(given, disparity, config_file))
     if dry_run:
         from sat_intervals.run.batch_system import job_script
 

@@ -177,13 +177,13 @@ def log_options(command: Command) -> Command:
     )
 
 
-def with_range(given: dict[str, Any], disparity: tuple[int, int] | None) -> dict[str, Any]:
-    """Add the search range of the command line, if given, to its sections."""
-    return (
-        given
-        if disparity is None
-        else {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
-    )
+def with_range(given: dict[str, Any], disparity: tuple[int, int] | None, config_file: Path | None) -> dict[str, Any]:
+    """Add the search range of the command line to its sections; without one, a file of settings must have it."""
+    if disparity is not None:
+        return {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
+    if config_file is None:
+        raise click.UsageError("Missing search range: give --disparity MIN MAX, or --config with a file that has it.")
+    return given
 
 
 def _with(command: Command, *options: Callable[[Command], Command]) -> Command:

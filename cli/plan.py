@@ -46,13 +46,15 @@ def plan(
 
     Options and settings are those of match.
     """
+    from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
     from sat_intervals.run.cluster import parse_memory
     from sat_intervals.run.plan import plan as make_plan
 
-    config = load_config(config_file, with_range(given, disparity))
+    config = load_config(config_file, with_range(given, disparity, config_file))
     limit = parse_memory(memory) if memory else None
-    made = make_plan(*images(left, right), config, window=window, memory=limit)
+    with Console(quiet=False) as console:
+        made = make_plan(*images(left, right), config, window=window, memory=limit, progress=console.progress)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     one, together = _verdicts(made, limit, config.cluster.kind)
     at_once = "1 tile" if made.workers == 1 else f"{made.workers} tiles"

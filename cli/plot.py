@@ -32,7 +32,7 @@ def plot(
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
-    OUT/dsm.png        if dsm.tif exists: hillshade, height, width
+    OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.

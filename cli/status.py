@@ -48,7 +48,7 @@ def _show(out: Path, store: str | None) -> None:
         return
     now = read_status(out / "tiles", store)
     left = now.total - now.done - len(now.failed)
-    state = "a run is active" if now.running else "no run is active: rerun the same command: it resumes"
+    state = "a run is active" if now.running else "no run is active, the same command resumes it"
     click.echo(f"{out}: {now.done} of {now.total} tiles done, {len(now.failed)} failed, {left} left; {state}")
     for name, reason in now.failed.items():
         click.echo(f"  tile {name}: {reason}")

@@ -95,9 +95,9 @@ def show_surface(name: str, report: dict[str, Any]) -> None:
 
 
 def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
-    """Return rows for all pixels and for those of high and low confidence."""
+    """Return rows for all pixels counted and for those of high and low confidence."""
     columns = ("accuracy", "relative_size", "mean_width", "relative_overestimation")
-    names = {"all": "all pixels", "high": "high confidence", "low": "low confidence"}
+    names = {"all": "all pixels" if where else "valid pixels", "high": "high confidence", "low": "low confidence"}
     return [[name + where, *_measures(report[key], *columns)] for key, name in names.items()]
 
 

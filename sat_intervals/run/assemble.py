@@ -31,6 +31,10 @@ Item = TypeVar("Item")
 STRIP_PIXELS = 1 << 20
 # Number of disparities up to which refinement alone can widen an interval to the whole search range.
 _NARROW_RANGE = 3
+# Number of disparities up to which intervals of usual width are wider than half of the search range.
+_SHORT_RANGE = 8
+# Share of valid pixels with the whole search range as interval above which a run warns.
+_AMBIGUOUS_SHARE = 0.1
 
 # Meanings of some of the counts, for readers of run.json.
 _COUNTS_MEANING = {
@@ -154,13 +158,15 @@ def _check_matched(job: Job, records: Records, searched: int) -> None:
 
 
 def _warn_of_ambiguity(job: Job, counts: dict[str, Any]) -> None:
-    """Warn if most intervals are the whole search range."""
+    """Warn if many intervals are the whole search range, or most are wider than half of it."""
     search = job.config.disparity
-    if 2 * counts["ambiguous"] > counts["valid"] and search.count > _NARROW_RANGE:
+    width = counts["median_interval_width"] or 0
+    ambiguous = counts["ambiguous"] > _AMBIGUOUS_SHARE * counts["valid"] and search.count > _NARROW_RANGE
+    if ambiguous or (2 * width > search.count and search.count > _SHORT_RANGE):
         _LOG.warning(
-            "%s: the interval of %d of %d valid pixels is the whole search range %d to %d: the texture there does not "
-            "distinguish disparities",
-            job.left.path, counts["ambiguous"], counts["valid"], search.minimum, search.maximum,
+            "%s: the interval of %d of %d valid pixels is the whole search range %d to %d, the median width is %g px: "
+            "check the search range, and no-data values (--nodata), or the ground has no texture",
+            job.left.path, counts["ambiguous"], counts["valid"], search.minimum, search.maximum, width,
         )  # fmt: skip
 
 

@@ -9,6 +9,8 @@ from typing import Any
 from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
+from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.progress import Progress
 from sat_intervals.raster import Image
 from sat_intervals.run.cluster import tiles_at_once
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
@@ -63,6 +65,7 @@ def plan(
     window: Window | None = None,
     memory: int | None = None,
     workers: int | None = None,
+    progress: Progress = lambda stage, done, total: None,
 ) -> Plan:
     """Estimate tiles, memory, disk and time of matching a pair.
 
@@ -75,6 +78,8 @@ def plan(
     workers
         Tiles at once; by default those of the settings (all cores of all jobs with batch systems), or one per core of
         this machine.
+    progress
+        Called before kernels are compiled. The estimate contains only the time to load them.
 
     Raises
     ------
@@ -89,6 +94,9 @@ def plan(
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
     work = _work(grid, region, config)
+    # Compiled once a machine: a part of the first plan, not of the run.
+    progress("kernels", 0, 1)
+    compile_kernels(config)
     pixels = region.height * region.width
     together = {"threads": workers, "processes": 1, "address": 1}.get(config.cluster.kind, config.cluster.cores)
     return Plan(

@@ -39,8 +39,7 @@ def draw_profile(
     lower, upper, disparity, truth, low = (np.repeat(line[0, first : last + 1], 2) for line in lines)
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
     has_intervals = results.config.interval is not None
-    mark = "band" if has_intervals else "black line"
-    title = f"Row {row}, columns {first} to {last}; no {mark}: no valid pixel"
+    title = f"Row {row}, columns {first} to {last}; gaps: invalid pixels"
     with page(path, (_WIDTH, 5.4), dpi, title) as figure:
         strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
         _draw_strip(strip, results, row, first, last, dpi)
@@ -145,4 +144,4 @@ def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, 
     panel.axhline(row, color=ORANGE, lw=1.2, ls="--")
     panel.set_facecolor(NOTHING)
     panel.set_ylabel("row")
-    panel.yaxis.set_major_locator(MaxNLocator(2, integer=True, min_n_ticks=1))
+    panel.set_yticks([row])

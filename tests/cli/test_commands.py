@@ -200,9 +200,10 @@ def test_match__refuses_settings_that_it_does_not_know(folder, tmp_path, text, s
     assert not (tmp_path / "out").exists()
 
 
-def test_match__asks_for_a_search_range(folder, tmp_path):
-    result = invoke("match", folder / "left.tif", folder / "right.tif", tmp_path / "out")
-    assert_refused(result, "Missing search range: give --disparity MIN MAX", "match --help")
+@pytest.mark.parametrize(("command", "out"), [("match", ["out"]), ("plan", [])])
+def test_command__asks_for_a_search_range(folder, tmp_path, command, out):
+    result = invoke(command, folder / "left.tif", folder / "right.tif", *[tmp_path / name for name in out])
+    assert_refused(result, "Missing search range: give --disparity MIN MAX", f"{command} --help")
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])

@@ -390,7 +390,7 @@ def test_command__prints_one_run(run, pair):
     assert status == 0
     lines = text.splitlines()
     assert lines[0] == str(run)
-    assert lines[2].startswith("all pixels ")
+    assert lines[2].startswith("valid pixels ")
     figures = evaluate_run(run, tolerance=0.25, remove_bias=True)
     assert lines[2].split()[2:5] == [str(figures["all"]["count"])] + [
         f"{figures['all'][name]:.3f}" for name in ("accuracy", "relative_size")

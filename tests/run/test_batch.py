@@ -417,6 +417,7 @@ def test_plan__prints_what_a_run_will_take(images):
     pair = [str(images / "left1.tif"), str(images / "right1.tif"), "--disparity", "-18", "40"]
     result = invoke("plan", *pair, "--memory", "400MB", "--workers", "3")
     assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("preparing kernels")
     assert "expected time, 3 tiles at once" in result.stdout
     assert "smaller than set, to fit" in result.stdout
     assert re.search(r"memory of a worker: +\d+ MB, fits in 400 MB\n", result.stdout)

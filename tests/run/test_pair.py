@@ -74,6 +74,27 @@ def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
     assert f"left.tif: the interval of {counts['ambiguous']} of {counts['valid']} valid pixels" in record.getMessage()
 
 
+def test_match_pair__warns_of_undeclared_no_data(tmp_path, caplog):
+    settings = write_pair(tmp_path, make_scene(200, 320, seed=3))
+    for name in ("left", "right"):
+        with rasterio.open(tmp_path / f"{name}.tif", "r+") as file:
+            pixels = file.read(1)
+            pixels[:, :64] = 0
+            file.write(pixels, 1)
+            file.nodata = None
+    counts = match_pair(tmp_path / "left.tif", tmp_path / "right.tif", tmp_path / "out", settings)["counts"]
+    assert 0.1 < counts["ambiguous"] / counts["valid"] < 0.5
+    assert "no-data values (--nodata)" in caplog.text
+
+
+def test_match_pair__warns_of_a_wrong_search_range(pair, tmp_path, caplog):
+    left, right, _ = pair
+    wrong = {"disparity": {"minimum": 60, "maximum": 100}, "sgm": {"p1": 20, "p2": 128}}
+    counts = match_pair(left, right, tmp_path / "out", wrong, window=Window(100, 100, 150, 200))["counts"]
+    assert counts["ambiguous"] < 0.1 * counts["valid"]
+    assert "check the search range" in caplog.text
+
+
 @pytest.mark.parametrize("more", [{}, {"cross_check": {"method": "accurate"}}])
 def test_match_pair__tiles_with_overlap_equal_one_tile_nearly_everywhere(pair, tmp_path, more):
     left, right, settings = pair

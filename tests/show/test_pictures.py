@@ -282,7 +282,7 @@ def test_plot__without_intervals_claims_none(tmp_path, words):
     assert done.output.split() == [str(out / "overview.png"), str(out / "profile.png")]
     assert {"truth", "disparity"} < set(words)
     assert "interval" not in words
-    assert "Row 20, columns 0 to 49; no black line: no valid pixel" in words
+    assert "Row 20, columns 0 to 49; gaps: invalid pixels" in words
     with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: errors need them"):
         draw_errors(open_results(out), tmp_path / "errors.png")
 
