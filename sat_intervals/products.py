@@ -17,7 +17,7 @@ IMPOSSIBLE_COST = 65535
 # MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008. Its codes, 0 to 250, fit in a byte.
 COSINE_STEPS = 125
 
-# Validity bits (method: section 9). They have Pandora's numbers, so its tools read our files.
+# Validity bits (METHOD.md, section 9). They have Pandora's numbers, so its tools read our files.
 LEFT_WINDOW = 1 << 0
 NO_CANDIDATE = 1 << 1
 RANGE_INCOMPLETE = 1 << 2

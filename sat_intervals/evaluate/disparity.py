@@ -1,4 +1,4 @@
-"""Evaluate the intervals of a run against a known truth, strip by strip (method: section 10)."""
+"""Evaluate the intervals of a run against a known truth, strip by strip (METHOD.md, section 10)."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

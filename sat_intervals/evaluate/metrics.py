@@ -1,4 +1,4 @@
-"""Accumulate figures of merit of intervals (paper section 4.1; method: section 10).
+"""Accumulate figures of merit of intervals (paper section 4.1; METHOD.md, section 10).
 
 Medians come from histograms with these steps: widths 0.01 px, overestimation 0.001 (at least -99), bias 0.001 px
 (within 1000 px), confidence 0.001.

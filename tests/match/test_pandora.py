@@ -1,4 +1,4 @@
-"""The real peer: Pandora with its plugins libSGM and MC-CNN beside ours on real pairs (method: section 12).
+"""The real peer: Pandora with its plugins libSGM and MC-CNN beside ours on real pairs (METHOD.md, section 12).
 
 Both sides get the same files, no-data value and settings. Unless a test says otherwise it compares the
 *whole* pixels: those whose whole search range is possible. The agreed bars are 99.99 % of the samples and
