@@ -1,4 +1,4 @@
-"""The command as a person meets it: what is refused and how, what is printed, what files others find."""
+"""The commands from outside: what they refuse and how, what they print, which files they write."""
 
 import json
 import logging

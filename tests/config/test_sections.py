@@ -1,4 +1,4 @@
-"""What sections of settings hold of images."""
+"""Checks of settings against images."""
 
 import pytest
 

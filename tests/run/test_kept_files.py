@@ -1,4 +1,4 @@
-"""Files of the user: inputs, what lies in a folder by chance, and a good run are never lost, whatever is asked."""
+"""Files of the user are never lost: inputs, unrelated files in a folder, and a finished run."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Pictures: made, of the right size, not blank, showing what they claim, whatever the results."""
+"""Pictures are written for any results: of the right size, not blank, with the right content."""
 
 import json
 import os
