@@ -6,7 +6,7 @@ EXTRAS ?= test,lint,plot
 BIN := $(VENV)/bin
 READY := $(VENV)/.has-$(EXTRAS)
 
-# Files run apart, so that what a file prepares is prepared once.
+# One worker runs a whole file, so that its fixtures are prepared once.
 PYTEST := $(BIN)/python -m pytest $(OPTIONS)
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 
@@ -18,11 +18,11 @@ demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals report demo-out
 	@echo 'Open demo-out/overview.png and demo-out/report.html'
 
-# What needs neither services, other extras nor real pairs; three minutes on two cores.
+# Tests that need no services, no other extras and no real pairs; three minutes on two cores.
 test: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
 
-# Everything: what starts processes and services runs alone. OPTIONS=--skip-nothing fails what would be skipped.
+# All tests; those that start processes and services run alone. With OPTIONS=--skip-nothing a skipped test fails.
 test-all: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process'
 	$(PYTEST) -m process
@@ -51,7 +51,7 @@ pictures: $(VENV)/.has-dsm,plot
 	mkdir -p .github/pictures
 	for name in overview profile dsm; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
-# Python compiles what it imports by itself, most of what is installed never.
+# --no-compile saves time: Python compiles a module when it is first imported, and most never are.
 $(VENV)/.has-%: pyproject.toml $(VENV)/.made
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[$*]'
 	touch $@

@@ -12,8 +12,8 @@ from sat_intervals.cli.logs import logged
 if TYPE_CHECKING:
     from sat_intervals.raster import Image
 
-COSTS = ("census", "mccnn")
 # Copied from `sat_intervals.config`, which --help must not import.
+COSTS = ("census", "mccnn")
 PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homogeneous", "mccnn")
 
 Command = Callable[..., Any]

@@ -15,7 +15,7 @@ from sat_intervals.demo import make_scene
 
 pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
 
-# How long an example takes is the machine's affair: a deadline makes tests fail beside others.
+# No deadline for an example: it would make tests fail on a busy machine.
 hypothesis.settings.register_profile("project", deadline=None)
 hypothesis.settings.load_profile("project")
 
@@ -36,7 +36,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip what ``peer("module", ...)`` marks where a module is not installed."""
+    """Skip tests marked ``peer("module", ...)`` if one of the modules is not installed."""
     for name in [name for marker in item.iter_markers("peer") for name in marker.args if find_spec(name) is None]:
         pytest.skip(f"{name} is not installed")
 
@@ -60,7 +60,7 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with left.tif, right.tif, settings.yaml of 7 x 8 tiles, and the run that nothing disturbed."""
+    """A folder with left.tif, right.tif, settings.yaml for 7 x 8 tiles, and an undisturbed run of them."""
     folder = tmp_path_factory.mktemp("pair")
     settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
     match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
@@ -69,7 +69,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
-    """A function that mounts a disk of so many bytes, or gives it that size."""
+    """A function that mounts a disk of a given number of bytes, or resizes it."""
     place = tmp_path / "disk"
     place.mkdir()
 
@@ -77,7 +77,7 @@ def disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
         options = f"remount,size={count}" if place.is_mount() else f"size={count}"
         tried = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", place], capture_output=True, text=True)
         if tried.returncode:
-            pytest.skip(f"a small disk takes root: {tried.stderr}")
+            pytest.skip(f"a small disk needs root: {tried.stderr}")
         return place
 
     yield of_size

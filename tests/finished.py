@@ -1,4 +1,4 @@
-"""Folders of finished runs whose bands a test makes up, for what only looks at results."""
+"""Folders of finished runs with bands made by a test, for code that only reads results."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What several test modules do: write a pair, run a command, wait, and compare runs."""
+"""Functions shared by test modules: write a pair, run a command, wait, compare runs."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ PATIENCE = 60.0
 
 
 def write_pair(folder: Path, scene: Scene, *, group: str = "all", **sections: Any) -> dict[str, Any]:
-    """Write the images and the truth of a scene, meta.json and settings.yaml: the settings, its range and sections."""
+    """Write images and truth of a scene, meta.json and settings.yaml; return the settings: its range and sections."""
     for name, nodata in (("left", 0), ("right", 0), ("truth", np.nan)):
         write_layer(folder / f"{name}.tif", getattr(scene, name), nodata, PLACE)
     (folder / "meta.json").write_text(json.dumps({"disparity": [scene.minimum, scene.maximum], "group": group}))
@@ -75,8 +75,8 @@ def bands(out):
 
 
 def shares_that_differ(one, other):
-    """Of the pixels that are valid in one of two runs: those of another disparity, and those of another interval."""
+    """Shares of the pixels valid in at least one of two runs whose disparity differs, and whose interval differs."""
     (first, flags), (second, other_flags) = bands(one), bands(other)
-    judged = (flags & INVALID == 0) | (other_flags & INVALID == 0)
-    differs = (first != second) & ~(np.isnan(first) & np.isnan(second)) & judged
-    return differs[0].sum() / judged.sum(), (differs[1] | differs[2]).sum() / judged.sum()
+    either_valid = (flags & INVALID == 0) | (other_flags & INVALID == 0)
+    differs = (first != second) & ~(np.isnan(first) & np.isnan(second)) & either_valid
+    return differs[0].sum() / either_valid.sum(), (differs[1] | differs[2]).sum() / either_valid.sum()

@@ -8,7 +8,7 @@ CONVOLUTIONS = (0, 2, 4, 6, 8)
 
 
 def random_weights(features=8, layers=5, seed=0):
-    """Arrays of a network of few features, named as the trained ones are."""
+    """Arrays of a network of few features, with the names of the trained ones."""
     random = np.random.default_rng(seed)
     weights = {}
     for layer in CONVOLUTIONS[:layers]:
@@ -19,7 +19,7 @@ def random_weights(features=8, layers=5, seed=0):
 
 
 def write_network(file, weights, *, unit=True, pads=0, rank=2):
-    """Write convolutions with ReLU between them, and unit vectors; the other options make networks that are refused."""
+    """Write convolutions with ReLU between them, and unit vectors; the other options make networks of another form."""
     layers = [layer for layer in CONVOLUTIONS if f"conv_blocks.{layer}.weight" in weights]
     constants = {"first two axes": [0, 1], "first axis": [0], "second axis": [1]}
     parts = [numpy_helper.from_array(np.array(value, np.int64), name) for name, value in constants.items()]

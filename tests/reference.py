@@ -86,12 +86,12 @@ def census_cost(left, right, left_state, right_state, window):
 
 # ---- 2, 3. Semi-global matching and the cost span ----------------------------------------------------------
 def aggregate(cost, window, p1, p2):
-    """Section 2: the sum of the eight path costs; an empty pixel carries nothing, paths restart behind it."""
+    """Section 2: the sum of the eight path costs; paths restart behind a pixel without a candidate."""
     return aggregate_with(cost, window * window + p2 + 1, lambda step: (p1, p2))
 
 
 def aggregate_with(cost, price, penalties):
-    """Section 2, an impossible candidate at a price; ``penalties(step)`` gives P1 and P2 of a path.
+    """Section 2, with the cost of an impossible candidate; ``penalties(step)`` gives P1 and P2 of a path.
 
     Both are numbers, or arrays of the shape of the cost that hold what it takes to come to (r, c, k) on that path.
     """
@@ -171,7 +171,7 @@ def span(window, p2):
 
 # ---- 4. Ambiguity and confidence ---------------------------------------------------------------------------
 def etas(eta_max, eta_step):
-    """Section 4: 0, step, 2 step, .. below eta_max, as fractions of the decimals a person wrote."""
+    """Section 4: 0, step, 2 step, ... below eta_max, as exact fractions of the decimals in the settings."""
     stop, step = Fraction(Decimal(str(eta_max))), Fraction(Decimal(str(eta_step)))
     return [i * step for i in range(math.ceil(stop / step))]
 
@@ -379,13 +379,13 @@ def regularize(lower, upper, low, depth, share):
 
 
 def widen(lower, upper, disparity):
-    """Section 8: the last law, lower <= disparity <= upper."""
+    """Section 8: widen the interval so that lower <= disparity <= upper."""
     return np.minimum(lower, disparity), np.maximum(upper, disparity)
 
 
 # ---- 9. Validity -------------------------------------------------------------------------------------------
 def right_bits(right_window_state, columns):
-    """Section 9, bits 1 and 7: no facing right window is usable; 7 where the right mask has a part in it."""
+    """Section 9, bits 1 and 7: no right window is usable; bit 7 if the right mask is one of the reasons."""
     count = right_window_state.shape[1] - columns + 1
     bits = np.zeros((right_window_state.shape[0], columns), np.uint16)
     for r, c in np.ndindex(bits.shape):
@@ -396,7 +396,7 @@ def right_bits(right_window_state, columns):
 
 
 def validity(left_pixel_state, left_window_state, right_window_state, refined):
-    """Section 9: the bits a tile knows. Without refinement ``refined`` is False everywhere."""
+    """Section 9: the bits that are set in a tile. Without refinement ``refined`` is False everywhere."""
     searched = possible(left_window_state, right_window_state)
     bits = right_bits(right_window_state, left_window_state.shape[1])
     for r, c in np.ndindex(bits.shape):

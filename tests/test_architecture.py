@@ -1,4 +1,4 @@
-"""The house rules that a machine can hold: who may import whom, and where each library is at home."""
+"""Rules of the architecture: which folder imports which, where each library is imported, how large functions are."""
 
 import ast
 import importlib.util
@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-# Top to bottom. A room, which is a folder or a module of `sat_intervals/`, imports only rooms of lower floors.
+# Top to bottom. A room is a folder or a module in `sat_intervals/`; it imports only rooms of lower floors.
 FLOORS = [
     {"cli"},
     {"show"},
@@ -40,13 +40,13 @@ HOMES = {
     "zarr": "store",
 }
 
-# Without docstrings; callbacks of click commands have a parameter an option.
+# Without docstrings. Callbacks of click commands are exempt from the limit of parameters: they have one per option.
 MOST_FUNCTION_LINES, MOST_MODULE_LINES, MOST_PARAMETERS = 45, 300, 8
 OVER_THE_LIMITS = {
     "sat_intervals.interop.cars_method.run": "its parameters are those of CARS' method",
 }
 
-# Tests of several modules of a folder, or of what all of them keep.
+# Test files without a module of their name: they test several modules together.
 LAWS = {
     "./architecture", "./documents", "./package", "cli/commands", "cli/messages", "match/accuracy", "match/pandora",
     "raster/raster", "run/damage", "run/kept_files", "run/survival", "run/waits", "show/pictures",

@@ -19,8 +19,10 @@ def equal(one: Scene, other: Scene) -> bool:
 
 
 def warp_errors(scene: Scene) -> np.ndarray:
-    """What the right image, sampled linearly at x + truth, differs from the left on visible pixels, as a share of
-    the left's dynamic range; the radiometry of both views undone."""
+    """Differences of the left image and the right one sampled linearly at x + truth, on visible pixels.
+
+    They are shares of the left's dynamic range, after the radiometry of both views is undone.
+    """
     left, right = ((image - o) / g for image, o, g in zip((scene.left, scene.right), OFFSET, GAIN, strict=True))
     x = np.arange(scene.left.shape[1])
     warped = np.stack([np.interp(x + d, x, line) for d, line in zip(scene.truth, right, strict=True)])

@@ -31,7 +31,7 @@ IN_JOB = "9:memory:/slurm/job_7/step_0\n4:cpu,cpuacct:/slurm/job_7/step_0\n0::/"
 
 
 def made_up(root, groups, mounts, limits):
-    """A tree with what the kernel says of this process, and files of limits by their path below ``/sys/fs/cgroup``."""
+    """A tree with the kernel's entries of this process, and files of limits by path below ``/sys/fs/cgroup``."""
     (root / "proc/self").mkdir(parents=True)
     (root / "proc/self/cgroup").write_text(groups + "\n")
     (root / "proc/self/mountinfo").write_text("\n".join([DISK, *mounts]) + "\n")
@@ -150,8 +150,8 @@ def test_usable_memory_and_cores__are_the_least_of_all_limits(tmp_path, monkeypa
     assert machine.usable_cores() == len(os.sched_getaffinity(0))
 
 
-def printed(what, prepare=None, root="/"):
-    """What a new process says of its memory or cores, after it called ``prepare``."""
+def told(what, prepare=None, root="/"):
+    """Memory or cores that a new process reports after it called ``prepare``."""
     code = f"from pathlib import Path; from sat_intervals import machine; machine._ROOT = Path({str(root)!r}); "
     command = [sys.executable, "-c", code + f"print(machine.{what}())"]
     return int(subprocess.run(command, preexec_fn=prepare, capture_output=True, check=True, timeout=60).stdout)
@@ -166,7 +166,7 @@ def test_usable_cores__are_at_most_those_of_the_affinity():
 
 
 def real_cgroup(controller):
-    """A new cgroup below that of this process; None where none can be made."""
+    """A new cgroup below that of this process; None if it cannot be made."""
     above = list(machine._cgroups(Path("/"), controller))
     if above and above[0].parent not in above:  # others belong to the service that made them, with all below
         folder = above[0] / f"sat_intervals_{os.getpid()}"
@@ -185,7 +185,7 @@ def real_cgroup(controller):
     ],
 )
 def test_usable_memory_and_cores__are_at_most_those_of_a_cgroup(tmp_path, controller, limits, what, expected):
-    """A real one where it can be made, else one of a made-up tree."""
+    """A real cgroup if possible, else one of a made-up tree."""
     folder = real_cgroup(controller)
     known = {folder / name: text for name, text in limits.items() if folder and (folder / name).exists()}
     try:

@@ -85,7 +85,7 @@ for name in {[name.removesuffix(".__init__") for name in MODULES]!r}:
 
 @pytest.mark.peer("cars", "matplotlib", "onnxruntime", "shareloc")
 def test_modules__importing_them_changes_nothing_of_others() -> None:
-    """Other libraries may set at import what they like: theirs are imported before."""
+    """Dependencies may change global settings at import, so they are imported first."""
     others = run_python(f"{IMPORT_ALL}import sys; print(*[name for name in sys.modules if name[:4] != 'sat_'])").split()
     script = f"""{STATE}
 for name in {others!r}:
@@ -104,5 +104,5 @@ for name, value in before.items():
 
 
 def run_python(script: str) -> str:
-    """What a script prints, in a process of its own."""
+    """Return what a script prints in a separate process."""
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout

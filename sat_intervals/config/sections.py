@@ -116,8 +116,18 @@ class Census(Section):
 
     @property
     def ceiling(self) -> int:
-        """Return the base of the cost of impossible candidates, as in libSGM."""
+        """Return the part of `Config.impossible_cost` that the cost decides, at least ``largest``; as in libSGM."""
         return self.window**2
+
+    @property
+    def precomputed(self) -> bool:
+        """Return whether the costs of a patch are computed before SGM, a byte each; SGM compares codes."""
+        return False
+
+    @property
+    def needs_statistics(self) -> bool:
+        """Return whether the costs need mean and standard deviation of the whole images."""
+        return False
 
 
 class Mccnn(Section):
@@ -148,8 +158,18 @@ class Mccnn(Section):
 
     @property
     def ceiling(self) -> int:
-        """Return the base of the cost of impossible candidates."""
+        """Return the part of `Config.impossible_cost` that the cost decides, at least ``largest``."""
         return self.largest
+
+    @property
+    def precomputed(self) -> bool:
+        """Return whether the costs of a patch are computed before SGM, a byte each."""
+        return True
+
+    @property
+    def needs_statistics(self) -> bool:
+        """Return whether the costs need mean and standard deviation of the whole images."""
+        return True
 
 
 class Ambiguity(Section):

@@ -127,7 +127,7 @@ class Config(Section):
 
     @property
     def impossible_cost(self) -> int:
-        """Return the cost of an impossible candidate inside SGM."""
+        """Return the cost of an impossible candidate inside SGM, above every possible cost + P2."""
         return self.cost.ceiling + self.largest_p2 + self.cost.steps
 
     @property

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Config, Interval, Mccnn, load_config
+from sat_intervals.config import Config, Interval, load_config
 from sat_intervals.config.pairs import Pair
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import criteria_of, evaluate
@@ -81,7 +81,7 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
 
 
 def _statistics(images: Sequence[Image], config: Config) -> PairStatistics | None:
-    if not isinstance(config.cost, Mccnn):
+    if not config.cost.needs_statistics:
         return None
     return PairStatistics(
         *(

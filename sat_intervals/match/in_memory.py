@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sat_intervals.config import Config, Mccnn, load_config
+from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.matching_cost import View
@@ -50,7 +50,7 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     windows = patch_windows(whole, whole, config)
     views = _view(images[0], windows[0]), _view(images[1], windows[1])
     statistics = None
-    if isinstance(config.cost, Mccnn):
+    if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
     patch = match_patch(views, whole, whole, whole, config, statistics)
     raw, rows = patch.raw, RawRows.of(patch.raw, patch.right)

@@ -112,7 +112,7 @@ def cost_areas(
     config
         Settings.
     statistics
-        Mean and standard deviation of the whole images, which MC-CNN needs.
+        Mean and standard deviation of the whole images; None if the matching cost needs none.
     """
     radius = config.cost.window // 2
     if isinstance(config.cost, Mccnn):

@@ -19,8 +19,8 @@ def _lanes(config: Config) -> int:
 
 
 def volume_bytes(height: int, width: int, config: Config) -> int:
-    """Bytes of the cost volume, the largest part of matching; with MC-CNN also of its matching costs."""
-    return (3 if isinstance(config.cost, Mccnn) else 2) * height * width * _lanes(config)
+    """Bytes of the cost volume, the largest part of matching, and of precomputed matching costs."""
+    return (3 if config.cost.precomputed else 2) * height * width * _lanes(config)
 
 
 def tile_bytes(config: Config, size: int | None = None) -> int:
@@ -32,8 +32,9 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     accurate = config.cross_check is not None and config.cross_check.method == "accurate"
     if accurate:
         volume = 2 * size * (size + config.disparity.count) * lanes  # the volume of the right view is wider
-    if isinstance(config.cost, Mccnn):
+    if config.cost.precomputed:
         volume += lanes * patch * (patch + accurate * (patch + config.disparity.count))
+    if isinstance(config.cost, Mccnn):
         volume += _NETWORK_BYTES * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes
     return volume + paths + _PATCH_BYTES * patch * (patch + config.disparity.count) + _CORE_BYTES * size**2

@@ -95,7 +95,7 @@ def match_patch(
     config
         Settings.
     statistics
-        Mean and standard deviation of the whole images, which MC-CNN needs.
+        Mean and standard deviation of the whole images; None if the matching cost needs none.
     """
     settings = kernel_settings(config)
     output = core.grown(1, 1).clipped(region)

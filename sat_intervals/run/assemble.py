@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sat_intervals.config import Config, Mccnn
+from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
 from sat_intervals.products import FLAGS
@@ -128,7 +128,7 @@ def _prefetched(items: Iterable[Item]) -> Iterator[Item]:
 
 def _check_done(job: Job, records: Records, normalization: dict[str, Any] | None) -> None:
     """Raise if tiles or image statistics are missing; a retry restores them."""
-    if isinstance(job.config.cost, Mccnn) and normalization is None:
+    if job.config.cost.needs_statistics and normalization is None:
         raise DamagedTilesError(
             f"the image statistics in {job.store.folder} are missing: rerun the same command: it resumes"
         )

@@ -8,7 +8,6 @@ from typing import Any
 
 from distributed import Client
 
-from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.match.warm_up import compile_kernels
@@ -126,11 +125,11 @@ def assembled(
 
 def _is_measured(job: Job) -> bool:
     """Return whether the store has mean and standard deviation of both images, or the run needs none."""
-    return not isinstance(job.config.cost, Mccnn) or job.store.normalization() is not None
+    return not job.config.cost.needs_statistics or job.store.normalization() is not None
 
 
 def measure_images(client: Client, job: Job, progress: Progress) -> None:
-    """Measure mean and standard deviation of both images and store them, if MC-CNN needs them and they are missing.
+    """Measure mean and standard deviation of both images and store them, if the cost needs them and they are missing.
 
     Raises
     ------

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Mccnn
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.matching_cost import View
@@ -70,8 +69,8 @@ def _match_tile(job: Job, tile: Tile) -> None:
 
 
 def _checked_statistics(job: Job) -> PairStatistics | None:
-    """Return mean and standard deviation of the images if MC-CNN needs them, else None."""
-    if not isinstance(job.config.cost, Mccnn):
+    """Return mean and standard deviation of the images if the matching cost needs them, else None."""
+    if not job.config.cost.needs_statistics:
         return None
     normalization = job.store.normalization()
     if normalization is None:

@@ -1,4 +1,4 @@
-"""One thing to measure, in a process of its own: ``python candidates.py NAME ROWS COLUMNS DISPARITIES RUNS``.
+"""Measure one candidate in a separate process: ``python candidates.py NAME ROWS COLUMNS DISPARITIES RUNS``.
 
 Prints JSON: the seconds of each run after a first one that is not counted, those of them that went into the network
 of MC-CNN, and the process's peak memory in MB.
@@ -36,7 +36,7 @@ def make_pair(rows, columns):
 
 
 def search_range(disparities):
-    """A range of so many disparities around those of the scene."""
+    """A range with a given number of disparities around those of the scene."""
     return 8 - disparities // 2, 8 - disparities // 2 + disparities - 1
 
 
@@ -69,7 +69,7 @@ def opencv(left, right, disparities):
 
 
 def watch_network(name):
-    """Let every call of the network, this project's or the reference's, add its seconds to the figure returned."""
+    """Return a figure to which each call of a network, ours or the reference's, adds its seconds."""
     if name.startswith("pandora"):
         from mc_cnn.inference_engine.inference_engine_onnx import ONNXEngine as Network
 
@@ -160,7 +160,7 @@ CANDIDATES = {
 
 
 def main():
-    """Measure what the command line names."""
+    """Measure the candidate named on the command line."""
     name, (rows, columns, disparities, runs) = sys.argv[1], map(int, sys.argv[2:6])
     task = CANDIDATES[name](*make_pair(rows, columns), disparities)
     spent = watch_network(name) if name.endswith("mccnn") else [0.0]

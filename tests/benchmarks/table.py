@@ -73,7 +73,7 @@ def match(pair, out, workers, disparities=64, environment=None):
 
 
 def median_run(pair, out, workers, runs):
-    """What `match` returns of the run of median seconds."""
+    """Return the result of `match` of the run with the median time."""
     return sorted((match(pair, out, workers) for _ in range(runs)), key=lambda run: run[0])[runs // 2]
 
 
@@ -122,7 +122,7 @@ def mccnn():
 
 
 def file_to_file(folder):
-    """Whole runs of the command: workers, growth, what tiling and files add, starting up."""
+    """Whole runs of the command: workers, growth, the cost of tiling and files, starting up."""
     print()
     row("files to files, 64 disparities", "figure")
     row("---", "---")

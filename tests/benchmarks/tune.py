@@ -70,7 +70,7 @@ def read_scene(name: str) -> Scene:
 
 
 def bands(name: str, settings: dict[str, Any]) -> dict[str, np.ndarray]:
-    """What matching a scene gives."""
+    """Match a scene."""
     scene = read_scene(name)
     found = match_arrays(scene.left, scene.right, {**settings, "disparity": scene.search})
     return {band: found[band].values.astype(np.float64) for band in ("disparity", "lower", "upper", "confidence")}
@@ -99,7 +99,7 @@ def judged(name: str, settings: dict[str, Any]) -> dict[str, float]:
 
 @cache
 def trusted_roofs(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Disparities by the paper's settings, and where they are trusted and stand off their neighbourhood."""
+    """Disparities by the paper's settings, and the roofs: trusted pixels that differ from their neighbourhood."""
     paper = bands(name, {})
     disparity, side = paper["disparity"], SIDE // EVERY
     sparse = np.pad(disparity[::EVERY, ::EVERY], side // 2, constant_values=np.nan)
@@ -130,7 +130,7 @@ def means(names: Iterable[str], settings: dict[str, Any]) -> dict[str, float]:
 
 
 def candidates() -> Iterator[tuple[str, dict[str, Any]]]:
-    """Settings of the sweep, with what to call them."""
+    """Names and settings of the sweep."""
     for window, pairs in CENSUS.items():
         for p1, p2 in pairs:
             yield f"Census {window}, {p1}/{p2}", {"cost": {"window": window}, "sgm": {"p1": p1, "p2": p2}}
@@ -163,7 +163,7 @@ def sweep() -> None:
 
 
 def presets() -> None:
-    """What every preset gives, by kind of scene."""
+    """Figures of every preset by kind of scene."""
     figures = "good", "bad-3", "kept", "coverage", "median width", "score"
     header("preset", "scenes", *figures)
     for preset in PRESETS:

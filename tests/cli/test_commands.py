@@ -1,4 +1,4 @@
-"""The command as a person meets it: what is refused and how, what is printed, what files others find."""
+"""The commands from outside: what they refuse and how, what they print, which files they write."""
 
 import json
 import logging
@@ -10,6 +10,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import get_args
 
 import click
 import numpy as np
@@ -23,7 +24,7 @@ from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals import load_config, match_arrays
 from sat_intervals.cli import main, options
-from sat_intervals.config import PRESETS, preset_text
+from sat_intervals.config import PRESETS, Config, preset_text
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
 from sat_intervals.products import BANDS, FLAGS, INVALID
@@ -771,7 +772,12 @@ def test_match__takes_a_preset_and_what_is_given_beside_it(folder, tmp_path):
     (tmp_path / "spelt.yaml").write_text(json.dumps(config))
     command(*matching(folder, tmp_path / "spelt", "--window", 60, 80, 70, 90, config=tmp_path / "spelt.yaml"))
     assert hashes(tmp_path / "spelt") == hashes(tmp_path / "out")
+
+
+def test_options__offer_the_presets_and_matching_costs_of_the_settings():
     assert options.PRESETS == PRESETS
+    kinds = get_args(Config.model_fields["cost"].annotation)
+    assert tuple(kind.model_fields["method"].default for kind in kinds) == options.COSTS
 
 
 def test_match__refuses_two_presets(folder, tmp_path):

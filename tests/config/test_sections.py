@@ -1,4 +1,4 @@
-"""What sections of settings hold of images."""
+"""Checks of settings against images."""
 
 import pytest
 
@@ -15,5 +15,7 @@ def test_check_images__refuses_a_range_that_meets_no_pixel(minimum, maximum, mee
     if meets:
         disparity.check_images("left.tif", 4, "right.tif", 3)
     else:
-        with pytest.raises(ConfigError, match=rf"{minimum} to {maximum} .*left.tif, 4 columns.*right.tif, 3.*sign"):
+        with pytest.raises(
+            ConfigError, match=rf"{minimum} to {maximum} .*left.tif \(4 columns.*right.tif \(3 columns.*sign"
+        ):
             disparity.check_images("left.tif", 4, "right.tif", 3)

@@ -1,4 +1,4 @@
-"""What is read off a whole volume, against the slow twins; the ablation against runs, the paper and the reference."""
+"""Products of a whole volume against the slow twins; the ablation against runs, the paper and Pandora."""
 
 import json
 
@@ -110,7 +110,7 @@ def folder(scene, tmp_path_factory):
 
 
 def judged(scene, config):
-    """What `match_arrays` gives for the scene, judged."""
+    """Figures of merit of `match_arrays` on the scene."""
     left, right = (np.ma.masked_equal(image, 0) for image in (scene.left, scene.right))
     bands = match_arrays(left, right, config)
     names = ("disparity", "lower", "upper", "confidence", "validity")

@@ -1,4 +1,4 @@
-"""Metrics of merit against a slow twin, of maps, of runs on disk, of real pairs, and as the command prints them."""
+"""Figures of merit against a slow twin: of maps, runs on disk and real pairs, and as the command prints them."""
 
 import json
 import re

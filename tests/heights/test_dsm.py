@@ -1,4 +1,4 @@
-"""Surface models from points that the tests make up."""
+"""Surface models from made-up points."""
 
 import json
 import threading

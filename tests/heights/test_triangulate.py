@@ -1,4 +1,4 @@
-"""Points and heights: cameras of known geometry, shareloc's own points, a real pair and a peer's surface of it."""
+"""Points and heights: cameras of known geometry, shareloc's own points, and a real pair with the surface of a peer."""
 
 import csv
 from contextlib import suppress
@@ -53,7 +53,7 @@ def camera(path, view, longitude=LONGITUDE):
 
 
 def grid(path, rows, columns, *, step=20, offset=0.5):
-    """Write the grid that leads every position to the same of the sensor, whose first pixel centre is at one half."""
+    """Write the grid that maps every epipolar position to the same sensor position; first pixel centre at 0.5."""
     row, column = (np.arange(-2 * step, size + 3 * step, step, dtype=np.float64) for size in (rows, columns))
     positions = np.stack(np.broadcast_arrays(column + offset, row[:, None] + offset))
     place = Affine(step, 0, column[0] - step / 2, 0, step, row[0] - step / 2)
@@ -107,7 +107,7 @@ def test_triangulate__heights_of_an_exact_scene_come_back(tmp_path):
 
 
 def dimap(path, geotiff, view):
-    """Write the model of a view as DIMAP 2, which counts pixels from 1 and has the way down to the ground as well."""
+    """Write the model of a view as DIMAP 2, which counts pixels from 1 and also has the direct model."""
     with rasterio.open(geotiff) as dataset:
         rpc = dataset.rpcs
     across, up, down = rpc.samp_num_coeff[1], rpc.samp_num_coeff[3], rpc.line_num_coeff[2]

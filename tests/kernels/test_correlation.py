@@ -49,7 +49,7 @@ def test_correlate__spans_all_cosines():
     vector = features(np.random.default_rng(0), 1, 1)
     assert costs_of(vector, vector, 1).item() == 0
     assert costs_of(vector, -vector, 1).item() == 2 * COSINE_STEPS
-    # Of vectors too long, and of NaN: nothing wraps around.
+    # Vectors that are too long, or NaN: nothing wraps around.
     assert costs_of(1.1 * vector, 1.1 * vector, 1).item() == 0
     assert costs_of(1.1 * vector, -1.1 * vector, 1).item() == 255
     assert costs_of(np.nan * vector, vector, 1).item() == 0

@@ -1,4 +1,4 @@
-"""The bars of accuracy on real pairs: no worse than the reference implementation with the same settings."""
+"""Accuracy on real pairs: no worse than that of the reference implementation with the same settings."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Arrays in, a dataset out: what counts as an image, what is kept of it, what is refused."""
+"""Matching of arrays: accepted and refused inputs, coordinates and metadata of the dataset."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The real peer: Pandora with its plugins libSGM and MC-CNN beside ours on real pairs (METHOD.md, section 12).
+"""Comparison with Pandora and its plugins libSGM and MC-CNN on real pairs (METHOD.md, section 12).
 
 Both sides get the same files, no-data value and settings. Unless a test says otherwise it compares the
 *whole* pixels: those whose whole search range is possible. The agreed bars are 99.99 % of the samples and
@@ -154,7 +154,7 @@ def our_volume(pair: Pair) -> np.ndarray:
 
 
 def census_codes(image: np.ma.MaskedArray, window: int, before: int, after: int) -> Codes:
-    """Codes of an image and of so many columns before and after it."""
+    """Codes of an image and of some columns before and after it."""
     radius = window // 2
     margin = (radius, radius), (radius + before, radius + after)
     state = np.where(np.ma.getmaskarray(image), NO_DATA, 0).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Which file an input is, and inputs on a web server: read window by window, known by size and ETag."""
+"""Identity of input files; inputs on a web server, read by windows and identified by size and ETag."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""Rasters in and out, on real files: what is refused, what is read, what is written, what is left behind."""
+"""Reading and writing of rasters, on real files: refusals, pixels, metadata, temporary files."""
 
 import itertools
 import os
@@ -95,7 +95,7 @@ def make(path: Path, bands, *, internal=None, alpha=None, external=None, **optio
 
 
 def look(path: Path, read=lambda dataset: dataset.read(), **options):
-    """What a reader of the file sees."""
+    """Content of a file as another program reads it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(path, **options) as dataset:

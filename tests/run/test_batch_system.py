@@ -1,4 +1,4 @@
-"""A real SLURM of one node on loopback: jobs that are cancelled, and jobs whose time is up."""
+"""A real SLURM of one node on loopback: cancelled jobs, and jobs that reach their time limit."""
 
 import os
 import shutil
@@ -71,7 +71,7 @@ def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
 
 
 def jobs(state: str = "RUNNING") -> set[str]:
-    """The jobs that run, or wait."""
+    """Running and waiting jobs."""
     command = ["squeue", "--noheader", "--states", state, "--format", "%A"]
     return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.split())
 
@@ -158,7 +158,7 @@ def test_job_script__says_what_is_set_as_each_batch_system_takes_it(tmp_path, ki
 
 
 def sbatch(folder: Path, script: str) -> str:
-    """A folder of programs whose ``sbatch`` does more than SLURM's, which it knows as $SBATCH."""
+    """A folder with an ``sbatch`` that wraps SLURM's own, which is in $SBATCH."""
     (folder / "programs").mkdir()
     program = folder / "programs" / "sbatch"
     program.write_text(f"#!/bin/sh\nSBATCH={shutil.which('sbatch')}\n{script}\n")

@@ -1,4 +1,4 @@
-"""A store that was damaged, or shares its folder with files of the user: right bytes or a clear line, nothing lost."""
+"""A damaged store, or one in a folder with files of the user: right bytes or a clear error, and nothing lost."""
 
 import itertools
 import json
@@ -59,7 +59,7 @@ def match(scene, out, *options, status=0):
 
 
 def unfinished(scene, out):
-    """A copy of the run that kept its tiles, without its end."""
+    """A copy of the run with its tiles, as if it had not finished."""
     shutil.copytree(scene / "kept", out)
     for name in OUTPUTS:
         (out / name).unlink()

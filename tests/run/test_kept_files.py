@@ -1,4 +1,4 @@
-"""The user's files are never lost: inputs, other files in a folder, and complete runs."""
+"""Files of the user are never lost: inputs, unrelated files in a folder, and a finished run."""
 
 import json
 import os
@@ -61,7 +61,7 @@ def pair(tmp_path):
 
 
 def refused(arguments, *parts):
-    """Run a command that must end with status 2, and one line."""
+    """Run a command that must end with status 2 and one line."""
     result = invoke(*arguments)
     assert result.exit_code == 2, result.output
     assert result.stderr.count("\n") == 1
@@ -77,7 +77,7 @@ def contents(folder):
 
 
 def swap(file, content):
-    """Put another file in the place of one, of the same size and time where it can be."""
+    """Replace a file by another, if possible of the same size and time."""
     status, new = file.stat(), file.with_name("new")
     new.write_bytes(content)
     os.utime(new, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -290,7 +290,7 @@ def test_log_file__is_no_input(pair):
 
 @pytest.fixture
 def finished(tmp_path):
-    """A run made up, with its images; its left image bears a name that each tool writes to."""
+    """A made-up run with its images; the left image has a name that each tool writes to."""
     return write_run(tmp_path, *random_bands(40, 50))
 
 
@@ -474,7 +474,7 @@ def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
 
 @pytest.fixture
 def elsewhere(tmp_path):
-    """A web server that counts what it is asked for, and a folder of the user's own that looks like a store."""
+    """A web server that counts its requests, and a folder of the user that looks like a store."""
     asked = []
 
     class Handler(BaseHTTPRequestHandler):

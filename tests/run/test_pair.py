@@ -1,4 +1,4 @@
-"""Files to files on real workers: the laws of tiles, resume, reports."""
+"""Whole runs on real workers: tiles against the whole image, resuming, reports."""
 
 import errno
 import json

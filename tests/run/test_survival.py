@@ -1,4 +1,4 @@
-"""What dies in the middle of a run costs time and nothing else: real processes, killed for real."""
+"""A process killed in the middle of a run costs time and nothing else: real processes, really killed."""
 
 import json
 import os
@@ -88,7 +88,7 @@ def is_worker(process: psutil.Process) -> bool:
 
 @contextmanager
 def started(*args: object, **options) -> Iterator[Command]:
-    """A command that does not outlive the test."""
+    """A command that is killed at the end of the test."""
     command = Command(*args, **options)
     workers: list[psutil.Process] = []
     try:
@@ -107,7 +107,7 @@ def kill(process: psutil.Process) -> None:
 
 
 def assert_complete(pair: Path, out: Path) -> None:
-    """The same bytes, band by band, as the run that nothing disturbed, and nothing else left behind."""
+    """Check for the same bytes, band by band, as the undisturbed run, and for no other files."""
     for name in ("intervals.tif", "validity.tif"):
         with rasterio.open(pair / "undisturbed" / name) as expected, rasterio.open(out / name) as found:
             for band in range(1, expected.count + 1):
@@ -121,7 +121,7 @@ def assert_nothing_final(out: Path) -> None:
 
 
 def half_written(out: Path) -> bool:
-    """Whether a tile's first array lies in the store and its record does not."""
+    """Whether the store has a tile's first array, but not its record."""
     first = {f"{file.parent.name}_{file.name}" for file in (out / "tiles/arrays.zarr/int16/c/0").glob("*/[0-9]*")}
     return bool({name for name in first if name.replace("_", "").isdigit()} - done_tiles(out))
 
@@ -142,7 +142,7 @@ def test_match__survives_kill_9_of_workers_at_random_moments(pair, tmp_path):
 
 
 def kill_while_writing(command: Command) -> None:
-    """Kill the workers in the middle of what a tile writes."""
+    """Kill the workers while a tile is written."""
     while True:
         wait_until(lambda: half_written(command.out) or command.ended, "a tile half written")
         assert not command.ended, command.output
@@ -191,7 +191,7 @@ def test_batch__goes_on_after_kill_9_and_does_only_what_is_missing(pair, tmp_pat
     command += ["--keep-tiles", "--quiet"]
 
     def done() -> dict[Path, int]:
-        """What is done of tiles and pairs, and when it was."""
+        """Finished tiles and pairs, with their times."""
         files = [*tmp_path.glob("*/tiles/records/[0-9]*.json"), *tmp_path.glob("*/run.json")]
         return {file: file.stat().st_mtime_ns for file in files}
 

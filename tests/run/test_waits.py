@@ -1,4 +1,4 @@
-"""Ends that would be none: pipes for files, YAML that grows without end, workers that say nothing."""
+"""Nothing waits forever: pipes in place of files, YAML that expands without end, silent workers."""
 
 import json
 import logging

@@ -39,9 +39,9 @@ PartitionName=debug Nodes=localhost Default=YES MaxTime=INFINITE State=UP
 
 @pytest.fixture(scope="session")
 def slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """SLURM at work, which SLURM_CONF names."""
+    """A running SLURM; SLURM_CONF names its configuration."""
     if os.geteuid() or not all(map(shutil.which, PROGRAMS)):
-        pytest.skip("SLURM takes root, and apt-get install slurm-wlm munge")
+        pytest.skip("SLURM needs root, and apt-get install slurm-wlm munge")
     folder = tmp_path_factory.mktemp("slurm")
     folder.chmod(0o755)
     key, conf = folder / "munge.key", folder / "slurm.conf"

@@ -1,4 +1,4 @@
-"""A web server on loopback that knows byte ranges and ETags."""
+"""A web server on loopback that supports byte ranges and ETags."""
 
 import hashlib
 import re

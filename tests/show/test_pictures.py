@@ -1,4 +1,4 @@
-"""Pictures: right size, not blank, showing what they claim, for results of all kinds."""
+"""Pictures are written for any results: of the right size, not blank, with the right content."""
 
 import json
 import os

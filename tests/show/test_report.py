@@ -163,7 +163,7 @@ class Page:
         return self.browser.execute_script("return document.querySelector('#band').getAttribute('d')")
 
     def map(self):
-        """What the map shows, as a picture in text."""
+        """The picture of the map as text."""
         return self.browser.execute_script("return document.querySelector('#map canvas').toDataURL()")
 
     def complaints(self):

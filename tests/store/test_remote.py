@@ -1,4 +1,4 @@
-"""Tiles in a bucket of a real S3 server: the same bytes, nothing lost when something dies."""
+"""Tiles in a bucket of a real S3 server: the same bytes, and nothing lost if a process is killed."""
 
 import json
 import os
@@ -22,7 +22,7 @@ TILES = 16
 
 
 def s3():
-    """A client other than the one that is tried."""
+    """A client other than the tested one."""
     return boto3.client("s3")
 
 
@@ -53,7 +53,7 @@ def ended(process: subprocess.Popen) -> tuple[int, str]:
 
 
 def objects(store: str) -> dict[str, datetime]:
-    """Names under a store, and when they were written."""
+    """Names in a store, with the times they were written."""
     prefix = store.removeprefix("s3://bucket/") + "/"
     pages = s3().get_paginator("list_objects_v2").paginate(Bucket="bucket", Prefix=prefix)
     found = (item for page in pages for item in page.get("Contents", []))
@@ -71,7 +71,7 @@ def wait_for_tiles(process: subprocess.Popen, store: str, count: int) -> None:
 
 @contextmanager
 def halted(process: subprocess.Popen) -> Iterator[list[psutil.Process]]:
-    """The run alive, its two workers halted, and all killed at the end."""
+    """A running run whose two workers are stopped; all processes are killed at the end."""
     workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
     for worker in workers:
         worker.suspend()
