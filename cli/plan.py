@@ -36,7 +36,7 @@ def plan(
     left: str,
     right: str,
     disparity: tuple[int, int] | None,
-    images: "Callable[[str, str], tuple[Image, Image]]",
+    open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     memory: str | None,
     config_file: "Path | None",
@@ -52,7 +52,7 @@ def plan(
 
     config = load_config(config_file, with_range(given, disparity))
     limit = parse_memory(memory) if memory else None
-    made = make_plan(*images(left, right), config, window=window, memory=limit)
+    made = make_plan(*open_images(left, right), config, window=window, memory=limit)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     one, together = _verdicts(made, limit, config.cluster.kind)
     lines = {
