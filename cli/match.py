@@ -35,7 +35,7 @@ def match(
     right: str,
     out: Path,
     disparity: tuple[int, int] | None,
-    images: "Callable[[str, str], tuple[Image, Image]]",
+    open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     dry_run: bool,
     config_file: Path | None,
@@ -69,7 +69,7 @@ def match(
 
         check_not_replaced([config_file], [out / name for name in OUTPUTS], [out / "tiles"])
         report = match_pair(
-            *images(left, right),
+            *open_images(left, right),
             out,
             config,
             window=window,

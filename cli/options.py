@@ -88,7 +88,7 @@ _SETTINGS_OPTIONS = (
 def image_options(command: Command) -> Command:
     """Add options for reading the images of a pair.
 
-    The command gets ``images``, a function that opens both images, and ``window``, the region of the left image or
+    The command gets ``open_images``, a function that opens both images, and ``window``, the region of the left image or
     None.
     """
 
@@ -98,10 +98,10 @@ def image_options(command: Command) -> Command:
 
         of_images = {name: given.pop(name) for name in _OF_IMAGES}
 
-        def images(left: str, right: str) -> "tuple[Image, Image]":
+        def open_images(left: str, right: str) -> "tuple[Image, Image]":
             return _opened(left, "left", of_images), _opened(right, "right", of_images)
 
-        return command(images=images, window=Window(*window) if window else None, **given)
+        return command(open_images=open_images, window=Window(*window) if window else None, **given)
 
     return _with(with_images, *_IMAGE_OPTIONS)
 

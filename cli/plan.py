@@ -36,7 +36,7 @@ def plan(
     left: str,
     right: str,
     disparity: tuple[int, int] | None,
-    images: "Callable[[str, str], tuple[Image, Image]]",
+    open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     memory: str | None,
     config_file: "Path | None",
@@ -54,7 +54,7 @@ def plan(
     config = load_config(config_file, with_range(given, disparity, config_file))
     limit = parse_memory(memory) if memory else None
     with Console(quiet=False) as console:
-        made = make_plan(*images(left, right), config, window=window, memory=limit, progress=console.progress)
+        made = make_plan(*open_images(left, right), config, window=window, memory=limit, progress=console.progress)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     one, together = _verdicts(made, limit, config.cluster.kind)
     at_once = "1 tile" if made.workers == 1 else f"{made.workers} tiles"

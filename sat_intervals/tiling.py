@@ -1,7 +1,10 @@
-"""Geometry of windows and tiles: which pixels a tile owns and which it needs."""
+"""Windows, their pixels, and tiles: which pixels a tile owns and which it needs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,22 @@ class Window:
     def relative_to(self, origin: "Window") -> "Window":
         """Return the same pixels, counted from the first pixel of ``origin``."""
         return Window(self.row - origin.row, self.column - origin.column, self.height, self.width)
+
+
+class View(NamedTuple):
+    """Pixels (float) and states (uint8) of a window of an image; outside the image the state is NO_DATA."""
+
+    window: Window
+    pixels: np.ndarray
+    state: np.ndarray
+
+    def inner(self, array: np.ndarray, window: Window) -> np.ndarray:
+        """Crop ``pixels`` or ``state`` to a window."""
+        return np.ascontiguousarray(array[window.relative_to(self.window).slices])
+
+
+Views = tuple[View, View]
+"""Views of the left and of the right image."""
 
 
 @dataclass(frozen=True)

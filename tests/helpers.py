@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 from sat_intervals.cli import main
 from sat_intervals.demo import Scene
 from sat_intervals.kernels.cost import between, census
-from sat_intervals.kernels.matching import Settings, match
+from sat_intervals.kernels.matching import Settings, match_costs
 from sat_intervals.products import INVALID
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.tiling import Window
@@ -65,7 +65,7 @@ def matched(scene, output=None, core=None, **options):
     """Raw products and right view of a scene of `reference`, of the whole patch by default."""
     left, right = codes_of(scene)
     output = output or Window(0, 0, *left.state.shape)
-    return match(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
+    return match_costs(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
 
 
 def bands(out):

@@ -150,7 +150,7 @@ def test_usable_memory_and_cores__are_the_least_of_all_limits(tmp_path, monkeypa
     assert machine.usable_cores() == len(os.sched_getaffinity(0))
 
 
-def told(what, prepare=None, root="/"):
+def printed(what, prepare=None, root="/"):
     """Memory or cores that a new process reports after it called ``prepare``."""
     code = f"from pathlib import Path; from sat_intervals import machine; machine._ROOT = Path({str(root)!r}); "
     command = [sys.executable, "-c", code + f"print(machine.{what}())"]

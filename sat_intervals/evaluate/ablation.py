@@ -15,14 +15,14 @@ from sat_intervals.evaluate.paper import METHODS
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import Area, View, Views, cost_areas, view_windows
+from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.memory import PROCESS_BYTES, check_memory, volume_bytes
 from sat_intervals.match.normalization import PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.patch import kernel_settings, match_right, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, cut_rows, postprocess_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY, Bands
-from sat_intervals.raster import Image, check_pair, open_image, read_window
-from sat_intervals.tiling import Window
+from sat_intervals.raster import Image, check_pair, open_image, read_views, read_window
+from sat_intervals.tiling import Views, Window
 
 # The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).
 _BASELINE = 1, 10
@@ -69,13 +69,12 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
     areas = patch_areas(whole, whole, config)
-    windows = zip((left, right), view_windows(areas, config), strict=True)
-    left_view, right_view = (View(window, *read_window(image, window)) for image, window in windows)
-    methods, scale = _all_methods((left_view, right_view), areas, whole, config, _statistics((left, right), config))
+    views = read_views((left, right), view_windows(areas, config))
+    methods, scale = _all_methods(views, areas, whole, config, _statistics((left, right), config))
     report: dict[str, Any] = {"cost": config.cost.method}
     criteria = criteria_of(config, tolerance)
     for method in METHODS:
-        strips = partial(_evaluated, *_settled(methods[method], method, config), scale, truth)
+        strips = partial(_final_strips, *_of_method(methods[method], method, config), scale, truth)
         report[method] = evaluate(strips, criteria)["all"]
     return report
 
@@ -130,7 +129,7 @@ def _all_methods(
     return methods, confidence_scale(config.ambiguity, histogram)
 
 
-def _settled(rows: RawRows, method: str, config: Config) -> tuple[RawRows, Config]:
+def _of_method(rows: RawRows, method: str, config: Config) -> tuple[RawRows, Config]:
     """Return products and settings of one method: only the last is regularised, the baseline is not filtered."""
     if method != METHODS[-1]:
         config = config.model_copy(update={"regularization": None})
@@ -140,7 +139,7 @@ def _settled(rows: RawRows, method: str, config: Config) -> tuple[RawRows, Confi
     return rows, config
 
 
-def _evaluated(rows: RawRows, config: Config, scale: ConfidenceScale, truth: Image) -> Iterator[Bands]:
+def _final_strips(rows: RawRows, config: Config, scale: ConfidenceScale, truth: Image) -> Iterator[Bands]:
     """Yield final bands and truth strip by strip: whole, they would need as much memory as the volume."""
     height, width = rows.winner.shape
     step = max(1, _STRIP_PIXELS // width)

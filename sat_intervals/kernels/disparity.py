@@ -140,7 +140,10 @@ def _medians_of_nine(values, kept, result):
 
 @njit(nogil=True)
 def _median_3(values, kept):
-    """Medians of 3 x 3 windows: the same operations on every pixel, kept or not, so that they vectorise."""
+    """Medians of 3 x 3 windows: the same operations on every pixel, kept or not, so that they vectorise.
+
+    1.9 ms at 600 x 600, 135 ms by `_median_around`.
+    """
     rows, columns = values.shape
     result = np.empty((rows, columns), np.float32)
     # The current row and its neighbours, with a border of pixels that are not kept.

@@ -198,20 +198,7 @@ def smallest(typing_context, vector):
     """Return the smallest lane."""
 
     def generate(context, builder, signature, arguments):
-        value = arguments[0]
-        width = LANES
-        while width > 8:  # down to 8 lanes: x86 has an instruction for the minimum of 8
-            width //= 2
-            halves = [
-                builder.shuffle_vector(
-                    value,
-                    ir.Constant(value.type, ir.Undefined),
-                    ir.Constant(ir.VectorType(_WORD, width), list(range(start, start + width))),
-                )
-                for start in (0, width)
-            ]
-            value = _call(builder, f"llvm.umin.v{width}i16", halves[0].type, halves)
-        return _call(builder, "llvm.vector.reduce.umin.v8i16", _HALF, (value,))
+        return _call(builder, f"llvm.vector.reduce.umin.v{LANES}i16", _HALF, arguments)
 
     return types.uint16(vector), generate
 

@@ -9,13 +9,12 @@ import xarray as xr
 from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.match.matching_cost import View
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.patch import match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import View, Window
 
 Array = np.ndarray | xr.DataArray
 

@@ -12,7 +12,7 @@ from sat_intervals.kernels.cost import Codes, Costs, between, census, padded_to_
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.match.mccnn import RADIUS, Network, load_network, weights_file
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
-from sat_intervals.tiling import Window, facing
+from sat_intervals.tiling import View, Views, Window, facing
 
 # Rows that go through the network at once; few, which limits the memory for features.
 STRIP = 64
@@ -66,22 +66,6 @@ class MatchingCost(NamedTuple):
     gradients: Gradients | None
     state: np.ndarray
     textureless: np.ndarray
-
-
-class View(NamedTuple):
-    """Pixels (float) and states (uint8) of a window of an image; outside the image the state is NO_DATA."""
-
-    window: Window
-    pixels: np.ndarray
-    state: np.ndarray
-
-    def inner(self, array: np.ndarray, window: Window) -> np.ndarray:
-        """Crop ``pixels`` or ``state`` to a window."""
-        return np.ascontiguousarray(array[window.relative_to(self.window).slices])
-
-
-Views = tuple[View, View]
-"""Views of the left and of the right image."""
 
 
 def view_windows(areas: Sequence[Area], config: Config) -> tuple[Window, Window]:

@@ -2,6 +2,7 @@
 
 from sat_intervals.config import Config, ConfigError, Mccnn
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.machine import usable_memory
 
 # A process before its first tile, with libraries and compiled kernels; measured 240 MB.
@@ -13,20 +14,15 @@ _PATCH_BYTES, _CORE_BYTES = 40, 60
 _NETWORK_BYTES = 140_000
 
 
-def _lanes(config: Config) -> int:
-    """Number of disparities, padded to whole vectors."""
-    return -(-config.disparity.count // 32) * 32
-
-
 def volume_bytes(height: int, width: int, config: Config) -> int:
     """Bytes of the cost volume, the largest part of matching, and of precomputed matching costs."""
-    return (3 if config.cost.precomputed else 2) * height * width * _lanes(config)
+    return (3 if config.cost.precomputed else 2) * height * width * padded_to_lanes(config.disparity.count)
 
 
 def tile_bytes(config: Config, size: int | None = None) -> int:
     """Bytes that matching a tile needs on top of its process; ``size`` replaces ``tiles.size`` of the settings."""
     size = size or config.tiles.size
-    lanes = _lanes(config)
+    lanes = padded_to_lanes(config.disparity.count)
     patch = size + 2 * config.tiles.overlap
     volume = 2 * (size + 2) ** 2 * lanes
     accurate = config.cross_check is not None and config.cross_check.method == "accurate"

@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, CosineSgm, Sgm
-from sat_intervals.kernels.matching import Raw, RightView, Settings, match
-from sat_intervals.match.matching_cost import Area, MatchingCost, Views, cost_areas, view_windows
+from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
+from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
-from sat_intervals.tiling import Window, facing
+from sat_intervals.tiling import Views, Window, facing
 
 
 class Patch(NamedTuple):
@@ -47,36 +47,36 @@ def kernel_settings(config: Config) -> Settings:
     )
 
 
-def patch_areas(core: Window, image: Window, config: Config) -> list[Area]:
+def patch_areas(core: Window, whole: Window, config: Config) -> list[Area]:
     """Area of a core with its overlap and, for accurate cross-checking, that of the right view.
 
-    ``image`` is the window of all left pixels. The overlap may leave the region, but not the image.
+    ``whole`` is the window of all left pixels. The overlap may leave the region, but not the image.
     """
     overlap = config.tiles.overlap
-    areas = [Area.of(core.grown(overlap, overlap).clipped(image), config)]
+    areas = [Area.of(core.grown(overlap, overlap).clipped(whole), config)]
     if config.cross_check and config.cross_check.method == "accurate":
-        areas.append(_right_area(core, image, config))
+        areas.append(_right_area(core, whole, config))
     return areas
 
 
-def _right_area(core: Window, image: Window, config: Config) -> Area:
+def _right_area(core: Window, whole: Window, config: Config) -> Area:
     """Area of the right pixels that face a core, with their overlap; they may be outside the right image."""
     search, overlap = config.disparity, config.tiles.overlap
     reach = facing(core, search.minimum, search.maximum)
-    rows = Window(image.row, reach.column - overlap, image.height, reach.width + 2 * overlap)
+    rows = Window(whole.row, reach.column - overlap, whole.height, reach.width + 2 * overlap)
     return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
 
 
-def patch_windows(core: Window, image: Window, config: Config) -> tuple[Window, Window]:
+def patch_windows(core: Window, whole: Window, config: Config) -> tuple[Window, Window]:
     """Windows of both images that matching a core needs; see `patch_areas`."""
-    return view_windows(patch_areas(core, image, config), config)
+    return view_windows(patch_areas(core, whole, config), config)
 
 
 def match_patch(
     views: Views,
     core: Window,
     region: Window,
-    image: Window,
+    whole: Window,
     config: Config,
     statistics: PairStatistics | None = None,
 ) -> Patch:
@@ -90,7 +90,7 @@ def match_patch(
         Left pixels whose products are kept.
     region
         Left pixels of the whole run.
-    image
+    whole
         All pixels of the left image.
     config
         Settings.
@@ -99,11 +99,11 @@ def match_patch(
     """
     settings = kernel_settings(config)
     output = core.grown(1, 1).clipped(region)
-    area, *of_right = patch_areas(core, image, config)
+    area, *of_right = patch_areas(core, whole, config)
     cost, *cost_of_right = cost_areas(views, [area, *of_right], config, statistics)
     wants_fast = config.cross_check is not None and config.cross_check.method == "fast"
     right_core = core if wants_fast else Window(core.row, core.column, 0, 0)
-    raw, right_view = match(
+    raw, right_view = match_costs(
         cost.costs, settings, output.relative_to(area.base), right_core.relative_to(area.base), cost.gradients
     )
     inside = output.relative_to(area.base).slices
@@ -129,5 +129,5 @@ def match_right(cost: MatchingCost, area: Area, core: Window, settings: Settings
     maximum = settings.minimum + settings.count - 1
     mirrored = settings._replace(minimum=-maximum, cut_level=-1, weights=np.zeros(0, np.uint16), refine=False)
     reach = facing(core, settings.minimum, maximum).relative_to(area.base)
-    raw, _ = match(cost.costs, mirrored, reach, reach, cost.gradients)
+    raw, _ = match_costs(cost.costs, mirrored, reach, reach, cost.gradients)
     return RightView(raw.cost, np.where(raw.winner == NO_DISPARITY, NO_DISPARITY, -raw.winner).astype(np.int16))

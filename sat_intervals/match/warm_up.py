@@ -3,11 +3,10 @@
 import numpy as np
 
 from sat_intervals.config import Config
-from sat_intervals.match.matching_cost import View
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import View, Window
 
 
 def compile_kernels(config: Config) -> None:

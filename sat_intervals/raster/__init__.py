@@ -16,7 +16,7 @@ from sat_intervals.raster.layers import (
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
 from sat_intervals.raster.surfaces import check_reference, is_surface, read_heights, read_place, resolution_of
-from sat_intervals.raster.windows import read_window
+from sat_intervals.raster.windows import read_views, read_window
 from sat_intervals.raster.writer import OutputError, OutputWriter, check_space, remove_scratch
 
 __all__ = [
@@ -45,6 +45,7 @@ __all__ = [
     "read_small_image",
     "read_small_layers",
     "read_tags",
+    "read_views",
     "read_window",
     "remove_scratch",
     "resolution_of",

@@ -1,16 +1,24 @@
 """Read any window of an image, with the states of its pixels."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.products import MASKED, NO_DATA
 from sat_intervals.raster.images import Image, InputError, opened
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import View, Views, Window
 
 # Types whose values are all exact in float32.
 _FLOAT32_HOLDS = {"uint8", "int8", "uint16", "int16", "float16", "float32"}
 # Integers up to this are exact in float64.
 _EXACT = 2**53
+
+
+def read_views(images: Iterable[Image], windows: Iterable[Window]) -> Views:
+    """Read a window of the left and one of the right image; see `read_window`."""
+    left, right = (View(window, *read_window(image, window)) for image, window in zip(images, windows, strict=True))
+    return left, right
 
 
 def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:

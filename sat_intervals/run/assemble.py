@@ -15,6 +15,7 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
@@ -71,8 +72,8 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         No pixel could be matched.
     """
     config, store, region = job.config, job.store, job.store.grid.region
-    records, normalization = store.records(), store.normalization()
-    _check_done(job, records, normalization)
+    records, statistics = store.records(), job.statistics()
+    _check_done(job, records)
     histogram, seams = store.histogram(records), store.seams(records)
     _check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
@@ -95,7 +96,7 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         for stage in ("read", "match", "write"):
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
-        report = _report(job, normalization, scale, tally, seconds, seams) | {"files": files}
+        report = _report(job, statistics, scale, tally, seconds, seams) | {"files": files}
         _warn_of_ambiguity(job, report["counts"])
         if not keep_tiles:
             mark_finished(store.home, job.name)
@@ -126,12 +127,8 @@ def _prefetched(items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _check_done(job: Job, records: Records, normalization: dict[str, Any] | None) -> None:
-    """Raise if tiles or image statistics are missing; a retry restores them."""
-    if job.config.cost.needs_statistics and normalization is None:
-        raise DamagedTilesError(
-            f"the image statistics in {job.store.folder} are missing: rerun the same command: it resumes"
-        )
+def _check_done(job: Job, records: Records) -> None:
+    """Raise if tiles are missing; a retry restores them."""
     missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
         raise DamagedTilesError(
@@ -183,7 +180,7 @@ def _tags(config: Config) -> dict[str, str]:
 
 def _report(
     job: Job,
-    normalization: dict[str, Any] | None,
+    statistics: PairStatistics | None,
     scale: ConfidenceScale,
     tally: Tally,
     seconds: dict[str, float],
@@ -204,7 +201,7 @@ def _report(
             "overlap": config.tiles.overlap,
         },
         "cost_span": config.cost_span,
-        "normalization": normalization,
+        "normalization": statistics and statistics.report(),
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),
         "counts_meaning": _COUNTS_MEANING,

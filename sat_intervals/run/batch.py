@@ -25,7 +25,7 @@ from sat_intervals.run.cluster import connected
 from sat_intervals.run.inputs import changes_since
 from sat_intervals.run.job import Job, fitted_to_jobs, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
-from sat_intervals.run.pair import assembled, check_failures, matched, measure_images
+from sat_intervals.run.pair import assemble_repaired, check_failures, match_jobs, measure_images
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
@@ -198,7 +198,7 @@ def _matched(
             except RunError as error:
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
-        for job, failures in matched(client, list(measured.values()), progress):
+        for job, failures in match_jobs(client, list(measured.values()), progress):
             assembling[thread.submit(_assembled, client, job, failures, keep_tiles, check)] = names[id(job)]
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()
@@ -237,13 +237,13 @@ def _assembled(
 ) -> dict[str, Any]:
     def match() -> None:
         measure_images(client, job, progress)
-        for _, failures in matched(client, [job], progress):
+        for _, failures in match_jobs(client, [job], progress):
             check_failures(job, failures)
 
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assembled(job, match, {}, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, match, {}, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others

@@ -12,6 +12,7 @@ from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.mccnn import load_network, weights_file
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
+from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.cluster import parse_memory
@@ -19,7 +20,7 @@ from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.output import OUTPUTS, check_output, holds_run, is_complete
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import LAYOUT, Store, finished_run, inputs_before
+from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run, inputs_before
 from sat_intervals.tiling import Grid, Tile, Window
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
@@ -90,6 +91,23 @@ class Job:
         check_unchanged(self.files)
         if isinstance(self.config.cost, Mccnn):
             check_weights(self.config.cost, self.inputs["weights"])
+
+    def statistics(self) -> PairStatistics | None:
+        """Return mean and standard deviation of both images, None if the run needs none.
+
+        Raises
+        ------
+        DamagedTilesError
+            They are missing in the store; a retry restores them.
+        """
+        if not self.config.cost.needs_statistics:
+            return None
+        normalization = self.store.normalization()
+        if normalization is None:
+            raise DamagedTilesError(
+                f"the image statistics in {self.store.folder} are missing: rerun the same command: it resumes"
+            )
+        return PairStatistics.of_report(normalization)
 
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""

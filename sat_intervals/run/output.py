@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import RUN_FILES
 from sat_intervals.store.tiles import finished_run, has_begun, is_replacing
 
-OUTPUTS = ("intervals.tif", "validity.tif", "run.json")
+OUTPUTS = (*(file.name for file in RUN_FILES), "run.json")
 
 
 def check_output(out: Path, overwrite: bool) -> None:

@@ -85,7 +85,7 @@ def match_pair(
                 with connected(job.config.cluster, job.out) as client:
                     with logged_stage(seconds, "tiles.images"):
                         measure_images(client, job, progress)
-                    for _, failures in matched(client, [job], progress):
+                    for _, failures in match_jobs(client, [job], progress):
                         check_failures(job, failures)
 
     with LocalFolder(job.store.home).locked():
@@ -103,13 +103,13 @@ def match_pair(
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
             match()
-            report = assembled(job, match, seconds, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     return report
 
 
-def assembled(
+def assemble_repaired(
     job: Job, match: Callable[[], None], seconds: dict[str, float], progress: Progress, *, keep_tiles: bool
 ) -> dict[str, Any]:
     """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles."""
@@ -173,7 +173,9 @@ def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
         ) from min(failures.items())[1]
 
 
-def matched(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[tuple[Job, dict[str, BaseException]]]:
+def match_jobs(
+    client: Client, jobs: Sequence[Job], progress: Progress
+) -> Iterator[tuple[Job, dict[str, BaseException]]]:
     """Match the unfinished tiles of jobs; yield each job after its last tile, with its failures by tile.
 
     Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the

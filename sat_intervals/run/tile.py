@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.match.matching_cost import View
-from sat_intervals.match.normalization import Moments, PairStatistics, moments
+from sat_intervals.match.normalization import Moments, moments
 from sat_intervals.match.patch import Patch, match_patch, patch_windows
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
-from sat_intervals.raster import Image, read_window
+from sat_intervals.raster import Image, read_views, read_window
 from sat_intervals.raster.identity import check_unchanged
 from sat_intervals.run.job import Job
 from sat_intervals.run.seams import seam_lines
@@ -50,32 +49,22 @@ def _match_tile(job: Job, tile: Tile) -> None:
     job.store.check(job.manifest)
     job.check_inputs()  # before any work
     job.store.check_space(tile)
-    statistics = _checked_statistics(job)
+    statistics = job.statistics()
     seconds: dict[str, float] = {}
     whole = Window(0, 0, job.left.height, job.left.width)
-    windows = zip((job.left, job.right), patch_windows(tile.core, whole, job.config), strict=True)
+    windows = patch_windows(tile.core, whole, job.config)
     try:
         with timed(seconds, "read"):
-            left, right = (View(window, *read_window(image, window)) for image, window in windows)
+            views = read_views((job.left, job.right), windows)
     finally:  # a changed input explains a read error
         job.check_inputs()
     with timed(seconds, "match"):
-        patch = match_patch((left, right), tile.core, job.store.grid.region, whole, job.config, statistics)
+        patch = match_patch(views, tile.core, job.store.grid.region, whole, job.config, statistics)
     with timed(seconds, "write"):
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    usable = {side: int((view.state == 0).sum()) for side, view in (("left", left), ("right", right))}
+    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
-
-
-def _checked_statistics(job: Job) -> PairStatistics | None:
-    """Return mean and standard deviation of the images if the matching cost needs them, else None."""
-    if not job.config.cost.needs_statistics:
-        return None
-    normalization = job.store.normalization()
-    if normalization is None:
-        raise RunError(f"the image statistics in {job.store.folder} are missing: rerun the same command: it resumes")
-    return PairStatistics.of_report(normalization)
 
 
 def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:

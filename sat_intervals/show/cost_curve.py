@@ -7,11 +7,11 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.matching_cost import Area, View, cost_areas, view_windows
+from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import FLAGS, IMPOSSIBLE_COST
-from sat_intervals.raster import read_window
+from sat_intervals.raster import read_views
 from sat_intervals.results import Results
 from sat_intervals.tiling import Window
 
@@ -66,11 +66,10 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     base = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
     area = Area.of(base, config)
     settings = kernel_settings(config)
-    windows = zip((results.left, results.right), view_windows([area], config), strict=True)
-    left, right = (View(window, *read_window(image, window)) for image, window in windows)
+    views = read_views((results.left, results.right), view_windows([area], config))
     normalization = results.report.get("normalization")
     statistics = PairStatistics.of_report(normalization) if normalization else None
-    (cost,) = cost_areas((left, right), [area], config, statistics)
+    (cost,) = cost_areas(views, [area], config, statistics)
     volume = cost_volume(cost.costs, settings, cost.gradients)
     curve = np.ascontiguousarray(volume[pixel.relative_to(base).slices])
     possible = curve[0, 0] != IMPOSSIBLE_COST

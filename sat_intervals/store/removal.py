@@ -38,7 +38,7 @@ def drop(folder: Folder) -> None:
     folder.delete_if_empty()
 
 
-def check_free(folder: Folder) -> None:
+def check_not_foreign(folder: Folder) -> None:
     """Raise if a run would overwrite files in a folder that no run made, or write through a link.
 
     Raises

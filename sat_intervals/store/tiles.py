@@ -23,7 +23,7 @@ from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
-from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_free, drop, is_of_run
+from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_not_foreign, drop, is_of_run
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -99,7 +99,7 @@ class Store:
         home, folder = folder_at(self.home), self.folder
         try:
             before = self._place_before(overwrite)
-            check_free(folder)
+            check_not_foreign(folder)
             text = None if overwrite or before is None else before.read(MANIFEST) or None
             if before is not None and text is not None:
                 check_same(text, before, manifest)

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from sat_intervals.config import Ambiguity
 from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
 from sat_intervals.kernels.cost import Codes, between
-from sat_intervals.kernels.matching import Settings, match
+from sat_intervals.kernels.matching import Settings, match_costs
 from sat_intervals.match.postprocess import confidence_scale
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
@@ -26,7 +26,7 @@ X = IMPOSSIBLE_COST
 
 
 # ---- Ambiguity ---------------------------------------------------------------------------------------------
-def test_match__ambiguity_worked_example():
+def test_match_costs__ambiguity_worked_example():
     # Census 5 without SGM: span 24. Etas 0, .05, .1: costs up to 0, 1 (1.2), 2 (2.4) above the least.
     #     9 3 5 9     6 0 2 6 above: 1 + 1 + 2 = 4
     #     4 4 4 7     0 0 0 3 above: 3 + 3 + 3 = 9
@@ -38,7 +38,7 @@ def test_match__ambiguity_worked_example():
     scene = SimpleNamespace(window=5, minimum=-2, count=4, p1=8, p2=32, regularized=False)
     parameters = Settings(**reference.settings_of(scene, eta_max="0.15", eta_step="0.05"))
     assert parameters.weights.tolist() == [3, 2, 1] + 22 * [0]
-    raw, _ = match(between(left, right), parameters, Window(0, 0, 3, 1))
+    raw, _ = match_costs(between(left, right), parameters, Window(0, 0, 3, 1))
     assert raw.ambiguity.tolist() == [[4], [9], [7]]
     assert reference.ambiguity(curves[:, np.newaxis], "0.15", "0.05", 24).tolist() == [[4], [9], [7]]
 
@@ -46,7 +46,7 @@ def test_match__ambiguity_worked_example():
 @pytest.mark.parametrize("etas", [("0.7", "0.01"), ("0.33", "0.1"), ("1", "0.07"), ("0.01", "0.01")])
 @bounded
 @given(scene=reference.scenes())
-def test_match__ambiguity_equals_reference(etas, scene):
+def test_match_costs__ambiguity_equals_reference(etas, scene):
     raw = matched(scene, eta_max=etas[0], eta_step=etas[1])[0]
     expected = reference.ambiguity(reference.volume_of(scene), *etas, reference.span_of(scene))
     np.testing.assert_array_equal(raw.ambiguity, expected)
@@ -56,7 +56,7 @@ def test_match__ambiguity_equals_reference(etas, scene):
 @pytest.mark.parametrize("count", COUNTS)
 @few
 @given(data=st.data())
-def test_match__ambiguity_equals_reference_at_every_count(count, data):
+def test_match_costs__ambiguity_equals_reference_at_every_count(count, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=6))
     expected = reference.ambiguity(reference.volume_of(scene), "0.7", "0.01", reference.span_of(scene))
     np.testing.assert_array_equal(matched(scene)[0].ambiguity, expected)
@@ -64,7 +64,7 @@ def test_match__ambiguity_equals_reference_at_every_count(count, data):
 
 @few
 @given(scene=reference.scenes())
-def test_match__ambiguity_is_bounded(scene):
+def test_match_costs__ambiguity_is_bounded(scene):
     # At least the winner counts for each of the 70 etas, at most the whole range does.
     raw = matched(scene)[0]
     found = raw.winner != NO_DISPARITY
@@ -75,7 +75,7 @@ def test_match__ambiguity_is_bounded(scene):
 
 @few
 @given(scene=reference.scenes())
-def test_match__without_ambiguity(scene):
+def test_match_costs__without_ambiguity(scene):
     (raw, _), (whole, _) = matched(scene, eta_max=None), matched(scene)
     assert (raw.ambiguity == 0).all()
     for name in ("winner", "lower", "upper", "disparity", "validity"):

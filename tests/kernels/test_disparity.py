@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.disparity import cross_check, median
-from sat_intervals.kernels.matching import Settings, match
+from sat_intervals.kernels.matching import Settings, match_costs
 from sat_intervals.products import (
     IMPOSSIBLE_COST,
     LEFT_WINDOW,
@@ -47,14 +47,14 @@ def bare(left_levels, right_levels, minimum=0, **options):
     count = codes[1].state.shape[1] - codes[0].state.shape[1] + 1
     scene = SimpleNamespace(window=5, minimum=minimum, count=count, p1=8, p2=32, regularized=False)
     parameters = Settings(**reference.settings_of(scene, **options))
-    return match(between(*codes), parameters, Window(0, 0, *codes[0].state.shape))
+    return match_costs(between(*codes), parameters, Window(0, 0, *codes[0].state.shape))
 
 
 # ---- Winner and refinement ---------------------------------------------------------------------------------
 CURVES = np.array([[9, 3, 5, 9], [4, 4, 4, 7], [X, 2, 6, 4]])  # three pixels, four disparities from -2
 
 
-def test_match__winner_and_refinement_worked_example():
+def test_match_costs__winner_and_refinement_worked_example():
     # 9 3 5 9: least at k = 1, d = -1; shift (9 - 5) / (2 (9 - 3)) = 1/3.
     # 4 4 4 7: the smallest of the ties, k = 0, d = -2, at the range's end: not refined.
     # . 2 6 4: k = 1, d = -1, beside an impossible candidate: not refined, and the range is incomplete.
@@ -71,7 +71,7 @@ def test_match__winner_and_refinement_worked_example():
     assert refined.tolist() == [[True], [False], [False]]
 
 
-def test_match__without_refinement():
+def test_match_costs__without_refinement():
     raw, _ = bare(np.zeros((3, 1), int), CURVES, minimum=-2, refine=False)
     assert raw.disparity.tolist() == [[-1], [-2], [-1]]
     assert raw.validity.tolist() == [[NOT_REFINED], [NOT_REFINED], [NOT_REFINED | RANGE_INCOMPLETE]]
@@ -80,7 +80,7 @@ def test_match__without_refinement():
 @pytest.mark.parametrize("refine", [True, False])
 @bounded
 @given(scene=reference.scenes())
-def test_match__equals_reference(refine, scene):
+def test_match_costs__equals_reference(refine, scene):
     raw, right_view = matched(scene, refine=refine)
     volume = reference.volume_of(scene)
     winner = reference.winner_takes_all(volume)
@@ -103,7 +103,7 @@ def test_match__equals_reference(refine, scene):
 @pytest.mark.parametrize("count", COUNTS)
 @few
 @given(data=st.data())
-def test_match__equals_reference_at_every_count(count, refine, data):
+def test_match_costs__equals_reference_at_every_count(count, refine, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=9))
     raw, right_view = matched(scene, refine=refine)
     volume = reference.volume_of(scene)
@@ -120,7 +120,7 @@ def test_match__equals_reference_at_every_count(count, refine, data):
 
 @bounded
 @given(scene=reference.scenes(), data=st.data())
-def test_match__any_part_equals_the_whole(scene, data):
+def test_match_costs__any_part_equals_the_whole(scene, data):
     # Only what is wanted differs, never a value; the right view is made of the core's pixels alone.
     raw, _ = matched(scene)
     rows, columns = raw.winner.shape
@@ -141,7 +141,7 @@ def test_match__any_part_equals_the_whole(scene, data):
 
 @few
 @given(scene=reference.scenes())
-def test_match__disparity_is_within_half_a_pixel_of_the_winner(scene):
+def test_match_costs__disparity_is_within_half_a_pixel_of_the_winner(scene):
     raw, _ = matched(scene)
     found = raw.winner != N
     assert np.isnan(raw.disparity[~found]).all()
@@ -150,7 +150,7 @@ def test_match__disparity_is_within_half_a_pixel_of_the_winner(scene):
 
 @few
 @given(scene=reference.scenes(), offset=st.integers(-1000, 1000))
-def test_match__unchanged_by_a_constant_on_both_images(scene, offset):
+def test_match_costs__unchanged_by_a_constant_on_both_images(scene, offset):
     before, right_before = matched(scene)
     scene.left, scene.right = scene.left + offset, scene.right + offset
     after, right_after = matched(scene)
@@ -160,7 +160,7 @@ def test_match__unchanged_by_a_constant_on_both_images(scene, offset):
 
 @few
 @given(scene=reference.scenes(), shift=st.integers(-300, 300))
-def test_match__moves_with_the_search_range(scene, shift):
+def test_match_costs__moves_with_the_search_range(scene, shift):
     before, right_before = matched(scene)
     scene.minimum += shift
     after, right_after = matched(scene)
@@ -171,7 +171,7 @@ def test_match__moves_with_the_search_range(scene, shift):
 
 
 # ---- The right view ----------------------------------------------------------------------------------------
-def test_match__right_view_worked_example():
+def test_match_costs__right_view_worked_example():
     # Left levels 2 4 9, right levels 2 3 8 9, disparities -1 and 0. Costs S(c, k) = |left[c] - right[c + k]|:
     #     c = 0: 0 1     c = 1: 1 4     c = 2: 1 0
     # Right column 1 sees c = 1 at k = 0 and c = 0 at k = 1, both at cost 1: the largest d, 0.
@@ -186,7 +186,7 @@ def test_match__right_view_worked_example():
     assert costs.tolist() == [[0, 1, 1, 0]]
 
 
-def test_match__right_view_of_unusable_pixels():
+def test_match_costs__right_view_of_unusable_pixels():
     _, right_view = bare([[2, 4, 9]], [[2, X, 8, X]], minimum=-1)
     assert right_view.winner.tolist() == [[-1, N, -1, N]]
     assert right_view.cost.tolist() == [[0, X, 1, X]]
@@ -194,7 +194,7 @@ def test_match__right_view_of_unusable_pixels():
 
 @few
 @given(scene=reference.scenes(counts=(3, 9, 33), columns=14), data=st.data())
-def test_match__right_view_merges_from_parts(scene, data):
+def test_match_costs__right_view_merges_from_parts(scene, data):
     # Columns cut anywhere: the smallest cost of the shares, the largest disparity at ties.
     left, _ = codes_of(scene)
     rows, columns = left.state.shape
@@ -215,7 +215,7 @@ def test_match__right_view_merges_from_parts(scene, data):
 
 
 # ---- Validity ----------------------------------------------------------------------------------------------
-def test_match__validity_worked_example():
+def test_match_costs__validity_worked_example():
     # Three rows of four pixels, disparities 0 and 1. Right states (0 usable, 1 no data, 2 masked):
     #     0 0 1 1 0     each pixel faces two:    0 0   0 1   1 1   1 0
     #     2 1 2 0 0                              2 1   1 2   2 0   0 0
@@ -226,7 +226,7 @@ def test_match__validity_worked_example():
     state = np.array([[0, 0, 1, 1, 0], [2, 1, 2, 0, 0], [0, 0, 0, 0, 0]], np.uint8)
     right = Codes(np.zeros((1, 3, 5), np.uint32), state)
     scene = SimpleNamespace(window=3, minimum=0, count=2, p1=1, p2=2, regularized=True)
-    raw, _ = match(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 3, 4))
+    raw, _ = match_costs(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 3, 4))
     part = RANGE_INCOMPLETE | NOT_REFINED
     expected = [
         [NOT_REFINED, part, NO_CANDIDATE, part],
@@ -239,18 +239,18 @@ def test_match__validity_worked_example():
     assert reference.validity(usable, left.state, state, refined).tolist() == expected
 
 
-def test_match__left_window_and_no_candidate_stand_together():
+def test_match_costs__left_window_and_no_candidate_stand_together():
     left = Codes(np.zeros((1, 1, 1), np.uint32), np.full((1, 1), NO_DATA, np.uint8))
     scene = SimpleNamespace(window=3, minimum=0, count=2, p1=1, p2=2, regularized=True)
     for states, bit in (([1, 1], NO_CANDIDATE), ([1, 2], RIGHT_MASKED), ([3, 1], RIGHT_MASKED), ([0, 1], 0)):
         right = Codes(np.zeros((1, 1, 2), np.uint32), np.array([states], np.uint8))
-        raw, _ = match(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 1, 1))
+        raw, _ = match_costs(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 1, 1))
         assert raw.validity.item() == LEFT_WINDOW | bit
 
 
 @few
 @given(scene=reference.scenes())
-def test_match__pixels_without_candidate_say_why(scene):
+def test_match_costs__pixels_without_candidate_say_why(scene):
     raw, _ = matched(scene)
     unmatched = (raw.validity & (LEFT_WINDOW | NO_CANDIDATE | RIGHT_MASKED)) != 0
     np.testing.assert_array_equal(unmatched, raw.winner == N)

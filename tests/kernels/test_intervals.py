@@ -14,13 +14,12 @@ from hypothesis import strategies as st
 from sat_intervals.config import load_config
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
-from sat_intervals.kernels.matching import Settings, match
+from sat_intervals.kernels.matching import Settings, match_costs
 from sat_intervals.match.in_memory import match_arrays
-from sat_intervals.match.matching_cost import View
 from sat_intervals.match.patch import match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import View, Window
 
 bounded = settings(max_examples=60, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
@@ -39,14 +38,16 @@ def of_curves(curves, minimum, **options):
     left = Codes(np.zeros((1, rows, 1), np.uint32), np.zeros((rows, 1), np.uint8))
     right = Codes(words.astype(np.uint32)[np.newaxis], np.where(curves == X, NO_DATA, 0).astype(np.uint8))
     scene = SimpleNamespace(window=5, minimum=minimum, count=count, p1=8, p2=32, regularized=False)
-    return match(between(left, right), Settings(**reference.settings_of(scene, **options)), Window(0, 0, rows, 1))[0]
+    return match_costs(
+        between(left, right), Settings(**reference.settings_of(scene, **options)), Window(0, 0, rows, 1)
+    )[0]
 
 
 # ---- Alpha-cut ---------------------------------------------------------------------------------------------
 CURVES = [[9, 3, 5, 9], [4, 4, 4, 7], [X, 2, 6, 4]]  # three pixels, four disparities from -2
 
 
-def test_match__interval_worked_example():
+def test_match_costs__interval_worked_example():
     # Census 5 without SGM: span 24; alpha .9: costs up to floor(2.4) = 2 above the least.
     #     9 3 5 9     cut -1 0; at -1 stands the least, so it is pushed out: -2 0
     #     4 4 4 7     cut -2 0; both ends have the least: -3 is beyond the range, so -2 1
@@ -60,7 +61,7 @@ def test_match__interval_worked_example():
     assert upper.tolist() == [[2], [3], [3]]
 
 
-def test_match__interval_without_refinement_is_the_cut():
+def test_match_costs__interval_without_refinement_is_the_cut():
     raw = of_curves(CURVES, -2, refine=False)
     assert raw.lower.tolist() == [[-1], [-2], [-1]]
     assert raw.upper.tolist() == [[0], [0], [1]]
@@ -69,7 +70,7 @@ def test_match__interval_without_refinement_is_the_cut():
     assert upper.tolist() == [[2], [2], [3]]
 
 
-def test_match__ties_belong_to_the_cut():
+def test_match_costs__ties_belong_to_the_cut():
     # Alpha .75: (1 - .75) * 24 = 6 above the least belongs, 7 does not.
     assert of_curves([[3, 9, 20]], 0, alpha="0.75").upper.tolist() == [[1]]
     assert of_curves([[3, 10, 9]], 0, alpha="0.75").upper.tolist() == [[2]]
@@ -90,7 +91,7 @@ def test_cut_level__says_the_same_as_possibility(alpha, cost_span):
 @pytest.mark.parametrize("refine", [True, False])
 @bounded
 @given(scene=reference.scenes(), alpha=st.sampled_from(ALPHAS))
-def test_match__interval_equals_reference(refine, scene, alpha):
+def test_match_costs__interval_equals_reference(refine, scene, alpha):
     raw = matched(scene, alpha=alpha, refine=refine)[0]
     bounds = reference.alpha_cut(reference.volume_of(scene), alpha, reference.span_of(scene), refine)
     for bound, expected in zip((raw.lower, raw.upper), bounds, strict=True):
@@ -100,7 +101,7 @@ def test_match__interval_equals_reference(refine, scene, alpha):
 @pytest.mark.parametrize("count", COUNTS)
 @few
 @given(data=st.data())
-def test_match__interval_equals_reference_at_every_count(count, data):
+def test_match_costs__interval_equals_reference_at_every_count(count, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=6))
     alpha = data.draw(st.sampled_from(ALPHAS))
     raw = matched(scene, alpha=alpha)[0]
@@ -111,7 +112,7 @@ def test_match__interval_equals_reference_at_every_count(count, data):
 
 @few
 @given(scene=reference.scenes(), refine=st.booleans())
-def test_match__a_smaller_alpha_never_narrows(scene, refine):
+def test_match_costs__a_smaller_alpha_never_narrows(scene, refine):
     alphas = ["0.99", "0.95", "0.9", "0.7", "0.4", "0.1"]
     raws = [matched(scene, alpha=alpha, refine=refine)[0] for alpha in alphas]
     for narrow, wide in pairwise(raws):
@@ -122,7 +123,7 @@ def test_match__a_smaller_alpha_never_narrows(scene, refine):
 
 @few
 @given(scene=reference.scenes(), refine=st.booleans(), alpha=st.sampled_from(ALPHAS))
-def test_match__interval_holds_the_disparity(scene, refine, alpha):
+def test_match_costs__interval_holds_the_disparity(scene, refine, alpha):
     raw = matched(scene, refine=refine, alpha=alpha)[0]
     found = raw.winner != N
     assert (raw.lower[found] <= raw.disparity[found]).all()
@@ -135,7 +136,7 @@ def test_match__interval_holds_the_disparity(scene, refine, alpha):
 
 @few
 @given(scene=reference.scenes())
-def test_match__without_interval(scene):
+def test_match_costs__without_interval(scene):
     (raw, _), (whole, _) = matched(scene, alpha=None), matched(scene)
     assert (raw.lower == N).all()
     assert (raw.upper == N).all()

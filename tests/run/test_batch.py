@@ -27,7 +27,7 @@ from sat_intervals.run import batch
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.cluster import connected, parse_memory
 from sat_intervals.run.job import prepare
-from sat_intervals.run.pair import match_pair, matched
+from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_tile
 from sat_intervals.store.folder import LocalFolder
@@ -243,7 +243,7 @@ def test_match_batch__that_fails_to_overwrite_is_gone_on_with(images, tmp_path, 
         raise RunError("no more disk")
 
     with monkeypatch.context() as patch:
-        patch.setattr(batch, "assembled", fail)
+        patch.setattr(batch, "assemble_repaired", fail)
         report = match_batch(pairs, tmp_path, {"median": None}, overwrite=True)
     assert {end["state"] for end in report.values()} == {"failed"}
     assert hashes(tmp_path / "pair1") == before
@@ -301,7 +301,7 @@ def test_status__of_a_batch_goes_on_after_a_pair_without_a_run(images, tmp_path)
     assert result.stdout == f"{tmp_path / 'pair1'}: done\n{tmp_path / 'pair2'}: complete\n"
 
 
-def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(images, tmp_path):
+def test_match_jobs__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(images, tmp_path):
     settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
     jobs = [prepare(images / f"left{n}.tif", images / f"right{n}.tif", tmp_path / f"out{n}", settings) for n in (1, 2)]
     for job in jobs:
@@ -314,7 +314,7 @@ def test_matched__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(ima
                 match_tile(jobs[1], tile)
 
     with connected(Cluster(workers=1), tmp_path) as client:
-        for job, failures in matched(client, jobs, progress):
+        for job, failures in match_jobs(client, jobs, progress):
             assert not failures
             ended.append(job)
     assert ended == jobs

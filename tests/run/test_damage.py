@@ -342,7 +342,7 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     assert_kept(mine)
     mine |= with_files(tiles, ["records/77_0.json"])
     with monkeypatch.context() as patch:
-        patch.setattr(run, "assembled", dies)
+        patch.setattr(run, "assemble_repaired", dies)
         match(scene, out, *options, "--overwrite", status=1)
     assert_kept(mine)
     match(scene, out, *options, "--overwrite")

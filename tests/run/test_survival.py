@@ -407,7 +407,7 @@ def test_match__refuses_a_folder_where_another_run_is_at_work(pair, tmp_path):
     assert_complete(pair, tmp_path / "out")
 
 
-def test_matched__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_path, monkeypatch):
+def test_match_jobs__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_path, monkeypatch):
     def record_only(job, tile):
         job.store.write_record(tile, {})
 
@@ -429,7 +429,7 @@ def test_matched__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_pat
                 futures.append(len(client.futures))
                 known.append(len(cluster.scheduler.tasks))
 
-            for _, failures in run.matched(client, [job], progress):
+            for _, failures in run.match_jobs(client, [job], progress):
                 assert not failures
     assert len(futures) == 501  # one before the first ends
     assert max(futures) <= 6  # two a core, and those that are just being released
