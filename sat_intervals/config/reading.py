@@ -74,7 +74,7 @@ def load_config(
         problems = error.errors(include_url=False)
         if all(_given(overrides, problem["loc"]) for problem in problems):
             file = ""  # the errors are in the overrides
-        raise ConfigError(file + "; ".join(map(explained, problems))) from error
+        raise ConfigError(file + "; ".join(dict.fromkeys(map(explained, problems)))) from error
     if "sgm" not in settings and (better := f"{config.preset}-{config.cost.method}") in PRESETS:
         _warn(
             f"preset {config.preset} has no penalties for cost.method {config.cost.method}, so defaults are used: "

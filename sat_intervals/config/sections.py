@@ -244,9 +244,20 @@ class Tiles(Section):
     size: int = Field(
         1024, ge=64, le=16384, multiple_of=64, description="side of a tile's core, in pixels; determines the memory"
     )
-    overlap: int = Field(
-        100, ge=1, le=4096, description="pixels read around the core and dropped; more give fewer seams"
+    overlap: Annotated[int, Field(ge=1, le=4096)] | Literal["exact"] = Field(
+        100,
+        description="pixels read around the core and dropped; exact: none, tiles hand SGM's path states on",
     )
+
+    @property
+    def margin(self) -> int:
+        """Pixels that a tile reads around its core for SGM."""
+        return 1 if self.overlap == "exact" else self.overlap
+
+    @property
+    def support(self) -> int:
+        """Pixels around what is matched alone, such as a region or a tile of another tool, that support it in SGM."""
+        return 128 if self.overlap == "exact" else self.overlap
 
 
 class Cluster(Section):

@@ -86,7 +86,12 @@ class Config(Section):
             )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
-        if self.tiles.overlap < smallest:
+        if self.tiles.overlap == "exact":
+            if self.cross_check and self.cross_check.method == "accurate":
+                raise ValueError(
+                    "tiles.overlap is exact, which cross_check.method accurate does not know: give a number"
+                )
+        elif self.tiles.overlap < smallest:
             raise ValueError(
                 f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with {self._cost_in_words}"
             )

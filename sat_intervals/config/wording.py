@@ -6,7 +6,7 @@ import reprlib
 from collections.abc import Iterable
 from decimal import Decimal
 from types import NoneType
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
@@ -22,19 +22,28 @@ def allowed(field: FieldInfo) -> str:
     nouns = {int: "integer", float: "number", Decimal: "number", bool: "true or false", str: "text"}
     signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
     kinds = get_args(field.annotation) or (field.annotation,)
+    constraints = [*field.metadata, *(of_kind for kind in kinds for info in _bounds(kind) for of_kind in info.metadata)]
+    kinds = tuple(get_args(kind)[0] if _bounds(kind) else kind for kind in kinds)
+    words = [str(word) for kind in kinds[1:] if get_origin(kind) is Literal for word in get_args(kind)]
     sections = _sections(field.annotation)
     kind = (
         f"section of {', '.join(sections[0].model_fields)}" if sections else nouns.get(kinds[0]) or " or ".join(kinds)
     )
     bounds = [
         f"{sign} {getattr(constraint, name)}"
-        for constraint in field.metadata
+        for constraint in constraints
         for name, sign in signs.items()
         if hasattr(constraint, name)
     ]
     if any(constraint == AfterValidator(check_odd) for constraint in field.metadata):
         bounds.append("odd")
-    return " ".join(filter(None, [kind, ", ".join(bounds), "or null" if NoneType in kinds else ""]))
+    others = [f"or {word}" for word in (*words, *(["null"] if NoneType in kinds else []))]
+    return " ".join(filter(None, [kind, ", ".join(bounds), *others]))
+
+
+def _bounds(kind: Any) -> tuple[FieldInfo, ...]:
+    """Return the bounds of one of several kinds, such as those of an integer that may also be a word."""
+    return tuple(info for info in getattr(kind, "__metadata__", ()) if isinstance(info, FieldInfo))
 
 
 def _sections(annotation: Any) -> list[type[Section]]:
@@ -53,6 +62,8 @@ def _name(kind: type[Section]) -> tuple[str, str]:
 def explained(problem: ErrorDetails) -> str:
     """Describe one problem of settings: the key, its value and the allowed values."""
     path = [str(key) for key in problem["loc"]]
+    if path[:1] == ["tiles"]:
+        del path[2:]  # pydantic adds the kind
     while len(path) > 1 and path[-1].isdecimal():
         path.pop()  # an index into a list
     owner: type[Section] = Config

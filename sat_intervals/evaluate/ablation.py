@@ -68,7 +68,7 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
         )
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
-    areas = patch_areas(whole, whole, config)
+    areas = patch_areas(whole, whole, whole, config)
     views = read_views((left, right), view_windows(areas, config))
     methods, scale = _all_methods(views, areas, whole, config, _statistics((left, right), config))
     report: dict[str, Any] = {"cost": config.cost.method}

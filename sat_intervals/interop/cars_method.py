@@ -69,7 +69,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         self.method = "sat_intervals"
         self.corr_config: dict[str, Any] = {}
         self.loader = _NoLoader()
-        overlap = self._config(0, 0).tiles.overlap
+        overlap = self._config(0, 0).tiles.support
         self.margins = Margins(overlap, overlap, overlap, overlap)
 
     def _config(self, minimum: int, maximum: int) -> Config:

@@ -13,34 +13,37 @@ import numpy as np
 from numba import njit
 
 from sat_intervals.kernels.compiled import cached
-from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.cost import Candidates, Costs, cost_curve, padded_to_lanes
-from sat_intervals.kernels.disparity import vfit
-from sat_intervals.kernels.intervals import alpha_cut
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
-from sat_intervals.kernels.sgm import WALL, Paths, add_curve, advance_pixel, enter_row, path_slots, restart
-from sat_intervals.kernels.vector import (
-    LANES,
-    choose_smaller,
-    fill_where_nonzero,
-    first_lane,
-    lanes_at_most,
-    larger,
-    load,
-    smaller,
-    smallest,
-    splat,
-    store,
+from sat_intervals.kernels.reading import (
+    Rectangle,
+    RightPixels,
+    close_impossible,
+    contains,
+    read_curve,
+    search_flags,
+    update_right,
+)
+from sat_intervals.kernels.sgm import (
+    WALL,
+    WAVEFRONTS,
+    Borders,
+    Paths,
+    Ring,
+    add_curve,
+    advance_pixel,
+    advance_wave,
+    enter_row,
+    hand_on,
+    no_borders,
+    path_slots,
+    restart,
+    take_over,
 )
 from sat_intervals.products import (
     IMPOSSIBLE_COST,
-    LEFT_WINDOW,
-    MASKED,
-    NO_CANDIDATE,
     NO_DISPARITY,
     NOT_REFINED,
-    RANGE_INCOMPLETE,
-    RIGHT_MASKED,
 )
 from sat_intervals.tiling import Window
 
@@ -116,20 +119,6 @@ class RightView(NamedTuple):
     winner: np.ndarray
 
 
-class _Rectangle(NamedTuple):
-    """Window in the form that the kernels take."""
-
-    row: int
-    column: int
-    row_stop: int
-    column_stop: int
-
-
-@njit(nogil=True, forceinline=True)
-def _contains(rectangle, r, c):
-    return rectangle.row <= r < rectangle.row_stop and rectangle.column <= c < rectangle.column_stop
-
-
 class _Buffers(NamedTuple):
     """Inputs of both sweeps, and buffers for the current row, paths and curve.
 
@@ -139,6 +128,10 @@ class _Buffers(NamedTuple):
         ``(columns,)`` int64: number of possible candidates of each pixel of the row.
     curve
         ``(size,)`` uint16: buffer of one curve.
+    inside
+        Pixels whose paths are computed; those of the pixels around them come from ``rings``.
+    rings
+        Rings of the two waves of the sweep.
     """
 
     candidates: Candidates
@@ -146,9 +139,17 @@ class _Buffers(NamedTuple):
     penalties: Penalties
     paths: Paths
     curve: np.ndarray
+    inside: Rectangle
+    rings: tuple[Ring, ...]
 
 
-def _prepare(costs: Costs, gradients: Gradients | None, settings: Settings) -> _Buffers:
+def _rectangle(window: Window) -> Rectangle:
+    return Rectangle(window.row, window.column, window.row_stop, window.column_stop)
+
+
+def _prepare(
+    costs: Costs, gradients: Gradients | None, settings: Settings, inside: Window, rings: tuple[Ring, ...]
+) -> _Buffers:
     columns, size = costs.left_state.shape[1], padded_to_lanes(settings.count)
     beyond = np.zeros(size, np.uint16)
     beyond[settings.count :] = WALL
@@ -159,6 +160,8 @@ def _prepare(costs: Costs, gradients: Gradients | None, settings: Settings) -> _
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
         Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
         np.zeros(size, np.uint16),
+        _rectangle(inside),
+        rings,
     )
 
 
@@ -168,7 +171,7 @@ def _enter_row(buffers, gradients, settings, r, down):
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    (costs, barrier, _), possible, penalties, paths, _ = buffers
+    (costs, barrier, _), possible, penalties, paths, _, inside, rings = buffers
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
     usable = 0
@@ -180,116 +183,48 @@ def _enter_row(buffers, gradients, settings, r, down):
         usable -= costs.right_state[r, c] == 0
     falling, rising = -r % possible.size, r % possible.size
     enter_row(paths, possible.size, falling, rising, down)
+    take_over(paths, rings, inside, r, falling, rising, down)
     fill_row(gradients, r, down, penalties.row)
     return falling, rising
 
 
 @njit(nogil=True, forceinline=True)
-def _close_impossible(curve, candidates, c):
-    """Set impossible candidates and lanes behind the range to IMPOSSIBLE_COST; return the lowest cost."""
-    lowest = splat(np.uint16(IMPOSSIBLE_COST))
-    for k in range(0, curve.size, LANES):
-        closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), load(candidates.beyond, k)))
-        costs = larger(load(curve, k), closed)
-        store(curve, k, costs)
-        lowest = smaller(lowest, costs)
-    return smallest(lowest)
+def _columns(inside, r, down):
+    """Columns of row ``r`` that lie inside, in the order of the sweep."""
+    if not inside.row <= r < inside.row_stop:
+        return range(0, 0, 1)
+    return range(inside.column, inside.column_stop, 1) if down else range(inside.column_stop - 1, inside.column - 1, -1)
 
 
-@njit(nogil=True, forceinline=True)
-def _winner(curve, lowest):
-    """First index with the lowest cost: 14 ns for 64 disparities by vectors, 36 ns by single costs."""
-    k = 0
-    mask = lanes_at_most(load(curve, k), lowest)
-    while mask == 0:
-        k += LANES
-        mask = lanes_at_most(load(curve, k), lowest)
-    return k + first_lane(mask)
-
-
-@njit(nogil=True, forceinline=True)
-def _interval(curve, lowest, count, cut_level, refine):
-    """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
-    first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
-    first -= refine & (first > 0) & (curve[first] == lowest)
-    last += refine & (last < count - 1) & (curve[last] == lowest)
-    return first, last
-
-
-class _RightPixels(NamedTuple):
-    """Best candidates so far of the right pixels that face the left pixels of ``core``.
-
-    Attributes
-    ----------
-    indices
-        ``(size,)`` uint16: 0, 1, ...
-    cost, best
-        ``(rows, columns + size)`` uint16: the smallest cost so far, and its index k.
-    """
-
-    core: _Rectangle
-    indices: np.ndarray
-    cost: np.ndarray
-    best: np.ndarray
-
-
-@njit(nogil=True, forceinline=True)
-def _update_right(curve, right, r, c):
-    """Update the right pixels that a left pixel faces with its candidates.
-
-    The sweep up visits the left pixels of a row from right to left, so ``k`` ascends at each right pixel and ties go to
-    the largest.
-    """
-    start = (r - right.core.row) * right.cost.shape[1] + c - right.core.column
-    for k in range(0, curve.size, LANES):
-        candidate, known = load(curve, k), load(right.cost, start + k)
-        best = choose_smaller(candidate, known, load(right.indices, k), load(right.best, start + k))
-        store(right.best, start + k, best)
-        store(right.cost, start + k, smaller(candidate, known))
-
-
-@njit(nogil=True)
-def _search_flags(costs, r, c, count, possible):
-    """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
-    flags = 0
-    if costs.left_state[r, c] != 0:
-        flags |= LEFT_WINDOW
-    usable, masked = 0, False
-    for x in range(c, c + count):
-        usable += costs.right_state[r, x] == 0
-        masked |= costs.right_state[r, x] & MASKED != 0
-    if usable == 0:
-        flags |= RIGHT_MASKED if masked else NO_CANDIDATE
-    elif 0 < possible < count:
-        flags |= RANGE_INCOMPLETE
-    return flags
-
-
-@njit(nogil=True, forceinline=True)
-def _read_curve(curve, lowest, settings):
-    """Winner, sub-pixel shift, whether it was refined, both bounds and ambiguity of a finished curve."""
-    k = _winner(curve, lowest)
-    shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
-    lower = upper = NO_DISPARITY
-    if settings.cut_level >= 0:
-        first, last = _interval(curve, lowest, settings.count, settings.cut_level, settings.refine)
-        lower, upper = settings.minimum + first, settings.minimum + last
-    # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
-    count = settings.count if settings.weights.size else 0
-    return settings.minimum + k, shift, refined, lower, upper, ambiguity(curve, count, lowest, settings.weights)
+@cached
+def _trace(buffers, gradients, settings, wave, down, target):
+    """Advance the paths of one wave through a patch and copy the states that leave it to ``target``, a `Ring`."""
+    candidates, possible, penalties, paths, _, inside, _ = buffers
+    rows = candidates.costs.left_state.shape[0]
+    for step in range(inside.row_stop if down else rows - inside.row):
+        r = step if down else rows - 1 - step
+        falling, rising = _enter_row(buffers, gradients, settings, r, down)
+        for c in _columns(inside, r, down):
+            slots = path_slots(c, possible.size, falling, rising)
+            if possible[c] == 0:
+                restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
+            else:
+                advance_wave(candidates, penalties, paths, slots, wave, r, c)
+        if inside.row <= r < inside.row_stop:
+            hand_on(paths, inside, r, falling, rising, wave, down, target)
 
 
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, possible, penalties, paths, curve = buffers
+    candidates, possible, penalties, paths, curve, inside, _ = buffers
     for r in range(output.row_stop):
         falling, rising = _enter_row(buffers, gradients, settings, r, True)
-        for c in range(possible.size):
+        for c in _columns(inside, r, True):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
-            elif _contains(output, r, c):
+            elif contains(output, r, c):
                 offset = ((r - output.row) * volume.shape[1] + c - output.column) * curve.size
                 advance_pixel(candidates, penalties, paths, slots, r, c, volume, offset)
             else:
@@ -299,22 +234,22 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
     """Finish and read the curves of the pixels of ``output``, and update the right view."""
-    candidates, possible, penalties, paths, curve = buffers
+    candidates, possible, penalties, paths, curve, inside, _ = buffers
     winner, lower, upper, disparity, cost, ambiguity, validity = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
         falling, rising = _enter_row(buffers, gradients, settings, r, False)
-        for c in range(possible.size - 1, -1, -1):
+        for c in _columns(inside, r, False):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
             elif settings.regularized:
                 advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
-            if not _contains(output, r, c):
+            if not contains(output, r, c):
                 continue
             i, j = r - output.row, c - output.column
             if possible[c] < settings.count:
-                validity[i, j] = _search_flags(costs, r, c, settings.count, possible[c])
+                validity[i, j] = search_flags(costs, r, c, settings.count, possible[c])
             if possible[c] == 0:
                 if keep:
                     volume[i, j] = IMPOSSIBLE_COST
@@ -323,23 +258,24 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
                 add_curve(curve, volume, (i * volume.shape[1] + j) * curve.size)
             else:
                 cost_curve(candidates, r, c, curve)
-            lowest = _close_impossible(curve, candidates, c)
-            winner[i, j], shift, refined, lower[i, j], upper[i, j], ambiguity[i, j] = _read_curve(
+            lowest = close_impossible(curve, candidates, c)
+            winner[i, j], shift, refined, lower[i, j], upper[i, j], ambiguity[i, j] = read_curve(
                 curve, lowest, settings
             )
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
                 validity[i, j] |= NOT_REFINED
-            if _contains(right.core, r, c):
-                _update_right(curve, right, r, c)
+            if contains(right.core, r, c):
+                update_right(curve, right, r, c)
             if keep:
                 volume[i, j] = curve
 
 
-def _sweep(costs, gradients, settings, output, core, keep):
+def _sweep(costs, gradients, settings, output, core, keep, borders):
     """Run both sweeps; return the raw products, the right view and the volume (finished curves only with ``keep``)."""
-    buffers = _prepare(costs, gradients, settings)
-    size = buffers.curve.size
+    size = padded_to_lanes(settings.count)
+    borders = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
+    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2])
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
@@ -352,18 +288,34 @@ def _sweep(costs, gradients, settings, output, core, keep):
         ambiguity=np.zeros(shape, np.uint32),
         validity=np.zeros(shape, np.uint16),
     )
-    wanted, cores = (_Rectangle(w.row, w.column, w.row_stop, w.column_stop) for w in (output, core))
+    wanted, cores = _rectangle(output), _rectangle(core)
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
-    right = _RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
+    right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         _sweep_down(buffers, gradients, settings, wanted, volume)
         for state in buffers.paths:
             state[:] = 0
-    _sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
+    _sweep_up(buffers._replace(rings=borders.rings[2:]), gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
     return raw, RightView(cost, winner), volume
+
+
+def trace(
+    costs: Costs, settings: Settings, borders: Borders, wavefront: int, gradients: Gradients | None = None
+) -> Ring:
+    """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
+
+    Parameters as in `match`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
+    Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
+    """
+    down, wave = WAVEFRONTS[wavefront]
+    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2] if down else borders.rings[2:])
+    inside, size = borders.inside, buffers.curve.size
+    target = Ring(np.empty((inside.height, 2, size), np.uint16), np.empty((inside.width, 2, size), np.uint16))
+    _trace(buffers, gradients, settings, wave, down, target)
+    return target
 
 
 def match_costs(
@@ -372,6 +324,7 @@ def match_costs(
     output: Window,
     core: Window | None = None,
     gradients: Gradients | None = None,
+    borders: Borders | None = None,
 ) -> tuple[Raw, RightView]:
     """Match a patch: matching costs in, raw products and the right view's winners out.
 
@@ -387,6 +340,8 @@ def match_costs(
         Left pixels that make the right view; by default those of ``output``.
     gradients
         Gradients that P1 and P2 follow; by default P1 and P2 are those of ``settings``.
+    borders
+        Path states around the patch; by default every path starts at the edge of the patch.
 
     Returns
     -------
@@ -395,7 +350,7 @@ def match_costs(
     RightView
         Of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False)
+    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False, borders)
     return raw, right_view
 
 
@@ -405,4 +360,4 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True)[2][:, :, : settings.count]
+    return _sweep(costs, gradients, settings, whole, whole, True, None)[2][:, :, : settings.count]

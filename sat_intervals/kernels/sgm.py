@@ -28,6 +28,7 @@ from sat_intervals.kernels.vector import (
     store,
     subtract,
 )
+from sat_intervals.tiling import Window
 
 # Above every L of a candidate: an impossible one is at most 2 P2 + 2 plus twice the largest cost, < 16505.
 WALL = 32768
@@ -98,6 +99,30 @@ def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
 
 
 @njit(nogil=True, forceinline=True)
+def _advance_pair(candidates, penalties, paths, slots, i, r, c):
+    """Advance the paths ``i`` and ``i + 1``, which have ``slots``, by the pixel ``(r, c)``."""
+    curves, lowest = paths
+    p1, p2, row = penalties
+    path_1, path_2 = _begin(paths, slots[0]), _begin(paths, slots[1])
+    for k in range(0, curves.shape[1], LANES):
+        costs = candidate_costs(candidates, r, c, k)
+        path_1, cost_1 = _advance(path_1, curves, k, costs, penalties_of(p1, p2, row, i, c, k))
+        path_2, cost_2 = _advance(path_2, curves, k, costs, penalties_of(p1, p2, row, i + 1, c, k))
+        store(curves, path_1[0] + k, cost_1)
+        store(curves, path_2[0] + k, cost_2)
+    lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
+
+
+@njit(nogil=True, forceinline=True)
+def advance_wave(candidates, penalties, paths, slots, wave, r, c):
+    """Advance the two paths of a wave by the pixel ``(r, c)``."""
+    if wave == 0:
+        _advance_pair(candidates, penalties, paths, (slots[0], slots[1]), 0, r, c)
+    else:
+        _advance_pair(candidates, penalties, paths, (slots[2], slots[3]), 2, r, c)
+
+
+@njit(nogil=True, forceinline=True)
 def path_slots(c, columns, falling, rising):
     """Slots of the paths through ``(r, c)``: along the row, the falling and the rising diagonal, the column.
 
@@ -140,3 +165,82 @@ def enter_row(paths, columns, falling, rising, down):
         restart(paths, (0, first[1], last[2]))
     else:
         restart(paths, (0, last[1], first[2]))
+
+
+# The sweep of each wavefront, True for down, and its wave of that sweep. A wave is two paths: 0, along the row and the
+# falling diagonal; 1, along the rising diagonal and the column. Wavefronts start at the upper left, the upper right,
+# the lower right and the lower left corner of the image.
+WAVEFRONTS = ((True, 0), (True, 1), (False, 0), (False, 1))
+
+
+class Ring(NamedTuple):
+    """Path states of one wavefront on the pixels around a tile. Empty arrays: no neighbour, so paths start.
+
+    Attributes
+    ----------
+    column
+        ``(rows, 2, size)`` uint16: states beside each row of the tile, in the column that the wavefront comes from.
+    row
+        ``(columns, 2, size)`` uint16: states in the row that the wavefront comes from, for each column of the patch.
+    """
+
+    column: np.ndarray
+    row: np.ndarray
+
+
+class Borders(NamedTuple):
+    """Path states around the pixels of a patch that are computed.
+
+    Attributes
+    ----------
+    inside
+        These pixels. The patch has one pixel more on each side that has a neighbour.
+    rings
+        By wavefront.
+    """
+
+    inside: Window
+    rings: tuple[Ring, ...]
+
+
+def no_borders(inside: Window, size: int) -> Borders:
+    """Borders of a patch without neighbours; ``size`` is a number of whole vectors."""
+    nothing = np.zeros((0, 2, size), np.uint16)
+    return Borders(inside, (Ring(nothing, nothing),) * len(WAVEFRONTS))
+
+
+@njit(nogil=True)
+def take_over(paths, rings, inside, r, falling, rising, down):
+    """Set the paths that enter row ``r``, or the next row where ``r`` lies outside, to the states of the rings."""
+    columns = paths.lowest.size // 3
+    for wave in range(2):
+        column, row = rings[wave]
+        if not inside.row <= r < inside.row_stop:
+            for c in range(row.shape[0]):
+                _set_wave(paths, path_slots(c, columns, falling, rising), wave, row[c])
+        elif column.shape[0]:
+            c = 0 if down == (wave == 0) else columns - 1
+            _set_wave(paths, path_slots(c, columns, falling, rising), wave, column[r - inside.row])
+
+
+@njit(nogil=True, forceinline=True)
+def _set_wave(paths, slots, wave, states):
+    for n in range(2):
+        slot = slots[2 * wave + n]
+        paths.curves[slot] = states[n]
+        paths.lowest[slot] = states[n].min()
+
+
+@njit(nogil=True)
+def hand_on(paths, inside, r, falling, rising, wave, down, target):
+    """Copy the states of a wave that leave the patch in row ``r`` to ``target``, the ring of a neighbour."""
+    columns = paths.lowest.size // 3
+    c = inside.column_stop - 1 if down == (wave == 0) else inside.column
+    slots = path_slots(c, columns, falling, rising)
+    for n in range(2):
+        target.column[r - inside.row, n] = paths.curves[slots[2 * wave + n]]
+    if r == (inside.row_stop - 1 if down else inside.row):
+        for c in range(inside.column, inside.column_stop):
+            slots = path_slots(c, columns, falling, rising)
+            for n in range(2):
+                target.row[c - inside.column, n] = paths.curves[slots[2 * wave + n]]

@@ -46,7 +46,7 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
     whole = Window(0, 0, *images[0].shape)
-    windows = patch_windows(whole, whole, config)
+    windows = patch_windows(whole, whole, whole, config)
     views = _view(images[0], windows[0]), _view(images[1], windows[1])
     statistics = None
     if config.cost.needs_statistics:

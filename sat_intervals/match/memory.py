@@ -23,7 +23,7 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     """Bytes that matching a tile needs on top of its process; ``size`` replaces ``tiles.size`` of the settings."""
     size = size or config.tiles.size
     lanes = padded_to_lanes(config.disparity.count)
-    patch = size + 2 * config.tiles.overlap
+    patch = size + 2 * config.tiles.margin
     volume = 2 * (size + 2) ** 2 * lanes
     accurate = config.cross_check is not None and config.cross_check.method == "accurate"
     if accurate:

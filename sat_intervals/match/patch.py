@@ -6,6 +6,7 @@ import numpy as np
 
 from sat_intervals.config import Config, CosineSgm, Sgm
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
+from sat_intervals.kernels.sgm import Borders
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
@@ -47,29 +48,50 @@ def kernel_settings(config: Config) -> Settings:
     )
 
 
-def patch_areas(core: Window, whole: Window, config: Config) -> list[Area]:
-    """Area of a core with its overlap and, for accurate cross-checking, that of the right view.
+def path_window(core: Window, region: Window, whole: Window, config: Config) -> Window:
+    """Pixels whose paths a tile computes: its core and, at the ends of the region, the pixels that support it."""
+    around = _supported(region, whole, config)
+    row = around.row if core.row == region.row else core.row
+    column = around.column if core.column == region.column else core.column
+    row_stop = around.row_stop if core.row_stop == region.row_stop else core.row_stop
+    column_stop = around.column_stop if core.column_stop == region.column_stop else core.column_stop
+    return Window(row, column, row_stop - row, column_stop - column)
 
-    ``whole`` is the window of all left pixels. The overlap may leave the region, but not the image.
+
+def patch_window(core: Window, region: Window, whole: Window, config: Config) -> Window:
+    """Pixels that a tile reads: those of `path_window` and one more on each side where another tile follows."""
+    return path_window(core, region, whole, config).grown(1, 1).clipped(_supported(region, whole, config))
+
+
+def _supported(region: Window, whole: Window, config: Config) -> Window:
+    return region.grown(config.tiles.support, config.tiles.support).clipped(whole)
+
+
+def patch_areas(core: Window, region: Window, whole: Window, config: Config) -> list[Area]:
+    """Area of a core with what it reads around it and, for accurate cross-checking, that of the right view.
+
+    ``whole`` is the window of all left pixels. The area may leave the region, but not the image.
     """
     overlap = config.tiles.overlap
+    if overlap == "exact":
+        return [Area.of(patch_window(core, region, whole, config), config)]
     areas = [Area.of(core.grown(overlap, overlap).clipped(whole), config)]
     if config.cross_check and config.cross_check.method == "accurate":
-        areas.append(_right_area(core, whole, config))
+        areas.append(_right_area(core, whole, overlap, config))
     return areas
 
 
-def _right_area(core: Window, whole: Window, config: Config) -> Area:
+def _right_area(core: Window, whole: Window, overlap: int, config: Config) -> Area:
     """Area of the right pixels that face a core, with their overlap; they may be outside the right image."""
-    search, overlap = config.disparity, config.tiles.overlap
+    search = config.disparity
     reach = facing(core, search.minimum, search.maximum)
     rows = Window(whole.row, reach.column - overlap, whole.height, reach.width + 2 * overlap)
     return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
 
 
-def patch_windows(core: Window, whole: Window, config: Config) -> tuple[Window, Window]:
+def patch_windows(core: Window, region: Window, whole: Window, config: Config) -> tuple[Window, Window]:
     """Windows of both images that matching a core needs; see `patch_areas`."""
-    return view_windows(patch_areas(core, whole, config), config)
+    return view_windows(patch_areas(core, region, whole, config), config)
 
 
 def match_patch(
@@ -79,8 +101,9 @@ def match_patch(
     whole: Window,
     config: Config,
     statistics: PairStatistics | None = None,
+    borders: Borders | None = None,
 ) -> Patch:
-    """Match a core with its overlap.
+    """Match a core.
 
     Parameters
     ----------
@@ -96,15 +119,17 @@ def match_patch(
         Settings.
     statistics
         Mean and standard deviation of the whole images; None if the matching cost needs none.
+    borders
+        Path states of the neighbours; by default every path starts where the patch does.
     """
     settings = kernel_settings(config)
-    output = core.grown(1, 1).clipped(region)
-    area, *of_right = patch_areas(core, whole, config)
+    output = core if config.tiles.overlap == "exact" else core.grown(1, 1).clipped(region)
+    area, *of_right = patch_areas(core, region, whole, config)
     cost, *cost_of_right = cost_areas(views, [area, *of_right], config, statistics)
     wants_fast = config.cross_check is not None and config.cross_check.method == "fast"
     right_core = core if wants_fast else Window(core.row, core.column, 0, 0)
     raw, right_view = match_costs(
-        cost.costs, settings, output.relative_to(area.base), right_core.relative_to(area.base), cost.gradients
+        cost.costs, settings, output.relative_to(area.base), right_core.relative_to(area.base), cost.gradients, borders
     )
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED

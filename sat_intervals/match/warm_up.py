@@ -13,7 +13,7 @@ def compile_kernels(config: Config) -> None:
     """Compile every kernel that the settings need, by matching a few random pixels."""
     random = np.random.default_rng(0)
     spot = Window(0, 0, 4, 4)
-    windows = patch_windows(spot, spot, config)
+    windows = patch_windows(spot, spot, spot, config)
     images = (random.random((window.height, window.width), np.float32) for window in windows)
     left, right = (
         View(window, pixels, np.zeros(pixels.shape, np.uint8)) for window, pixels in zip(windows, images, strict=True)

@@ -208,7 +208,7 @@ def _report(
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },
-        "overlap_left": seam_report(seams, grid),
+        "overlap_left": None if config.tiles.overlap == "exact" else seam_report(seams, grid),
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
     }

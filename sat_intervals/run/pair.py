@@ -9,6 +9,7 @@ from typing import Any
 from distributed import Client
 
 from sat_intervals.errors import RunError
+from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, logged_stage
@@ -19,8 +20,10 @@ from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
+from sat_intervals.run.schedule import Schedule, Step
 from sat_intervals.run.submit import Submission, Task, reason
-from sat_intervals.run.tile import match_tile, measure_block
+from sat_intervals.run.tile import match_tile, measure_block, trace_tile
+from sat_intervals.store.borders import whole_borders
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Window
@@ -181,34 +184,49 @@ def match_jobs(
     Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the
     number of tiles. Workers write the products to the store and return nothing.
     """
-    waiting = [job.waiting() for job in jobs]
-    left = [len(tiles) for tiles in waiting]
+    schedules = [_schedule(job) for job in jobs]
     failures: list[dict[str, BaseException]] = [{} for _ in jobs]
-    total = sum(len(job.store.grid) for job in jobs)
-    done = total - sum(left)
-    yield from ((job, {}) for job, count in zip(jobs, left, strict=True) if count == 0)
-    tasks = (
-        Task((i, tile), match_tile, (job, tile), job.config.cluster.retries)
-        for i, job in enumerate(jobs)
-        for tile in waiting[i]
-    )
+    total = sum(map(len, schedules)) + sum(len(job.store.done()) for job in jobs)
+    yield from ((job, {}) for job, schedule in zip(jobs, schedules, strict=True) if not schedule)
+    done = total - sum(map(len, schedules))
     progress("tiles", done, total)
-    for outcome in Submission(client, tasks):
+    for outcome in Submission(client, _tasks(jobs, schedules)):
         if outcome is None:
             progress("tiles", done, total)
             continue
-        (i, tile), _, error = outcome
+        (i, step), _, error = outcome
         if isinstance(error, OSError) and error.errno in _FULL_DISK:  # all other tiles would fail too
             raise RunError(
                 f"{error.filename or jobs[i].store.folder}: {error.strerror}: free disk space and rerun the same "
                 "command: it resumes"
             ) from error
-        if error is not None:
-            failures[i][tile.name] = error
-            jobs[i].store.write_failure(tile.name, reason(error))
-        _LOG.debug("%s: tile %s %s", jobs[i].out, tile.name, f"failed: {reason(error)}" if error else "done")
-        left[i] -= 1
-        done += 1
+        if error is None:
+            schedules[i].ended(step)
+        else:
+            failures[i][step.name] = error
+            schedules[i].failed(step)
+            jobs[i].store.write_failure(step.tile.name, reason(error))
+        _LOG.debug("%s: tile %s %s", jobs[i].out, step.name, f"failed: {reason(error)}" if error else "done")
+        done = total - sum(map(len, schedules))
         progress("tiles", done, total)
-        if left[i] == 0:
+        if not schedules[i]:
             yield jobs[i], failures[i]
+
+
+def _schedule(job: Job) -> Schedule:
+    grid, borders = job.store.grid, None
+    if job.config.tiles.overlap == "exact":
+        names = (Step(tile, wavefront).name for tile in grid for wavefront in range(len(WAVEFRONTS)))
+        borders = whole_borders(job.store.folder, names)
+    return Schedule(grid, job.waiting(), borders)
+
+
+def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task | None]:
+    """Tasks of all jobs as they become ready; None while none is."""
+    while any(schedules):
+        ready = [(i, step) for i, schedule in enumerate(schedules) if (step := schedule.next())]
+        for i, step in ready:
+            function, rest = (match_tile, ()) if step.wavefront is None else (trace_tile, (step.wavefront,))
+            yield Task((i, step), function, (jobs[i], step.tile, *rest), jobs[i].config.cluster.retries)
+        if not ready:
+            yield None

@@ -114,7 +114,7 @@ def plan(
 
 def _work(grid: Grid, region: Window, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows behind its core."""
-    overlap = config.tiles.overlap
+    overlap = config.tiles.margin
     total = 0
     for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
         for column, columns in _kinds(grid.columns, -(-overlap // grid.size)):

@@ -65,7 +65,7 @@ class Submission:
         The scheduler is gone, or all workers of a batch system.
     """
 
-    def __init__(self, client: Client, tasks: Iterator[Task]) -> None:
+    def __init__(self, client: Client, tasks: Iterator[Task | None]) -> None:
         self._client, self._tasks = client, tasks
         self._name = uuid.uuid4().hex  # unique, since a scheduler may serve several runs
         self._submitted = 0
@@ -91,11 +91,11 @@ class Submission:
             if is_blamed:
                 _LOG.info("%s of %s: its workers died; it is tried again, alone", task.function.__name__, task.label)
                 self._suspects.append(task)
+            else:
+                yield Outcome(task.label, result, error)  # first, since it may make other tasks ready
             self._fill()
             if not self._in_flight and self._suspects:
                 self._submit(self._suspects.pop(), is_alone=True)
-            if not is_blamed:
-                yield Outcome(task.label, result, error)
 
     def _next(self) -> Future[Any] | None:
         """Wait for the next finished future; return None after a few seconds."""

@@ -61,7 +61,7 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     """
     results.check_pixel(row, column)
     config = results.config
-    overlap = config.tiles.overlap
+    overlap = config.tiles.support
     pixel = Window(results.region.row + row, results.region.column + column, 1, 1)
     base = pixel.grown(overlap, overlap).clipped(Window(0, 0, results.left.height, results.left.width))
     area = Area.of(base, config)

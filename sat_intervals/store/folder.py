@@ -31,6 +31,9 @@ class Folder(Protocol):
     def write(self, name: str, text: str) -> None:
         """Write a file atomically."""
 
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """Write a file that exists only when it is complete."""
+
     def create(self, name: str, text: str) -> bool:
         """Write a file atomically unless it exists; return whether it was written."""
 

@@ -59,12 +59,16 @@ class LocalFolder:
 
     def write(self, name: str, text: str) -> None:
         """See `Folder`."""
-        with self._written(name, text) as (temporary, file):
+        self.write_bytes(name, text.encode())
+
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """See `Folder`."""
+        with self._written(name, content) as (temporary, file):
             os.replace(temporary, file)
 
     def create(self, name: str, text: str) -> bool:
         """See `Folder`."""
-        with self._written(name, text) as (temporary, file):
+        with self._written(name, text.encode()) as (temporary, file):
             try:
                 os.link(temporary, file)
             except FileExistsError:
@@ -76,12 +80,12 @@ class LocalFolder:
         return True
 
     @contextmanager
-    def _written(self, name: str, text: str) -> Iterator[tuple[Path, Path]]:
+    def _written(self, name: str, content: bytes) -> Iterator[tuple[Path, Path]]:
         """Write a temporary file, deleted after the block; yield it and the final path."""
         file = self.path / name
         temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
         try:
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_bytes(content)
             yield temporary, file
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(file)) from error

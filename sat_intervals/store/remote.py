@@ -68,8 +68,12 @@ class RemoteFolder:
 
     def write(self, name: str, text: str) -> None:
         """See `Folder`."""
+        self.write_bytes(name, text.encode())
+
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """See `Folder`."""
         with self._reached(name) as (system, path):
-            system.pipe_file(path, text.encode())
+            system.pipe_file(path, content)
 
     def create(self, name: str, text: str) -> bool:
         """See `Folder`; atomic if the service supports that, as S3 does."""

@@ -8,17 +8,18 @@ from sat_intervals.store.folder import Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed, unsealed
 from sat_intervals.store.zarr_arrays import MADE_BY
 
-ARRAYS, RECORDS, FAILURES = "arrays.zarr", "records", "failures"
+ARRAYS, RECORDS, FAILURES, BORDERS = "arrays.zarr", "records", "failures", "borders"
 NORMALIZATION = "normalization.json"
 _GROUP = f"{ARRAYS}/zarr.json"
 _OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
+    rf"|{BORDERS}/(\d+)_(\d+)_[0-3]"
     rf"|{ARRAYS}/(?:u?int\d+/c/0|right/c|seams/c|histogram/c)/(\d+)/(\d+)(?:/0)*"
 )
 # Folders of a run. If one of them were a link, writing would replace the user's files behind it.
 _FOLDER = re.compile(
-    rf"{RECORDS}|{FAILURES}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
+    rf"{RECORDS}|{FAILURES}|{BORDERS}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
 )
 # Temporary names of `LocalFolder` and of zarr, which a killed process leaves, with the final name as group.
 _UNFINISHED = re.compile(r"(?:(?<=/)|^)\.([^/]+)\.[0-9a-f]{32}$"), re.compile(r"()\.[0-9a-f]{32}\.partial$")
@@ -33,7 +34,7 @@ def drop(folder: Folder) -> None:
     if is_of_run(folder):
         # The manifest first, since the rest is invalid without it. The group last, to recognise an unfinished removal.
         folder.delete(MANIFEST)
-        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES))
+        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES, BORDERS))
         folder.delete_all([_GROUP], [ARRAYS])
     folder.delete_if_empty()
 

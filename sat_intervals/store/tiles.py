@@ -23,7 +23,16 @@ from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
-from sat_intervals.store.removal import ARRAYS, FAILURES, NORMALIZATION, RECORDS, check_not_foreign, drop, is_of_run
+from sat_intervals.store.removal import (
+    ARRAYS,
+    BORDERS,
+    FAILURES,
+    NORMALIZATION,
+    RECORDS,
+    check_not_foreign,
+    drop,
+    is_of_run,
+)
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -117,7 +126,7 @@ class Store:
                 drop(folder)
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
-            for name in ("", RECORDS, FAILURES):
+            for name in ("", RECORDS, FAILURES, BORDERS):
                 folder.make(name)
             home.make("")
             home.delete(_FINISHED)

@@ -353,7 +353,7 @@ def check(bands, validity, expected):
 def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
     left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
     whole = Window(0, 0, *left.shape)
-    windows = patch_windows(whole, whole, config)
+    windows = patch_windows(whole, whole, whole, config)
     views = view(left, left_state, windows[0]), view(right, right_state, windows[1])
     patch = match_patch(views, whole, whole, whole, config)
     raw, rows = patch.raw, RawRows.of(patch.raw, patch.right)

@@ -1,0 +1,94 @@
+"""Path states that tiles hand to their neighbours: with them, any tiling gives the result of the whole image.
+
+A wavefront, see `WAVEFRONTS`, visits the tiles from one corner of the grid to the opposite one. Each tile takes over
+the states of the pixels around it and hands on those of its own last pixels (METHOD.md, section 11).
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.config import Config
+from sat_intervals.kernels.cost import padded_to_lanes
+from sat_intervals.kernels.matching import trace
+from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
+from sat_intervals.match.matching_cost import Area, cost_areas
+from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.patch import kernel_settings, patch_window, path_window
+from sat_intervals.tiling import Views, Window
+
+Place = tuple[int, int]
+"""Row and column of a tile in its grid, or what to add to them."""
+
+
+class Border(NamedTuple):
+    """What a tile hands on in one wavefront: the pixels whose paths it computed, and the states of the last ones."""
+
+    inside: Window
+    ring: Ring
+
+
+def sources(wavefront: int) -> tuple[Place, Place, Place]:
+    """Neighbours whose states a tile takes over in a wavefront: beside it, before it, and diagonally before it."""
+    down, wave = WAVEFRONTS[wavefront]
+    row = -1 if down else 1
+    column = -1 if down == (wave == 0) else 1
+    return (0, column), (row, 0), (row, column)
+
+
+def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size: int) -> Ring:
+    """The ring of a patch, from the borders of the tile's `sources` that exist.
+
+    ``size`` is the number of disparities in whole vectors.
+    """
+    beside, *before = sources(wavefront)
+    nothing = np.zeros((0, 2, size), np.uint16)
+    row = nothing
+    if before[0] in borders:
+        row = np.zeros((patch.width, 2, size), np.uint16)
+        for place in before:
+            if place in borders:
+                inside, ring = borders[place]
+                shared = inside.clipped(Window(inside.row, patch.column, inside.height, patch.width))
+                row[shared.relative_to(patch).slices[1]] = ring.row[shared.relative_to(inside).slices[1]]
+    return Ring(borders[beside].ring.column if beside in borders else nothing, row)
+
+
+def borders_of(
+    core: Window, region: Window, image: Window, config: Config, found: Mapping[tuple[int, Place], Border]
+) -> Borders:
+    """Borders of a tile for the kernels, from those of its neighbours by wavefront and place."""
+    patch, size = patch_window(core, region, image, config), padded_to_lanes(config.disparity.count)
+    by_wavefront: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
+    for (wavefront, place), border in found.items():
+        by_wavefront[wavefront][place] = border
+    rings = tuple(ring_of(wavefront, patch, borders, size) for wavefront, borders in enumerate(by_wavefront))
+    return Borders(path_window(core, region, image, config).relative_to(patch), rings)
+
+
+def trace_patch(
+    views: Views,
+    patch: Window,
+    borders: Borders,
+    wavefront: int,
+    config: Config,
+    statistics: PairStatistics | None = None,
+) -> Ring:
+    """Path states that a tile hands on in a wavefront.
+
+    Parameters
+    ----------
+    views
+        Both images in the `patch_windows` of the tile.
+    patch
+        Its `patch_window`.
+    borders
+        States that it takes over, see `borders_of`.
+    wavefront
+        Index of WAVEFRONTS.
+    config, statistics
+        As for `match_patch`.
+    """
+    (cost,) = cost_areas(views, [Area.of(patch, config)], config, statistics)
+    return trace(cost.costs, kernel_settings(config), borders, wavefront, cost.gradients)

@@ -1,0 +1,83 @@
+"""With exact seams any tiling gives the result of the whole image, byte for byte."""
+
+import numpy as np
+import pytest
+from helpers import hashes, invoke, write_pair
+
+from sat_intervals import RunError, Window, match_pair
+from sat_intervals.demo import make_scene
+from sat_intervals.run import pair as run
+
+SETTINGS = {
+    "paper": {},
+    "satellite": {"preset": "satellite"},
+    "gradients": {"sgm": {"penalty": "negative", "alpha": 0.5, "gamma": 40}, "cross_check": None},
+    "window 3": {"cost": {"window": 3}},
+    "no SGM": {"sgm": None},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A pair with no data inside."""
+    folder = tmp_path_factory.mktemp("pair")
+    scene = make_scene(150, 190, seed=5)
+    random = np.random.default_rng(0)
+    for image in (scene.left, scene.right):
+        image[random.integers(0, 150, 20), random.integers(0, 190, 20)] = 0
+        image[60:75, 100:130] = 0
+    write_pair(folder, scene)
+    return folder
+
+
+def match(folder, out, size, settings, **options):
+    search = {"disparity": {"minimum": -8, "maximum": 9}, "tiles": {"size": size, "overlap": "exact"}}
+    return match_pair(folder / "left.tif", folder / "right.tif", out, search | settings, **options)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_match_pair__of_exact_tiles_equals_the_whole(folder, tmp_path, name):
+    settings = SETTINGS[name]
+    whole = match(folder, tmp_path / "whole", 1024, settings)
+    tiled = match(folder, tmp_path / "tiled", 64, settings | {"cluster": {"workers": 2}})
+    assert hashes(tmp_path / "tiled") == hashes(tmp_path / "whole")
+    assert tiled["counts"] == whole["counts"]
+    assert (tiled["tiles"]["overlap"], tiled["overlap_left"]) == ("exact", None)
+    overlapping = {"tiles": {"size": 1024, "overlap": 20}}
+    match(folder, tmp_path / "alone", 1024, settings | overlapping)
+    assert hashes(tmp_path / "alone") == hashes(tmp_path / "whole")
+
+
+def test_match_pair__of_exact_tiles_of_a_window_equals_one_tile(folder, tmp_path):
+    window = Window(20, 30, 101, 140)
+    for size in (64, 1024):
+        match(folder, tmp_path / str(size), size, {}, window=window)
+    assert hashes(tmp_path / "64") == hashes(tmp_path / "1024")
+
+
+@pytest.mark.parametrize("content", [b"", b"short", None])
+def test_match_pair__computes_damaged_path_states_again(folder, tmp_path, monkeypatch, content):
+    def damage_and_match(job, tile):
+        for file in (tmp_path / "out" / "tiles" / "borders").glob("1_*"):
+            file.write_bytes(file.read_bytes()[:-1] + b"x" if content is None else content)
+        return match_tile(job, tile)
+
+    match_tile = run.match_tile
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "match_tile", damage_and_match)
+        with pytest.raises(RunError, match="missing or damaged: rerun the same command: it resumes"):
+            match(folder, tmp_path / "out", 64, {})
+    match(folder, tmp_path / "out", 64, {})
+    match(folder, tmp_path / "whole", 1024, {})
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "whole")
+    assert not (tmp_path / "out" / "tiles").exists()
+
+
+def test_match__refuses_exact_seams_with_accurate_cross_checking(folder, tmp_path):
+    (tmp_path / "settings.yaml").write_text("tiles: {overlap: exact}\ncross_check: {method: accurate}\n")
+    result = invoke(
+        "match", folder / "left.tif", folder / "right.tif", tmp_path / "out", "--disparity", -8, 9,
+        "--config", tmp_path / "settings.yaml",
+    )  # fmt: skip
+    assert result.exit_code == 2
+    assert "tiles.overlap is exact, which cross_check.method accurate does not know: give a number" in result.stderr

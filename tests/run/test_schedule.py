@@ -1,0 +1,60 @@
+"""Order of tiles and of the path states that they hand to each other."""
+
+import pytest
+
+from sat_intervals.run.schedule import Schedule, Step, needs
+from sat_intervals.tiling import Grid, Window
+
+GRID = Grid(Window(10, 20, 4 * 64, 5 * 64 - 7), 64)
+
+
+def in_turn(schedule):
+    """Steps that can be done together, turn by turn."""
+    while schedule:
+        together = []
+        while (step := schedule.next()) is not None:
+            together.append(step)
+        yield together
+        for step in together:
+            schedule.ended(step)
+
+
+def test_schedule__draws_the_order_of_a_grid():
+    # The turn in which each of 4 x 5 tiles hands on its states, by wavefront: from the four corners.
+    turns = {step: turn for turn, steps in enumerate(in_turn(Schedule(GRID, GRID, set()))) for step in steps}
+    drawn = [
+        [[turns.get(Step(GRID.tile(row, column), wavefront)) for column in range(5)] for row in range(4)]
+        for wavefront in range(4)
+    ]
+    upper_left = [[0, 1, 2, 3, 4], [1, 2, 3, 4, 5], [2, 3, 4, 5, 6], [3, 4, 5, 6, None]]
+    upper_right = [row[::-1] for row in upper_left]
+    assert drawn == [upper_left, upper_right, [row[::-1] for row in upper_left[::-1]], upper_left[::-1]]
+
+
+@pytest.mark.parametrize("borders", [set(), {"0_0_0", "1_1_2"}])
+def test_schedule__comes_after_what_it_needs_and_does_nothing_twice(borders):
+    done = []
+    for steps in in_turn(Schedule(GRID, GRID, borders)):
+        for step in steps:
+            assert all(other in done or other.name in borders for other in needs(GRID, step))
+        done += steps
+    assert len(done) == len(set(done))
+    assert {step.tile for step in done if step.wavefront is None} == set(GRID)
+    assert not borders & {step.name for step in done}
+
+
+def test_schedule__of_one_tile_asks_for_its_neighbours_only_as_far_as_it_must():
+    (corner,) = in_turn(
+        Schedule(GRID, [GRID.tile(0, 0)], {"0_1_3", "1_0_1", "0_1_1", "1_0_3", "1_0_2", "1_1_2", "0_1_2"})
+    )
+    assert [step.name for step in corner] == ["0_0"]
+
+
+def test_schedule__drops_what_needs_a_failed_step():
+    schedule = Schedule(GRID, GRID, set())
+    while (step := schedule.next()) is not None:
+        if step.name == "0_0_0":
+            schedule.failed(step)
+        else:
+            schedule.ended(step)
+    assert not schedule
