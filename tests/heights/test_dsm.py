@@ -207,7 +207,7 @@ def test_make_surface__refuses_damaged_points(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 1.5], [-0.5, -0.5], [10.0, 20.0])
     with rasterio.open(out / "points.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as points:
         points.write(np.array([[43.6, np.nan]]), 2)
-    with pytest.raises(SatIntervalsError, match=r"points.tif is damaged, some of its pixels have parts of a point"):
+    with pytest.raises(SatIntervalsError, match=r"points.tif is damaged, some pixels have only part of a point"):
         surface_of([out], tmp_path, crs=None)
 
 
@@ -323,7 +323,7 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
             "exists and is not a surface model: choose another --output",
         ),
         ([far[0]], ["--output", str(tmp_path)], "exists and is not a surface model: choose another --output"),
-        ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "says -9999 m at longitude 1.39"),
+        ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "has -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(tmp_path / "none.gtx")], "none.gtx: no such file"),
         ([far[0]], ["--crs", "EPSG:4326"], "is not a map in metres"),
         ([tmp_path / "nowhere"], [], "give the folder of a finished run"),

@@ -364,7 +364,7 @@ def test_match__takes_an_input_of_a_damaged_manifest_for_unknown(scene, tmp_path
     manifest = json.loads((tiles / "manifest.json").read_text())
     manifest["inputs"]["left"]["sha256"] = manifest["inputs"]["left"]["sha256"][::-1]
     (tiles / "manifest.json").write_text(json.dumps(manifest))
-    assert "it is damaged: --overwrite" in match(scene, tmp_path / "out", status=2)
+    assert "it is damaged: start again with --overwrite" in match(scene, tmp_path / "out", status=2)
 
 
 @pytest.mark.parametrize("how", ["half", "bit"])

@@ -175,7 +175,7 @@ def test_prepare__refuses_an_image_that_was_replaced_since_it_was_opened(pair):
     left, right = open_image(folder / "left.tif"), open_image(folder / "right.tif")
     scene = make_scene(150, 180, seed=2)
     write_layer(folder / "left.tif", scene.left, int(scene.left[70, 80]), PLACE)  # another no-data value
-    with pytest.raises(ChangedInputError, match=r"left.tif was replaced or changed since it was opened: run the"):
+    with pytest.raises(ChangedInputError, match=r"left.tif was replaced or changed since it was opened: rerun the"):
         prepare(left, right, folder / "out", settings)
 
 
@@ -468,7 +468,7 @@ def test_match__takes_the_tiles_of_a_user_for_no_run_of_its_own(pair):
 def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
     file = tmp_path / "file"
     file.write_bytes(content)
-    refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", file], "is no log", "--log-file")
+    refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", file], "is not a log", "--log-file")
     assert file.read_bytes() == content
 
 
