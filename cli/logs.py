@@ -13,7 +13,7 @@ import click
 from sat_intervals.cli.signals import Ended
 
 # Output files of commands, which must not be log files.
-_OF_RUNS = ("intervals.tif", "validity.tif", "run.json", "points.tif", "dsm.tif", "batch.json")
+_OF_RUNS = ("intervals.tif", "validity.tif", "run.json", "points.tif", "points.json", "dsm.tif", "batch.json")
 
 _LOG = logging.getLogger(__name__)
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")

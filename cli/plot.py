@@ -1,5 +1,6 @@
 """``sat-intervals plot``: draw pictures of a finished run."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -42,6 +43,7 @@ def plot(
     from sat_intervals.results import open_results
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
+    from sat_intervals.show.marks import check_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
 
     if columns is not None and row is None:
@@ -53,20 +55,19 @@ def plot(
         results.check_pixel(*pixel)
     pictures = [out / f"{name}.png" for name in ("overview", "errors", "profile", "curve", "dsm")]
     results.check_kept(pictures, [truth, out / "dsm.tif"])
-    draw_overview(results, out / "overview.png", dpi)
-    click.echo(out / "overview.png")
+    drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
     if results.truth is not None and results.config.interval is not None:
-        draw_errors(results, out / "errors.png", dpi)
-        click.echo(out / "errors.png")
+        drawings["errors"] = lambda path: draw_errors(results, path, dpi)
     if row is not None:
-        draw_profile(results, out / "profile.png", row, columns, dpi)
-        click.echo(out / "profile.png")
+        drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
     if pixel is not None:
-        draw_curve(results, out / "curve.png", *pixel, dpi)
-        click.echo(out / "curve.png")
+        drawings["curve"] = lambda path: draw_curve(results, path, *pixel, dpi)
     surface = out / "dsm.tif"
     if surface.exists() and results.report["finished"] not in read_tags(surface).get("RUNS", ""):
         click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
     elif surface.exists():
-        draw_surface(surface, out / "dsm.png", dpi)
-        click.echo(out / "dsm.png")
+        drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
+    check_made_here(out / f"{name}.png" for name in drawings)
+    for name, draw in drawings.items():
+        draw(out / f"{name}.png")
+        click.echo(out / f"{name}.png")

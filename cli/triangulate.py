@@ -26,6 +26,7 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
     \b
     OUT/points.tif   longitude, latitude, height, its two bounds, residual,
                      positions of the points at both bounds
+    OUT/points.json  size and checksum of points.tif
 
     Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files. Grids contain the sensor column and row (bands 1 and 2)
     of epipolar positions, as written by CARS and shareloc. All must be local files. Swapping both models and grids of

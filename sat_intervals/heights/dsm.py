@@ -18,6 +18,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.fusion import cells_of_run, fused
 from sat_intervals.heights.point_cloud import WINDOW, Cells, Extent, PointCloud, read_points
+from sat_intervals.heights.triangulate import check_points
 from sat_intervals.products import POINTS
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
@@ -159,6 +160,7 @@ def _triangulated(outs: Sequence[Path]) -> list[Run]:
             raise SatIntervalsError(f"{out} has no points.tif: run sat-intervals triangulate on it first")
         if read_tags(path).get("RUN") != run.report["finished"] or read_shape(path) != (len(POINTS), *run.shape):
             raise SatIntervalsError(f"{path} belongs to an earlier run in {out}: triangulate again")
+        check_points(out)
         runs.append(run)
     return runs
 

@@ -4,20 +4,25 @@ Points are interpolated from a lattice at about one second per megapixel, so a s
 enough. Rows are read, computed and written strip by strip, so memory does not depend on the size.
 """
 
+import json
 from collections.abc import Iterable, Iterator
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.progress import Progress
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image
+from sat_intervals.raster.identity import checksum_of
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
 if TYPE_CHECKING:
     from sat_intervals.heights.sensors import Lattice, Points
 
+_POINTS, _REPORT = POINT_FILES[0].name, "points.json"
 # Pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes.
 _PIXELS = 1 << 20
 # Positions are rounded to 0.01 mm on the ground and 0.1 mm in height, below the error of the lattice. This halves the
@@ -33,7 +38,7 @@ def triangulate(
     right_grid: str | Path,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Triangulate a run and write ``points.tif`` to its folder.
+    """Triangulate a run and write ``points.tif`` to its folder, with its size and CRC-32 in ``points.json``.
 
     Parameters
     ----------
@@ -62,7 +67,8 @@ def triangulate(
     from sat_intervals.heights.sensors import Lattice, Sensors  # needs the extra `dsm`
 
     run = open_run(out)
-    run.check_kept([run.out / POINT_FILES[0].name], [left_model, right_model, left_grid, right_grid])
+    _published(run.out)  # a foreign points.json is not replaced
+    run.check_kept([run.out / name for name in (_POINTS, _REPORT)], [left_model, right_model, left_grid, right_grid])
     search = run.config.disparity
     sensors = Sensors.load(*map(Path, (left_model, right_model, left_grid, right_grid)))
     right_width = run.report["inputs"]["right"]["width"]
@@ -76,9 +82,39 @@ def triangulate(
             tally.add(int(np.isfinite(disparities[0]).sum()), height=bands[2], residual=bands[5])
             progress("points", window.row_stop, run.shape[0])
         progress("files", 0, 1)
-        writer.publish()
+        writer.publish((_REPORT, json.dumps({"files": writer.build()}, indent=1) + "\n"))
         progress("files", 1, 1)
     return tally.report() | {"median_residual": lattice.residual}
+
+
+def check_points(out: Path) -> None:
+    """Raise if the bytes of ``points.tif`` differ from those that were published; earlier versions wrote no checksum.
+
+    Raises
+    ------
+    SatIntervalsError
+        Names the damaged file.
+    """
+    published = _published(out)
+    if published and published != checksum_of(out / _POINTS):
+        raise SatIntervalsError(
+            f"{out / _POINTS} is not what triangulate published; it is damaged or was changed: triangulate again"
+        )
+
+
+def _published(out: Path) -> dict[str, int] | None:
+    """Return size and CRC-32 of ``points.tif`` from ``points.json``; None if that is missing."""
+    file = out / _REPORT
+    check_regular(file)
+    try:
+        known = json.loads(file.read_text(encoding="utf-8"))["files"][_POINTS]
+        return {key: index(known[key]) for key in ("bytes", "crc32")}
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: move it away") from error
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise SatIntervalsError(f"{file} is not the report of {_POINTS}: move it away and triangulate again") from error
 
 
 class _Tally:

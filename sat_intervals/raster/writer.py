@@ -27,8 +27,8 @@ from sat_intervals.store.folder import LocalFolder
 # Locked folder of unfinished files, named after the first of them. Files of these names from a killed process are
 # replaced, others stay.
 _SCRATCH = ".unpublished-{}"
-# Report of a run, published with its files.
-_REPORT = "run.json"
+# Reports that are published with files: of a run, and of its points.
+_REPORTS = "run.json", "points.json"
 # Layout of the temporary strips. Blocks are low, so that a strip fills most of those it touches; interleaving by band
 # saves a fifth of the time of the final files.
 _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "band", "bigtiff": "IF_SAFER"}
@@ -275,7 +275,7 @@ class OutputWriter:
     def _remove_scratch(self) -> None:
         """Delete temporary files of this or a killed process, and no others."""
         names = [file.name for file in self._files]
-        ours = (*names, *(f"strips-{name}" for name in names), _REPORT)
+        ours = (*names, *(f"strips-{name}" for name in names), *_REPORTS)
         for folder in (self._replaced, self._scratch):
             with suppress(OSError):
                 for file in folder.iterdir():

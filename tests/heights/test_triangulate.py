@@ -356,6 +356,33 @@ def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_
     assert f"{lost.sum()} valid pixels have no point" in result.stderr
 
 
+def test_triangulate__protects_the_points_by_a_checksum(level_run, tmp_path):
+    out, files = level_run
+    triangulate(out, *files)
+    surface = tmp_path / "dsm.tif"
+    whole = (out / "points.tif").read_bytes()
+    for place in range(len(whole) // 2, len(whole), len(whole) // 20):
+        (out / "points.tif").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(SatIntervalsError, match=r"points.tif is not what triangulate published; .*triangulate aga"):
+            make_surface([out], surface, resolution=1.0)
+    (out / "points.json").unlink()  # of an earlier version
+    (out / "points.tif").write_bytes(whole)
+    make_surface([out], surface, resolution=1.0)
+    triangulate(out, *files)
+    make_surface([out], surface, resolution=1.0)
+    assert not list(out.glob(".unpublished-*/files"))
+
+
+@pytest.mark.parametrize("text", ["mine", "[]", '{"files": {"points.tif": {"bytes": 1e999, "crc32": 0}}}'])
+def test_triangulate__keeps_a_foreign_report(level_run, tmp_path, text):
+    out, files = level_run
+    (out / "points.json").write_text(text)
+    with pytest.raises(SatIntervalsError, match=r"points.json is not the report of points.tif: move it away"):
+        triangulate(out, *files)
+    assert (out / "points.json").read_text() == text
+    assert not (out / "points.tif").exists()
+
+
 def test_triangulate_command__needs_a_run(tmp_path):
     files = cameras(tmp_path, 40, 50)
     result = invoke("triangulate", tmp_path, *given(files))

@@ -658,6 +658,24 @@ def test_export__that_fails_keeps_the_files_of_before(finished, tmp_path, monkey
     assert contents(tmp_path / "otb") == before
 
 
+@pytest.mark.parametrize("name", ["report.html", "overview.png", "profile.png"])
+def test_report_and_plot__replace_only_files_that_they_made(finished, name):
+    command = ["report", finished] if name == "report.html" else ["plot", finished, "--row", 0, "--dpi", 50]
+    assert invoke(*command).exit_code == 0
+    made = contents(finished)
+    (finished / "curve.png").write_text("of nobody's concern")
+    (finished / name).write_text("mine, about sat-intervals")
+    before = contents(finished)
+    refused(command, f"{name} exists and was not made by sat-intervals", "move it away")
+    assert contents(finished) == before
+    for own in ("overview.png", "profile.png", "report.html"):
+        if str(finished / own) in made:
+            (finished / own).write_bytes(made[str(finished / own)] + b"older")
+    assert invoke(*command).exit_code == 0
+    assert not (finished / name).read_bytes().endswith(b"older")
+    assert (finished / "curve.png").read_text() == "of nobody's concern"
+
+
 @pytest.mark.parametrize("name", ["report.html", "overview.png"])
 def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, monkeypatch, name):
 

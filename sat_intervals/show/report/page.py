@@ -13,6 +13,7 @@ from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import whole_file
 from sat_intervals.results import Results
 from sat_intervals.show.legend import PIXEL_CLASSES
+from sat_intervals.show.marks import check_made_here
 from sat_intervals.show.report.contents import Counts, Pixels
 
 
@@ -26,10 +27,11 @@ def write_report(results: Results) -> Path:
     Raises
     ------
     SatIntervalsError
-        The run cannot be read or the file cannot be written.
+        The run cannot be read, the file cannot be written, or one of that name was not made by this tool.
     """
     path = results.out / "report.html"
     results.check_kept([path], [results.truth.image.path if results.truth else None])
+    check_made_here([path])
     contents = _contents(results)
     # A "<" in the contents could end the script element.
     data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
