@@ -73,9 +73,9 @@ def _match_tile(job: Job, tile: Tile) -> None:
         borders = _borders(job, tile, range(len(WAVEFRONTS)))
     with timed(seconds, "match"):
         patch = match_patch(views, tile.core, region, whole, job.config, statistics, borders)
+    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     with timed(seconds, "write"):
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 

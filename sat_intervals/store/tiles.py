@@ -206,7 +206,10 @@ class Store:
 
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write the record of a tile, with its checksums in ``files``; the tile is then done."""
-        self.folder.write(f"{RECORDS}/{tile.name}.json", sealed(record))
+        name = f"{RECORDS}/{tile.name}.json"
+        self.folder.write(name, sealed(record))
+        if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
+            self.folder.delete(name)
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Write the statistics of the whole images, so that all tiles use the same."""
