@@ -55,7 +55,7 @@ def submitted(
         process = subprocess.Popen(list(map(str, command)), stdout=log, stderr=subprocess.STDOUT, env=environment)
     try:
         yield process
-        assert process.wait(150) == status, (folder / "log").read_text()
+        assert process.wait(400) == status, (folder / "log").read_text()
         if status == 0 and is_quiet:
             assert (folder / "log").read_text() == ""
     finally:
