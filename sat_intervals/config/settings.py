@@ -126,6 +126,11 @@ class Config(Section):
         return floor(Fraction(value) * self.cost.steps + Fraction(1, 2))
 
     @property
+    def hands_states_on(self) -> bool:
+        """Return whether tiles hand path states of SGM to their neighbours."""
+        return self.tiles.overlap == "exact" and self.sgm is not None
+
+    @property
     def largest_p2(self) -> int:
         """Return the largest penalty as an integer cost, 0 without SGM."""
         return 0 if self.sgm is None else self.in_steps(self.sgm.largest_p2)

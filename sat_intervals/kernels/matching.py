@@ -307,7 +307,7 @@ def trace(
 ) -> Ring:
     """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
 
-    Parameters as in `match`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
+    Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
     Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]

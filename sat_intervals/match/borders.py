@@ -4,7 +4,7 @@ A wavefront, see `WAVEFRONTS`, visits the tiles from one corner of the grid to t
 the states of the pixels around it and hands on those of its own last pixels (METHOD.md, section 11).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,15 +56,12 @@ def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
 
 
 def borders_of(
-    core: Window, region: Window, image: Window, config: Config, found: Mapping[tuple[int, Place], Border]
+    core: Window, region: Window, whole: Window, config: Config, found: Sequence[Mapping[Place, Border]]
 ) -> Borders:
     """Borders of a tile for the kernels, from those of its neighbours by wavefront and place."""
-    patch, size = patch_window(core, region, image, config), padded_to_lanes(config.disparity.count)
-    by_wavefront: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
-    for (wavefront, place), border in found.items():
-        by_wavefront[wavefront][place] = border
-    rings = tuple(ring_of(wavefront, patch, borders, size) for wavefront, borders in enumerate(by_wavefront))
-    return Borders(path_window(core, region, image, config).relative_to(patch), rings)
+    patch, size = patch_window(core, region, whole, config), padded_to_lanes(config.disparity.count)
+    rings = tuple(ring_of(wavefront, patch, borders, size) for wavefront, borders in enumerate(found))
+    return Borders(path_window(core, region, whole, config).relative_to(patch), rings)
 
 
 def trace_patch(

@@ -26,7 +26,7 @@ from sat_intervals.run.tile import match_tile, measure_block, trace_tile
 from sat_intervals.store.borders import whole_borders
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import DamagedTilesError
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Tile, Window
 
 _FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
@@ -184,9 +184,10 @@ def match_jobs(
     Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the
     number of tiles. Workers write the products to the store and return nothing.
     """
-    schedules = [_schedule(job) for job in jobs]
+    waiting = [job.waiting() for job in jobs]
+    schedules = [_schedule(job, tiles) for job, tiles in zip(jobs, waiting, strict=True)]
     failures: list[dict[str, BaseException]] = [{} for _ in jobs]
-    total = sum(map(len, schedules)) + sum(len(job.store.done()) for job in jobs)
+    total = sum(len(job.store.grid) for job in jobs) - sum(map(len, waiting)) + sum(map(len, schedules))
     yield from ((job, {}) for job, schedule in zip(jobs, schedules, strict=True) if not schedule)
     done = total - sum(map(len, schedules))
     progress("tiles", done, total)
@@ -213,12 +214,12 @@ def match_jobs(
             yield jobs[i], failures[i]
 
 
-def _schedule(job: Job) -> Schedule:
+def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:
     grid, borders = job.store.grid, None
-    if job.config.tiles.overlap == "exact":
+    if job.config.hands_states_on:
         names = (Step(tile, wavefront).name for tile in grid for wavefront in range(len(WAVEFRONTS)))
         borders = whole_borders(job.store.folder, names)
-    return Schedule(grid, job.waiting(), borders)
+    return Schedule(grid, tiles, borders)
 
 
 def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task | None]:

@@ -1,4 +1,4 @@
-"""Match one tile on a worker: read, match, write the intermediate products."""
+"""Match one tile on a worker, or trace its paths: read, compute, write the intermediate products."""
 
 import logging
 from collections.abc import Iterable, Iterator
@@ -10,7 +10,7 @@ import numpy as np
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
-from sat_intervals.match.borders import Border, borders_of, trace_patch
+from sat_intervals.match.borders import Border, Place, borders_of, trace_patch
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
 from sat_intervals.match.patch import Patch, match_patch, patch_window, patch_windows, path_window
 from sat_intervals.products import NO_DISPARITY
@@ -68,9 +68,7 @@ def _match_tile(job: Job, tile: Tile) -> None:
     region, whole = job.store.grid.region, _image(job)
     seconds: dict[str, float] = {}
     views, statistics = _read(job, patch_windows(tile.core, region, whole, job.config), seconds)
-    borders = None
-    if job.config.tiles.overlap == "exact":
-        borders = _borders(job, tile, range(len(WAVEFRONTS)))
+    borders = _borders(job, tile, range(len(WAVEFRONTS))) if job.config.hands_states_on else None
     with timed(seconds, "match"):
         patch = match_patch(views, tile.core, region, whole, job.config, statistics, borders)
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
@@ -108,7 +106,7 @@ def _read(job: Job, windows: tuple[Window, Window], seconds: dict[str, float]) -
 def _borders(job: Job, tile: Tile, wavefronts: Iterable[int]) -> Borders:
     """Read the path states that a tile takes over from its neighbours."""
     grid, whole = job.store.grid, _image(job)
-    found = {}
+    found: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
     for wavefront in wavefronts:
         for step in needs(grid, Step(tile, wavefront)):
             states = read_border(job.store.folder, step.name)
@@ -118,7 +116,8 @@ def _borders(job: Job, tile: Tile, wavefronts: Iterable[int]) -> Borders:
                     "same command: it resumes"
                 )
             place = step.tile.grid_row - tile.grid_row, step.tile.grid_column - tile.grid_column
-            found[wavefront, place] = Border(path_window(step.tile.core, grid.region, whole, job.config), Ring(*states))
+            inside = path_window(step.tile.core, grid.region, whole, job.config)
+            found[wavefront][place] = Border(inside, Ring(*states))
     return borders_of(tile.core, grid.region, whole, job.config, found)
 
 
