@@ -36,7 +36,7 @@ class Config(Section):
     """All settings of a run; None in place of a section switches its step off."""
 
     preset: Literal[PRESETS] = Field(PRESETS[0], description="settings for keys that are left out")  # type: ignore[valid-type]
-    disparity: Disparity
+    disparity: Disparity = Disparity()
     cost: Census | Mccnn = Field(Census(), discriminator="method")
     sgm: AnySgm | None = Sgm()
     ambiguity: Ambiguity | None = Ambiguity()
@@ -114,7 +114,7 @@ class Config(Section):
                 f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
             )
         is_raw = isinstance(sgm, MccnnSgm) and sgm.gradients == "raw"
-        if is_raw and not self.disparity.minimum <= 0 <= self.disparity.maximum:
+        if is_raw and not self.disparity.is_auto and not self.disparity.minimum <= 0 <= self.disparity.maximum:
             raise ValueError("sgm.gradients raw reads the right image at disparity 0: search a range with 0")
 
     @property

@@ -8,13 +8,10 @@ import xarray as xr
 
 from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
-from sat_intervals.match.patch import match_patch, patch_windows
-from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
-from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
-from sat_intervals.tiling import View, Window
+from sat_intervals.match.whole import match_whole
+from sat_intervals.products import BANDS, FLAGS
 
 Array = np.ndarray | xr.DataArray
 
@@ -45,19 +42,10 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     pixels = _pixels(left, "left"), _pixels(right, "right")
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
-    whole = Window(0, 0, *images[0].shape)
-    windows = patch_windows(whole, whole, whole, config)
-    views = _view(images[0], windows[0]), _view(images[1], windows[1])
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
-    patch = match_patch(views, whole, whole, whole, config, statistics)
-    raw, rows = patch.raw, RawRows.of(patch.raw, patch.right)
-    scale = ConfidenceScale(np.nan, np.nan)
-    if config.ambiguity:
-        histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
-        scale = confidence_scale(config.ambiguity, histogram)
-    final = postprocess_rows(rows, 0, whole.height, scale, config)
+    final = match_whole(*images, config, statistics)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
     dataset = xr.Dataset(coords=labels.coords)
     for band, layer in zip(BANDS, final[:4], strict=True):
@@ -120,14 +108,3 @@ def _moments(image: np.ma.MaskedArray) -> Iterator[Moments]:
     """Moments of the blocks of an image, in order."""
     for block in blocks(*image.shape):
         yield moments(image.data[block.slices], np.ma.getmaskarray(image)[block.slices])
-
-
-def _view(image: np.ma.MaskedArray, window: Window) -> View:
-    """Pixels and states of a window, which may extend beyond the image."""
-    pixels = np.zeros((window.height, window.width), image.dtype)
-    state = np.full(pixels.shape, NO_DATA, np.uint8)
-    inside = window.clipped(Window(0, 0, *image.shape))
-    part, here = image[inside.slices], inside.relative_to(window).slices
-    pixels[here] = part.filled(0)
-    state[here] = np.where(np.ma.getmaskarray(part), NO_DATA, 0)
-    return View(window, pixels, state)

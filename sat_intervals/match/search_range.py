@@ -1,0 +1,277 @@
+"""The search range of a pair from its images: matching of reduced images, from coarse to fine (METHOD.md, section 16).
+
+A level has its step: the images averaged over ``rows x columns`` pixels. The coarsest is searched widely, each finer one
+within what the level before found. Disparities of a level are in its own pixels; times the step they are in pixels.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sat_intervals.config import load_config
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.kernels.components import component_sizes
+from sat_intervals.kernels.disparity import median
+from sat_intervals.match.whole import match_whole
+
+# Columns of the coarsest level at most, of the finest level at least, and the largest step of the finest level.
+_TOP, _FINEST, _LARGEST_STEP = 400, 300, 8
+# Rows of a level at least, where the image has them.
+_ROWS = 100
+# Share of the width that disparities of the coarsest level are first searched in, to both sides.
+_REACH = 0.3
+# Pixels of a connected surface at the coarsest level; smaller ones are stray matches. At finer levels it has more.
+_SPECKLE = 60
+# Share of the usable pixels that a surface needs to be trusted wherever it lies, and how far from such surfaces, in
+# widths of their range and in pixels of the level, smaller ones may lie.
+_LARGE, _NEAR, _NEAR_PIXELS = 0.005, 0.5, 8
+# Share of matches beyond the range at each end, and the margin beyond it: pixels of the level, and widths of the range.
+_BEYOND, _MARGIN = 0.0005, (2, 0.05)
+_MARGIN_BETWEEN = 2, 0.1
+# Share of matches at an end of what was searched above which the search goes on there, and how often at most.
+_AT_END, _EXTENSIONS = 0.01, 3
+# Share of usable pixels with a consistent match below which there is no range: unrelated images have at most .05,
+# pairs have .7 and more.
+_FEWEST = 0.1
+# Bytes of the cost volume of a strip of a level, and its rows above and below that support it.
+_STRIP_BYTES, _SUPPORT = 1 << 26, 16
+_BINS = 32
+
+
+class NoRangeError(SatIntervalsError):
+    """The images have too few consistent matches to tell the search range."""
+
+
+class Step(NamedTuple):
+    """Rows and columns of the image that a pixel of a level averages."""
+
+    rows: int
+    columns: int
+
+
+@dataclass(frozen=True)
+class Level:
+    """What was searched at a level, in pixels of the image, and the share of usable pixels that it matched."""
+
+    step: int
+    minimum: int
+    maximum: int
+    matched: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """A search range with its evidence.
+
+    Attributes
+    ----------
+    minimum, maximum
+        The range in pixels, both ends included.
+    matched
+        Share of the usable left pixels with a consistent match at the finest level.
+    levels
+        From coarse to fine.
+    histogram
+        Matches of the finest level between the first and the last disparity: ``edges`` in pixels and ``counts``.
+    """
+
+    minimum: int
+    maximum: int
+    matched: float
+    levels: tuple[Level, ...]
+    histogram: dict[str, list[float]] = field(default_factory=dict)
+
+    def report(self) -> dict[str, Any]:
+        """Return the mapping that the store and run.json hold."""
+        return asdict(self) | {"levels": [asdict(level) for level in self.levels]}
+
+    @classmethod
+    def of_report(cls, report: dict[str, Any]) -> "Found":
+        """Read the mapping that `report` makes."""
+        return cls(**report | {"levels": tuple(Level(**level) for level in report["levels"])})
+
+
+class Matches(NamedTuple):
+    """Matches of a level.
+
+    Attributes
+    ----------
+    disparity
+        ``(rows, columns)`` float32 in pixels of the level.
+    kept
+        bool of the same shape: consistent matches that belong to a surface.
+    searched
+        First and last disparity searched, in pixels of the level.
+    matched
+        Share of the usable pixels that are kept.
+    """
+
+    disparity: np.ndarray
+    kept: np.ndarray
+    searched: tuple[int, int]
+    matched: float
+
+
+def finest_step(rows: int, columns: int) -> Step:
+    """Step of the finest level of a pair of this size."""
+    step = 1
+    while step < _LARGEST_STEP and columns >= 2 * step * _FINEST:
+        step *= 2
+    return Step(min(step, _most_rows(rows)), step)
+
+
+def _most_rows(rows: int) -> int:
+    """Largest power of two that leaves `_ROWS` rows, at least 1."""
+    step = 1
+    while rows >= 2 * step * _ROWS:
+        step *= 2
+    return step
+
+
+def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
+    """Means of the usable pixels, state 0, of blocks of ``step`` pixels.
+
+    Parameters
+    ----------
+    pixels, state
+        ``(rows, columns)``; unusable pixels are 0. Rows and columns that fill no block are dropped.
+
+    Returns
+    -------
+    float32, NaN where less than half of a block is usable.
+    """
+    sums, counts = pixels, (state == 0).view(np.uint8)
+    for axis, size in enumerate(step):
+        number = sums.shape[axis] // size
+        sums, counts = (
+            sum(np.take(array, range(first, number * size, size), axis) for first in range(size))  # type: ignore[misc]
+            if size > 1
+            else array
+            for array in (sums, counts)
+        )
+    return np.where(2 * counts >= step.rows * step.columns, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
+
+
+def _coarser(image: np.ndarray, step: Step) -> np.ndarray:
+    """The next level of an image with NaN where not usable; ``step`` counts its pixels."""
+    state = np.isnan(image)
+    return reduced(np.where(state, np.float32(0), image), state.view(np.uint8), step)
+
+
+def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tuple[Found, Matches]:
+    """Find the search range of a pair.
+
+    Parameters
+    ----------
+    left, right
+        Both images at the finest level: float32, NaN where not usable; of the same number of rows.
+    step
+        The `finest_step`.
+    rows
+        Of the images themselves.
+
+    Returns
+    -------
+    The range, and the matches of the finest level.
+
+    Raises
+    ------
+    NoRangeError
+        Too few matches are consistent.
+    """
+    pyramid = [(step, left, right)]
+    while max(pyramid[-1][1].shape[1], pyramid[-1][2].shape[1]) > _TOP:
+        here, left, right = pyramid[-1]
+        more = Step(2 if 2 * here.rows <= min(2 * here.columns, _most_rows(rows)) else 1, 2)
+        there = Step(here.rows * more.rows, here.columns * more.columns)
+        pyramid.append((there, _coarser(left, more), _coarser(right, more)))
+    levels: list[Level] = []
+    matches, search = None, None
+    for here, left, right in reversed(pyramid):
+        speckle = _SPECKLE * pyramid[-1][0].columns // here.columns
+        found = _matches_of(left, right, search, speckle)
+        first, last = found.searched
+        levels.append(Level(here.columns, first * here.columns, last * here.columns, round(found.matched, 4)))
+        if found.matched < (_FEWEST if matches is None else matches.matched / 2):
+            break
+        matches, step = found, here
+        search = np.array(_range_of(found, _MARGIN_BETWEEN)) * here.columns / max(1, here.columns // 2)
+    if matches is None:
+        raise NoRangeError(
+            f"only {100 * levels[0].matched:.0f} % of the pixels have a consistent match at step {levels[0].step} between "
+            f"disparities {levels[0].minimum} and {levels[0].maximum}, at least {100 * _FEWEST:.0f} % are needed"
+        )
+    low, high = (step.columns * end for end in _range_of(matches, _MARGIN))
+    counts, edges = np.histogram(matches.disparity[matches.kept] * step.columns, _BINS)
+    histogram = {"edges": [round(float(edge), 2) for edge in edges], "counts": counts.tolist()}
+    minimum, maximum = int(np.floor(low)), int(np.ceil(high))
+    return Found(minimum, maximum, round(matches.matched, 4), tuple(levels), histogram), matches
+
+
+def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, speckle: int) -> Matches:
+    """Match a level; search further where many matches stand at an end of what was searched.
+
+    ``search`` is None at the coarsest level: there the second search is that of all disparities.
+    """
+    most = 1 - left.shape[1], right.shape[1] - 1
+    reach, wider = int(_REACH * left.shape[1]), right.shape[1] - left.shape[1]
+    ends = (min(0, wider) - reach, max(0, wider) + reach) if search is None else search
+    first, last = max(most[0], int(np.floor(ends[0]))), min(most[1], int(np.ceil(ends[1])))
+    for _ in range(_EXTENSIONS):
+        found = _matched(left, right, first, last, speckle)
+        values = found.disparity[found.kept]
+        low = first > most[0] and (values <= first + 1).sum() > _AT_END * values.size
+        high = last < most[1] and (values >= last - 1).sum() > _AT_END * values.size
+        if search is None and (low or high or found.matched < _FEWEST) and (first, last) != most:
+            first, last = most
+        elif search is not None and (low or high):
+            more = max(4, (last - first) // 2)
+            first, last = max(most[0], first - low * more), min(most[1], last + high * more)
+        else:
+            break
+    return found
+
+
+def _matched(left: np.ndarray, right: np.ndarray, first: int, last: int, speckle: int) -> Matches:
+    """Match a level over the disparities ``first .. last``, strip by strip; remove stray matches."""
+    usable = np.count_nonzero(np.isfinite(left))
+    config = load_config(
+        {
+            "disparity": {"minimum": first, "maximum": last},
+            "ambiguity": {"eta_step": 0.1, "normalization": "range"},
+            "interval": None,
+            "regularization": None,
+        }
+    )
+    rows, columns = left.shape
+    strip = max(64, _STRIP_BYTES // (2 * columns * (last - first + 32)))
+    images = [np.ma.masked_invalid(image) for image in (left, right)]
+    disparity = np.empty(left.shape, np.float32)
+    for row in range(0, rows, strip):
+        top, stop = max(0, row - _SUPPORT), min(rows, row + strip)
+        found = match_whole(*(image[top : stop + _SUPPORT] for image in images), config)
+        # Confidence 0: the pixel and all its candidates have no texture.
+        known = found.valid & (found.confidence > 0)
+        disparity[row:stop] = np.where(known, found.disparity, np.nan)[row - top : stop - top]
+    known = np.isfinite(disparity)
+    disparity = np.nan_to_num(disparity)
+    steady = known & (np.abs(disparity - median(disparity, known, 5)) <= 1)
+    sizes = component_sizes(disparity, steady)
+    kept = steady & (sizes >= speckle)
+    large = kept & (sizes >= _LARGE * usable)
+    if large.any():
+        low, high = np.quantile(disparity[large], [_BEYOND, 1 - _BEYOND])
+        near = _NEAR * (high - low) + _NEAR_PIXELS
+        kept &= (disparity >= low - near) & (disparity <= high + near)
+    return Matches(disparity, kept, (first, last), float(kept.sum() / max(1, usable)))
+
+
+def _range_of(found: Matches, margin: tuple[float, float]) -> tuple[float, float]:
+    """Range of the matches of a level with a margin, within what was searched; in pixels of the level."""
+    first, last = found.searched
+    values = found.disparity[found.kept]
+    inner = values[(values > first + 1) & (values < last - 1)]  # an end gathers the matches of what lies beyond it
+    low, high = np.quantile(inner if inner.size else values, [_BEYOND, 1 - _BEYOND])
+    more = margin[0] + margin[1] * (high - low)
+    return max(low - more, float(first)), min(high + more, float(last))
