@@ -16,6 +16,7 @@ STAGES = {
     "pairs": "checking pairs",
     "pairs.files": "writing files of pairs",
     "kernels": "preparing kernels (compiled once per machine, then about a second)",
+    "range": "finding the search range",
     "images": "measuring images",
     "tiles": "matching tiles",
     "bands": "postprocessing rows",
@@ -101,6 +102,8 @@ class Console:
         table.add_column(style="bold")
         table.add_column(justify="right")
         pixels = counts["pixels"]
+        if report.get("search"):
+            table.add_row("search range, found", f"{report['search']['minimum']} to {report['search']['maximum']} px")
         table.add_row("valid pixels", _share(counts["valid"], pixels))
         for flag, count in counts["causes"].items():
             if count:

@@ -49,7 +49,7 @@ def demo(
     with Console(quiet) as console, put_back(layers if overwrite else (), out / "run.json"):
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed)
-        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum), config_file))
+        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum)))
         check_not_replaced([config_file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         nodata = 0, 0, float("nan")
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):

@@ -1,4 +1,4 @@
-"""``sat-intervals match``: match two epipolar GeoTIFFs over a search range."""
+"""``sat-intervals match``: match two epipolar GeoTIFFs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -44,19 +44,20 @@ def match(
     overwrite: bool,
     quiet: bool,
 ) -> None:
-    """Match the epipolar images LEFT and RIGHT over a search range and write to the folder OUT.
+    """Match the epipolar images LEFT and RIGHT and write to the folder OUT.
 
     \b
     OUT/intervals.tif   disparity, lower and upper bound (pixels), confidence
     OUT/validity.tif    flags: why a pixel is invalid, how it was processed
     OUT/run.json        settings, inputs, statistics
 
-    The disparity is x_right - x_left. To resume an interrupted run, rerun the same command.
+    The disparity is x_right - x_left; its search range is found unless it is given. To resume an interrupted run,
+    rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
 
-    config = load_config(config_file, with_range(given, disparity, config_file))
+    config = load_config(config_file, with_range(given, disparity))
     if dry_run:
         from sat_intervals.run.batch_system import job_script
 

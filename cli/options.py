@@ -47,7 +47,11 @@ store_option = click.option(
     "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles during the run."
 )
 disparity_option = click.option(
-    "--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched."
+    "--disparity",
+    type=int,
+    nargs=2,
+    metavar="MIN MAX",
+    help="Search range in pixels, both ends searched; default: found from the images.",
 )
 
 
@@ -177,13 +181,11 @@ def log_options(command: Command) -> Command:
     )
 
 
-def with_range(given: dict[str, Any], disparity: tuple[int, int] | None, config_file: Path | None) -> dict[str, Any]:
-    """Add the search range of the command line to its sections; without one, a file of settings must have it."""
-    if disparity is not None:
-        return {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
-    if config_file is None:
-        raise click.UsageError("Missing search range: give --disparity MIN MAX, or --config with a file that has it.")
-    return given
+def with_range(given: dict[str, Any], disparity: tuple[int, int] | None) -> dict[str, Any]:
+    """Add the search range of the command line to its sections."""
+    if disparity is None:
+        return given
+    return {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
 
 
 def _with(command: Command, *options: Callable[[Command], Command]) -> Command:

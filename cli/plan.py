@@ -51,7 +51,7 @@ def plan(
     from sat_intervals.run.cluster import parse_memory
     from sat_intervals.run.plan import plan as make_plan
 
-    config = load_config(config_file, with_range(given, disparity, config_file))
+    config = load_config(config_file, with_range(given, disparity))
     limit = parse_memory(memory) if memory else None
     with Console(quiet=False) as console:
         made = make_plan(*open_images(left, right), config, window=window, memory=limit, progress=console.progress)

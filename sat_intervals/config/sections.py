@@ -44,6 +44,7 @@ Odd = Annotated[int, AfterValidator(check_odd)]
 Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(float, when_used="json")]
 # Disparities are stored as int16; within this limit the difference of any two also fits.
 # The engine and so mypy only see numbers: auto is replaced before a pair is matched, see `Disparity.is_auto`.
+AUTO: Any = "auto"
 if TYPE_CHECKING:
     Pixels = int
 else:
@@ -66,8 +67,8 @@ class Section(BaseModel):
 class Disparity(Section):
     """Search range; both ends are searched."""
 
-    minimum: Pixels = Field("auto", description="smallest disparity searched, in pixels; auto: found from the images")
-    maximum: Pixels = Field("auto", description="largest disparity searched, in pixels; auto: found from the images")
+    minimum: Pixels = Field(AUTO, description="smallest disparity searched, in pixels; auto: found from the images")
+    maximum: Pixels = Field(AUTO, description="largest disparity searched, in pixels; auto: found from the images")
 
     @property
     def is_auto(self) -> bool:

@@ -1,7 +1,7 @@
-"""The search range of a pair from its images: matching of reduced images, from coarse to fine (METHOD.md, section 16).
+"""The search range of a pair, found by matching reduced images from coarse to fine (METHOD.md, section 16).
 
-A level has its step: the images averaged over ``rows x columns`` pixels. The coarsest is searched widely, each finer one
-within what the level before found. Disparities of a level are in its own pixels; times the step they are in pixels.
+A level has its step: the images averaged over ``rows x columns`` pixels. The coarsest is searched widely, each finer
+one within what the level before found. Disparities of a level are in its own pixels; times the step they are in pixels.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import load_config
+from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.components import component_sizes
 from sat_intervals.kernels.disparity import median
@@ -74,6 +74,9 @@ class Found:
         From coarse to fine.
     histogram
         Matches of the finest level between the first and the last disparity: ``edges`` in pixels and ``counts``.
+    quality
+        ``noise`` and ``row_offset``, see `sampling.summary`, and ``collars``: the value and share of pixels of the
+        `collar` of an image, by side.
     """
 
     minimum: int
@@ -81,6 +84,7 @@ class Found:
     matched: float
     levels: tuple[Level, ...]
     histogram: dict[str, list[float]] = field(default_factory=dict)
+    quality: dict[str, Any] = field(default_factory=dict)
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""
@@ -90,6 +94,12 @@ class Found:
     def of_report(cls, report: dict[str, Any]) -> "Found":
         """Read the mapping that `report` makes."""
         return cls(**report | {"levels": tuple(Level(**level) for level in report["levels"])})
+
+
+def with_range(config: Config, found: Found) -> Config:
+    """The settings with a range that was found."""
+    disparity = config.disparity.model_copy(update={"minimum": found.minimum, "maximum": found.maximum})
+    return config.model_copy(update={"disparity": disparity})
 
 
 class Matches(NamedTuple):
@@ -105,12 +115,18 @@ class Matches(NamedTuple):
         First and last disparity searched, in pixels of the level.
     matched
         Share of the usable pixels that are kept.
+    step
+        Of the level.
+    images
+        The left and the right image of the level.
     """
 
     disparity: np.ndarray
     kept: np.ndarray
     searched: tuple[int, int]
     matched: float
+    step: Step
+    images: tuple[np.ndarray, np.ndarray]
 
 
 def finest_step(rows: int, columns: int) -> Step:
@@ -143,20 +159,40 @@ def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
     """
     sums, counts = pixels, (state == 0).view(np.uint8)
     for axis, size in enumerate(step):
-        number = sums.shape[axis] // size
-        sums, counts = (
-            sum(np.take(array, range(first, number * size, size), axis) for first in range(size))  # type: ignore[misc]
-            if size > 1
-            else array
-            for array in (sums, counts)
-        )
+        sums, counts = _added(sums, axis, size), _added(counts, axis, size)
     return np.where(2 * counts >= step.rows * step.columns, sums / np.maximum(counts, 1), np.nan).astype(np.float32)
+
+
+def _added(array: np.ndarray, axis: int, size: int) -> np.ndarray:
+    """Sums of ``size`` rows (axis 0) or columns (1); adding whole arrays is faster than a sum over an axis."""
+    if size == 1:
+        return array
+    stop = array.shape[axis] // size * size
+    parts = [array[first:stop:size] if axis == 0 else array[:, first:stop:size] for first in range(size)]
+    total = parts[0].copy()
+    for part in parts[1:]:
+        total += part
+    return total
 
 
 def _coarser(image: np.ndarray, step: Step) -> np.ndarray:
     """The next level of an image with NaN where not usable; ``step`` counts its pixels."""
     state = np.isnan(image)
     return reduced(np.where(state, np.float32(0), image), state.view(np.uint8), step)
+
+
+def collar(image: np.ndarray, smallest: float) -> np.ndarray:
+    """Pixels of a level that have only the smallest value and reach the border of the image along a row or column.
+
+    ``image`` is float32; ``smallest`` is the smallest usable value. Returns bool of the same shape.
+    """
+    has = np.isclose(image, smallest, rtol=1e-6, atol=0) if np.isfinite(smallest) else np.zeros(image.shape, bool)
+    found = np.zeros(image.shape, bool)
+    for axis in (0, 1):
+        for flipped in (slice(None), slice(None, None, -1)):
+            turn = (flipped, slice(None)) if axis == 0 else (slice(None), flipped)
+            found[turn] |= np.logical_and.accumulate(has[turn], axis)
+    return found
 
 
 def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tuple[Found, Matches]:
@@ -173,7 +209,7 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tu
 
     Returns
     -------
-    The range, and the matches of the finest level.
+    The range, and the matches of the finest level that has as many as the coarser ones.
 
     Raises
     ------
@@ -190,23 +226,32 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tu
     matches, search = None, None
     for here, left, right in reversed(pyramid):
         speckle = _SPECKLE * pyramid[-1][0].columns // here.columns
-        found = _matches_of(left, right, search, speckle)
+        found = _matches_of(left, right, search, speckle)._replace(step=here)
         first, last = found.searched
         levels.append(Level(here.columns, first * here.columns, last * here.columns, round(found.matched, 4)))
         if found.matched < (_FEWEST if matches is None else matches.matched / 2):
             break
-        matches, step = found, here
+        matches = found
         search = np.array(_range_of(found, _MARGIN_BETWEEN)) * here.columns / max(1, here.columns // 2)
     if matches is None:
+        top = levels[0]
         raise NoRangeError(
-            f"only {100 * levels[0].matched:.0f} % of the pixels have a consistent match at step {levels[0].step} between "
-            f"disparities {levels[0].minimum} and {levels[0].maximum}, at least {100 * _FEWEST:.0f} % are needed"
+            f"only {100 * top.matched:.0f} % of the pixels have a consistent match between disparities {top.minimum} "
+            f"and {top.maximum} in images reduced {top.step} times, {100 * _FEWEST:.0f} % are needed"
         )
-    low, high = (step.columns * end for end in _range_of(matches, _MARGIN))
-    counts, edges = np.histogram(matches.disparity[matches.kept] * step.columns, _BINS)
+    size = matches.step.columns
+    low, high = (size * end for end in _range_of(matches, _MARGIN))
+    counts, edges = np.histogram(matches.disparity[matches.kept] * size, _BINS)
     histogram = {"edges": [round(float(edge), 2) for edge in edges], "counts": counts.tolist()}
     minimum, maximum = int(np.floor(low)), int(np.ceil(high))
     return Found(minimum, maximum, round(matches.matched, 4), tuple(levels), histogram), matches
+
+
+def settings(first: int, last: int) -> Config:
+    """Settings that a level is matched with over the disparities ``first .. last``: Census, no intervals."""
+    confidence = {"eta_step": 0.1, "normalization": "range"}
+    search = {"minimum": first, "maximum": last}
+    return load_config({"disparity": search, "ambiguity": confidence, "interval": None, "regularization": None})
 
 
 def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, speckle: int) -> Matches:
@@ -236,21 +281,14 @@ def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, 
 def _matched(left: np.ndarray, right: np.ndarray, first: int, last: int, speckle: int) -> Matches:
     """Match a level over the disparities ``first .. last``, strip by strip; remove stray matches."""
     usable = np.count_nonzero(np.isfinite(left))
-    config = load_config(
-        {
-            "disparity": {"minimum": first, "maximum": last},
-            "ambiguity": {"eta_step": 0.1, "normalization": "range"},
-            "interval": None,
-            "regularization": None,
-        }
-    )
+    config = settings(first, last)
     rows, columns = left.shape
     strip = max(64, _STRIP_BYTES // (2 * columns * (last - first + 32)))
     images = [np.ma.masked_invalid(image) for image in (left, right)]
     disparity = np.empty(left.shape, np.float32)
     for row in range(0, rows, strip):
         top, stop = max(0, row - _SUPPORT), min(rows, row + strip)
-        found = match_whole(*(image[top : stop + _SUPPORT] for image in images), config)
+        found = match_whole(images[0][top : stop + _SUPPORT], images[1][top : stop + _SUPPORT], config)
         # Confidence 0: the pixel and all its candidates have no texture.
         known = found.valid & (found.confidence > 0)
         disparity[row:stop] = np.where(known, found.disparity, np.nan)[row - top : stop - top]
@@ -264,7 +302,7 @@ def _matched(left: np.ndarray, right: np.ndarray, first: int, last: int, speckle
         low, high = np.quantile(disparity[large], [_BEYOND, 1 - _BEYOND])
         near = _NEAR * (high - low) + _NEAR_PIXELS
         kept &= (disparity >= low - near) & (disparity <= high + near)
-    return Matches(disparity, kept, (first, last), float(kept.sum() / max(1, usable)))
+    return Matches(disparity, kept, (first, last), float(kept.sum() / max(1, usable)), Step(1, 1), (left, right))
 
 
 def _range_of(found: Matches, margin: tuple[float, float]) -> tuple[float, float]:

@@ -192,6 +192,8 @@ def _report(
     return {
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "settings": config.model_dump(mode="json"),
+        "requested": {"disparity": job.requested},
+        "search": job.found and job.found.report(),
         "inputs": job.inputs,
         "tiles": {
             "region": asdict(grid.region),

@@ -1,6 +1,6 @@
 """Prepare a pair for matching: open and check its images, folder, tiles and store."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -13,6 +13,7 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.match.mccnn import load_network, weights_file
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.search_range import Found, with_range
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.cluster import parse_memory
@@ -20,8 +21,11 @@ from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.output import OUTPUTS, check_output, holds_run, is_complete
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run, inputs_before
+from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run, inputs_before, search_before
 from sat_intervals.tiling import Grid, Tile, Window
+
+Search = Callable[[Image, Image, dict[str, dict[str, Any]]], Found]
+"""Finds the search range of two images, whose files have these identities."""
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
@@ -45,6 +49,10 @@ class Job:
         Description of the images and of the MC-CNN weights for run.json.
     files
         `identity` of each file that the images are read from, by the name it is opened with.
+    requested
+        The section ``disparity`` as the user gave it.
+    found
+        The search range that was found from the images, None if it was given.
     """
 
     left: Image
@@ -54,6 +62,8 @@ class Job:
     out: Path
     inputs: dict[str, Any]
     files: dict[str, dict[str, Any]]
+    requested: dict[str, Any]
+    found: Found | None = None
 
     @property
     def manifest(self) -> dict[str, Any]:
@@ -79,6 +89,8 @@ class Job:
             raise holds_run(self.out, OUTPUTS)
         check_output(self.out, overwrite)
         self.store.open(self.manifest, overwrite=overwrite)
+        if self.found:
+            self.store.write_search({"of": _origin(self.inputs), "found": self.found.report()})
 
     def check_inputs(self) -> None:
         """Raise if an input changed since the start of the run, or this process has other weights.
@@ -124,19 +136,30 @@ def prepare(
     window: Window | None = None,
     overwrite: bool = False,
     pair: str = "",
+    find: Search | None = None,
 ) -> Job:
-    """Check all that can be checked before reading pixels; parameters as in `match_pair`.
+    """Check all that can be checked before tiles are matched; parameters as in `match_pair`.
 
-    ``pair`` distinguishes otherwise equal pairs of a batch in an external store.
+    ``pair`` distinguishes otherwise equal pairs of a batch in an external store. ``find`` finds a search range that is
+    not given; one that an interrupted run has found is taken over.
     """
-    config, out = fitted_to_jobs(load_config(config)), Path(out)
+    config, out = load_config(config), Path(out)
+    requested, found = config.disparity.model_dump(mode="json"), None
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
-    check_tiles(config, region)
     check_output(out, overwrite)
-    check_space(out, RUN_FILES, region.height, region.width)
     home, elsewhere = out / "tiles", None
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
+    if config.disparity.is_auto:
+        before = None if overwrite else search_before(home, config.cluster.store)
+        found = _found_before(before, inputs) or (find and find(left, right, files))
+        if found is None:
+            raise SatIntervalsError("the search range is auto: give it as numbers")
+        config = with_range(config, found)
+        checked_pair(left, right, config)
+    config = fitted_to_jobs(config)
+    check_tiles(config, region)
+    check_space(out, RUN_FILES, region.height, region.width)
     read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
         name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
@@ -146,7 +169,18 @@ def prepare(
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
     store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
-    return Job(left, right, config, store, out, inputs, files)
+    return Job(left, right, config, store, out, inputs, files, requested, found)
+
+
+def _origin(inputs: Mapping[str, Any]) -> str:
+    """Return a digest of all that decides which search range is found."""
+    images = {side: inputs[side] for side in ("left", "right")}
+    return digest({"version": version("sat-intervals"), "kernels": FINGERPRINT, "inputs": images})
+
+
+def _found_before(search: Mapping[str, Any] | None, inputs: Mapping[str, Any]) -> Found | None:
+    """Return the search range that an interrupted run of the same images has stored, None without one."""
+    return Found.of_report(search["found"]) if search and search.get("of") == _origin(inputs) else None
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
@@ -169,7 +203,7 @@ def fitted_to_jobs(config: Config) -> Config:
     ConfigError
         See `fitted` and `parse_memory`.
     """
-    if config.cluster.memory is None:
+    if config.cluster.memory is None or config.disparity.is_auto:
         return config
     # dask kills workers at 95 % of their memory
     return fitted(config, 9 * parse_memory(config.cluster.memory) // 10, config.cluster.cores)
@@ -178,8 +212,9 @@ def fitted_to_jobs(config: Config) -> Config:
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
     """Open the images of a pair and check that they can be matched."""
     left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
-    check_pair(left, right, config.disparity.count)
-    config.disparity.check_images(left.path, left.width, right.path, right.width)
+    check_pair(left, right, 1 if config.disparity.is_auto else config.disparity.count)
+    if not config.disparity.is_auto:
+        config.disparity.check_images(left.path, left.width, right.path, right.width)
     if isinstance(config.cost, Mccnn):
         load_network(weights_file(config.cost.weights))
     return left, right

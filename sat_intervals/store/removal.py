@@ -9,9 +9,9 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed, 
 from sat_intervals.store.zarr_arrays import MADE_BY
 
 ARRAYS, RECORDS, FAILURES, BORDERS = "arrays.zarr", "records", "failures", "borders"
-NORMALIZATION = "normalization.json"
+NORMALIZATION, SEARCH = "normalization.json", "range.json"
 _GROUP = f"{ARRAYS}/zarr.json"
-_OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
+_OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
     rf"|{BORDERS}/(\d+)_(\d+)_[0-3]"

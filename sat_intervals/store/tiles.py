@@ -29,6 +29,7 @@ from sat_intervals.store.removal import (
     FAILURES,
     NORMALIZATION,
     RECORDS,
+    SEARCH,
     check_not_foreign,
     drop,
     is_of_run,
@@ -219,6 +220,10 @@ class Store:
         """Read the statistics of `write_normalization`; None if missing or damaged."""
         return unsealed(self.folder.read(NORMALIZATION))
 
+    def write_search(self, search: Mapping[str, Any]) -> None:
+        """Write the search range that was found, so that it is not searched again, see `search_before`."""
+        self.folder.write(SEARCH, sealed(search))
+
     def write_failure(self, tile: str, reason: str) -> None:
         """Write why a tile failed, for `failures`; a later record replaces it."""
         with suppress(OSError):  # a full disk must not end the run
@@ -334,6 +339,14 @@ def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
         return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
     except (OSError, TypeError, ValueError):
         return {}
+
+
+def search_before(home: Path, store: str | None) -> dict[str, Any] | None:
+    """Return what `Store.write_search` wrote with existing tiles; None if it cannot be read."""
+    try:
+        return unsealed(place_of(home, store).read(SEARCH))
+    except (OSError, ValueError):
+        return None
 
 
 def _checksums(records: Records) -> Checksums:
