@@ -10,6 +10,7 @@ from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
+from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import match_whole
 from sat_intervals.products import BANDS, FLAGS
 
@@ -25,7 +26,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         ``(rows, columns)`` real numbers; the rows correspond, the numbers of columns may differ. NaN, infinity and
         the masked pixels of a masked array are no data.
     config
-        Settings, or a mapping as `load_config` takes it; ``tiles`` has no effect.
+        Settings, or a mapping as `load_config` takes it; ``tiles`` has no effect. A search range that is auto is found
+        first.
 
     Returns
     -------
@@ -40,8 +42,11 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     """
     config = load_config(config)
     pixels = _pixels(left, "left"), _pixels(right, "right")
-    _check_fit(*pixels, config)
+    _check_rows(*pixels)
     images = _image(pixels[0]), _image(pixels[1])
+    if config.disparity.is_auto:
+        config = with_range(config, _found(*images))
+    _check_fit(*pixels, config)
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
@@ -87,7 +92,19 @@ def _image(pixels: np.ma.MaskedArray) -> np.ma.MaskedArray:
     return np.ma.masked_invalid(pixels.astype(dtype))
 
 
-def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
+def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
+    """Find the search range of two images; see `find_range`."""
+    step = finest_step(left.shape[0], max(left.shape[1], right.shape[1]))
+    small = [reduced(image.filled(0), np.ma.getmaskarray(image).view(np.uint8), step) for image in (left, right)]
+    try:
+        return find_range(small[0], small[1], step, left.shape[0])[0]
+    except NoRangeError as error:
+        raise NoRangeError(
+            f"the arrays have no common search range: {error}: give disparity minimum and maximum"
+        ) from None
+
+
+def _check_rows(left: np.ndarray, right: np.ndarray) -> None:
     if left.shape[0] != right.shape[0]:
         raise SatIntervalsError(
             f"the left array has {left.shape[0]} rows, the right {right.shape[0]}, but rows must correspond: "
@@ -95,6 +112,9 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
         )
     if 0 in left.shape or 0 in right.shape:
         raise SatIntervalsError(f"nothing to match: shapes {left.shape} and {right.shape}")
+
+
+def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
     config.disparity.check_images("the left array", left.shape[1], "the right array", right.shape[1])
     rows, columns = left.shape
     check_memory(
