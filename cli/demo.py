@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import path, run_options, settings_options, with_range
+from sat_intervals.cli.options import check_strict, path, run_options, settings_options, with_range
 
 
 @click.command(short_help="Make a scene with exact truth, match it and compare.")
@@ -22,6 +22,7 @@ def demo(
     seed: int,
     config_file: Path | None,
     given: dict[str, Any],
+    strict: bool,
     quiet: bool,
     **run: Any,
 ) -> None:
@@ -63,3 +64,4 @@ def demo(
             f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
             f"at a mean width of {figures['mean_width']:.2f} px."
         )
+    check_strict(strict, report["warnings"])

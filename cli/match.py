@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.options import (
+    check_strict,
     disparity_option,
     image_options,
     named,
@@ -42,6 +43,7 @@ def match(
     given: dict[str, Any],
     keep_tiles: bool,
     overwrite: bool,
+    strict: bool,
     quiet: bool,
 ) -> None:
     """Match the epipolar images LEFT and RIGHT and write to the folder OUT.
@@ -79,3 +81,4 @@ def match(
             progress=console.progress,
         )
     console.summary(report, out)
+    check_strict(strict, report["warnings"])

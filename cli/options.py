@@ -1,6 +1,6 @@
 """Options shared by commands, and checks of file names."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,6 +159,7 @@ def run_options(command: Command) -> Command:
     """Add options of commands that match pairs."""
     return _with(
         command,
+        click.option("--strict", is_flag=True, help="End with status 1 if the run warns, as of a narrow search range."),
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
         click.option("--overwrite", is_flag=True, help="Replace the run in OUT and delete its tiles."),
         quiet_option,
@@ -186,6 +187,21 @@ def with_range(given: dict[str, Any], disparity: tuple[int, int] | None) -> dict
     if disparity is None:
         return given
     return {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
+
+
+def check_strict(strict: bool, warnings: Sequence[str]) -> None:
+    """Raise if a run has warned and must not.
+
+    Raises
+    ------
+    RunError
+        With the number of warnings; their lines have been printed.
+    """
+    if strict and warnings:
+        from sat_intervals.errors import RunError
+
+        count = "1 warning" if len(warnings) == 1 else f"{len(warnings)} warnings"
+        raise RunError(f"{count}, see above, and --strict is given; the files are written")
 
 
 def _with(command: Command, *options: Callable[[Command], Command]) -> Command:

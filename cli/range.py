@@ -37,6 +37,7 @@ def search_range(
     Prints the range and its evidence. --window has no effect: a range is always that of the whole images.
     """
     from sat_intervals.cli.console import Console
+    from sat_intervals.run.quality import doubts
     from sat_intervals.run.search_range import find_here
 
     with Console(quiet or as_json) as console:
@@ -46,6 +47,8 @@ def search_range(
         return
     for name, value in _rows(found):
         click.echo(f"{name:<36}{value}")
+    for line in doubts(found.quality, {"left": left, "right": right}):
+        click.echo(line)
 
 
 def _rows(found: "Found") -> list[tuple[str, str]]:

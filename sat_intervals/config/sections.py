@@ -70,6 +70,10 @@ class Disparity(Section):
     minimum: Pixels = Field(AUTO, description="smallest disparity searched, in pixels; auto: found from the images")
     maximum: Pixels = Field(AUTO, description="largest disparity searched, in pixels; auto: found from the images")
 
+    open_ends: bool = Field(
+        False, description="confidence 0 and an open interval at the ends of the range; true where it was found"
+    )
+
     @property
     def is_auto(self) -> bool:
         """Return whether the range is to be found from the images."""

@@ -131,6 +131,11 @@ class Config(Section):
         return self.tiles.overlap == "exact" and self.sgm is not None
 
     @property
+    def opens_ends(self) -> bool:
+        """Return whether intervals at the ends of the search range are open, with confidence 0."""
+        return self.disparity.open_ends
+
+    @property
     def largest_p2(self) -> int:
         """Return the largest penalty as an integer cost, 0 without SGM."""
         return 0 if self.sgm is None else self.in_steps(self.sgm.largest_p2)

@@ -4,13 +4,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config, CosineSgm, Sgm
+from sat_intervals.config import Config, CosineSgm, Disparity, Sgm
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
 from sat_intervals.kernels.sgm import Borders
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
+from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY, RANGE_END
 from sat_intervals.tiling import Views, Window, facing
+
+# Number of disparities up to which a range has no ends of its own.
+_SHORT = 8
 
 
 class Patch(NamedTuple):
@@ -134,6 +137,7 @@ def match_patch(
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
     _mark_ambiguous(raw, cost.textureless[inside], config)
+    _mark_ends(raw, cost.textureless[inside], config.disparity)
     if of_right:
         right_view = match_right(cost_of_right[0], of_right[0], core, settings)
     return Patch(raw, output, right_view)
@@ -147,6 +151,13 @@ def _mark_ambiguous(raw: Raw, textureless: np.ndarray, config: Config) -> None:
     if config.interval:
         raw.lower[ambiguous], raw.upper[ambiguous] = config.disparity.minimum, config.disparity.maximum
     raw.ambiguity[ambiguous] = config.largest_ambiguity
+
+
+def _mark_ends(raw: Raw, textureless: np.ndarray, search: Disparity) -> None:
+    """Set the flag of winners at the first two and the last two candidates; a short range consists of ends only."""
+    if search.count > _SHORT:
+        ends = (raw.winner <= search.minimum + 1) | (raw.winner >= search.maximum - 1)
+        raw.validity[ends & (raw.winner != NO_DISPARITY) & ~textureless] |= RANGE_END
 
 
 def match_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:

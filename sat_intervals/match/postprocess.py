@@ -15,7 +15,7 @@ from sat_intervals.kernels.confidence import low_confidence, normalize, percenti
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
-from sat_intervals.products import INVALID, NO_DISPARITY, REGULARIZED, Bands
+from sat_intervals.products import INVALID, NO_DISPARITY, OPEN_ABOVE, OPEN_BELOW, RANGE_END, REGULARIZED, Bands
 
 Rows = TypeVar("Rows", bound=tuple[Any, ...])
 
@@ -100,6 +100,8 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
         validity |= cross_check(rows.winner, rows.right_winner, config.disparity.minimum, tolerance)
     kept = searched & (validity & INVALID == 0)
     confidence = normalize(rows.ambiguity, searched, scale.p1, scale.p99)
+    if config.opens_ends:
+        _open_ends(rows, validity, confidence, config)
     disparity, (lower, upper) = rows.disparity, _bounds(rows, config)
     if config.median:
         disparity = median(disparity, kept, config.median.size)
@@ -116,6 +118,15 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
     # Widen the intervals that medians or quantiles moved off the disparity.
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
     return Bands(disparity, lower, upper, confidence[inner], validity[inner])
+
+
+def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, config: Config) -> None:
+    """Distrust winners at the ends of the search range: the true disparity may lie beyond."""
+    ends = validity & RANGE_END != 0
+    confidence[ends] = 0
+    if config.interval:
+        below = rows.winner <= config.disparity.minimum + 1
+        validity[ends] |= np.where(below[ends], OPEN_BELOW, OPEN_ABOVE).astype(validity.dtype)
 
 
 def _bounds(rows: RawRows, config: Config) -> tuple[np.ndarray, np.ndarray]:

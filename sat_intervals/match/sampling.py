@@ -9,15 +9,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.kernels.cost import Codes, census
-from sat_intervals.match.search_range import Matches, settings
+from sat_intervals.match.search_range import Matches, Step, match_level, reduced, settings
 from sat_intervals.match.whole import match_whole
-from sat_intervals.tiling import Window
+from sat_intervals.products import NO_DATA
+from sat_intervals.tiling import View, Views, Window, facing
 
 # Side of a window in pixels of the image, and windows along each side of the image; side in pixels of the part of a
 # level that tells the row offset.
 _SIDE, _WINDOWS, _PART = 64, 3, 128
 # Rows up and down that are tried, and the box over which costs are summed.
 ROWS, _BOX = 2, 9
+# Side of the middle of a tile that is looked at, what it is reduced by first, and pixels of a surface there.
+_MIDDLE, _STEP, _SPECKLE = 192, Step(4, 4), 40
 # Matches of a window that are needed at least.
 _FEWEST = 200
 _CENSUS, _BITS = 5, 24
@@ -110,15 +113,19 @@ def look(sample: Sample, left: tuple[np.ndarray, np.ndarray], right: tuple[np.nd
     known = (found.valid & (found.confidence > 0))[inner]
     index = np.rint(np.nan_to_num(found.disparity[inner])).astype(int)
     codes = census(*left, _CENSUS), census(*right, _CENSUS)
+    return _look(codes, index, known, sample.rows)
+
+
+def _look(codes: tuple[Codes, Codes], index: np.ndarray, known: np.ndarray, rows: int) -> Look | None:
+    """What matches tell; ``rows`` is how much lower the right codes were read."""
     offsets = row_offsets(*codes, index, known)
     if known.sum() < _FEWEST or not offsets.size:
         return None
     matched = _distances(*codes, index, ROWS)[known]
     width = codes[1].state.shape[1]
-    random = _distances(*codes, (index + _AWAY + np.arange(index.shape[1])) % width - np.arange(index.shape[1]), ROWS)
-    return Look(
-        int(known.sum()), float(matched.mean()), float(random[known].mean()), sample.rows + float(np.median(offsets))
-    )
+    column = np.arange(index.shape[1])
+    random = _distances(*codes, (index + _AWAY + column) % width - column, ROWS)[known]
+    return Look(int(known.sum()), float(matched.mean()), float(random.mean()), rows + float(np.median(offsets)))
 
 
 def row_offsets(left: Codes, right: Codes, index: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -195,6 +202,45 @@ def _padded(image: np.ndarray, window: Window) -> tuple[np.ndarray, np.ndarray]:
     pixels = np.full((window.height, window.width), np.nan, np.float32)
     pixels[inside.relative_to(window).slices] = image[inside.slices]
     return np.nan_to_num(pixels), np.isnan(pixels).view(np.uint8)
+
+
+def look_in_tile(views: Views, core: Window, minimum: int, maximum: int) -> list[Look]:
+    """What the middle of a tile tells of the pair.
+
+    Parameters
+    ----------
+    views
+        Both images around the tile.
+    core
+        Pixels of the tile.
+    minimum, maximum
+        The search range.
+    """
+    row, column = (max(0, (side - _MIDDLE) // 2) for side in (core.height, core.width))
+    middle = Window(core.row + row, core.column + column, *(min(_MIDDLE, side) for side in (core.height, core.width)))
+    there = facing(middle, minimum, maximum)
+    left, right = (reduced(*_cut(view, window), _STEP) for view, window in zip(views, (middle, there), strict=True))
+    if 0 in left.shape:
+        return []
+    matches = match_level(left, right, (0, (maximum - minimum) // _STEP.columns), _SPECKLE)._replace(step=_STEP)
+    looks = []
+    for sample in samples(matches, coarse_rows(left, right, matches)):
+        windows = [
+            Window(middle.row + one.row, first + one.column, one.height, one.width)
+            for one, first in zip(sample.views, (middle.column, there.column), strict=True)
+        ]
+        looks.append(look(sample, *(_cut(view, window) for view, window in zip(views, windows, strict=True))))
+    return [found for found in looks if found is not None]
+
+
+def _cut(view: View, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and states of a window, which may leave the view."""
+    inside = window.clipped(view.window)
+    pixels = np.zeros((window.height, window.width), view.pixels.dtype)
+    state = np.full(pixels.shape, NO_DATA, np.uint8)
+    here, there = inside.relative_to(window).slices, inside.relative_to(view.window).slices
+    pixels[here], state[here] = view.pixels[there], view.state[there]
+    return pixels, state
 
 
 def summary(looks: Iterable[Look | None]) -> dict[str, Any]:

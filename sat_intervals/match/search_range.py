@@ -98,7 +98,9 @@ class Found:
 
 def with_range(config: Config, found: Found) -> Config:
     """The settings with a range that was found."""
-    disparity = config.disparity.model_copy(update={"minimum": found.minimum, "maximum": found.maximum})
+    disparity = config.disparity.model_copy(
+        update={"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
+    )
     return config.model_copy(update={"disparity": disparity})
 
 
@@ -264,7 +266,7 @@ def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, 
     ends = (min(0, wider) - reach, max(0, wider) + reach) if search is None else search
     first, last = max(most[0], int(np.floor(ends[0]))), min(most[1], int(np.ceil(ends[1])))
     for _ in range(_EXTENSIONS):
-        found = _matched(left, right, first, last, speckle)
+        found = match_level(left, right, (first, last), speckle)
         values = found.disparity[found.kept]
         low = first > most[0] and (values <= first + 1).sum() > _AT_END * values.size
         high = last < most[1] and (values >= last - 1).sum() > _AT_END * values.size
@@ -278,8 +280,19 @@ def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, 
     return found
 
 
-def _matched(left: np.ndarray, right: np.ndarray, first: int, last: int, speckle: int) -> Matches:
-    """Match a level over the disparities ``first .. last``, strip by strip; remove stray matches."""
+def match_level(left: np.ndarray, right: np.ndarray, searched: tuple[int, int], speckle: int) -> Matches:
+    """Match a level strip by strip; remove stray matches.
+
+    Parameters
+    ----------
+    left, right
+        float32, NaN where not usable.
+    searched
+        First and last disparity, in pixels of the level.
+    speckle
+        Pixels that a surface has at least.
+    """
+    first, last = searched
     usable = np.count_nonzero(np.isfinite(left))
     config = settings(first, last)
     rows, columns = left.shape

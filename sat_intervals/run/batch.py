@@ -134,7 +134,7 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
-    return {name: run.report[name] for name in ("counts", "seconds")}
+    return {name: run.report[name] for name in ("counts", "seconds", "warnings") if name in run.report}
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack, find: Search) -> Job:
@@ -251,4 +251,4 @@ def _assembled(
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
-    return {"state": "done", "counts": report["counts"], "seconds": report["seconds"]}
+    return {"state": "done", **{name: report[name] for name in ("counts", "seconds", "warnings")}}

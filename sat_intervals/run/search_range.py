@@ -27,14 +27,13 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, read_window
 from sat_intervals.raster.identity import ChangedInputError, check_unchanged
 from sat_intervals.run.cluster import Connection
+from sat_intervals.run.quality import COLLAR, is_plain
 from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.tiling import Window
 
 _Files = dict[str, dict[str, Any]]
 _Result = TypeVar("_Result")
 _RETRIES = 2
-# Share of an image above which its collar is told, and left out of the search.
-_COLLAR = 0.01
 
 
 class _Block(NamedTuple):
@@ -105,7 +104,7 @@ def search_range(client: Client, left: Image, right: Image, files: _Files, progr
     for side, image in (("left", left), ("right", right)):
         pixels, smallest = _reduced(client, image, step, files, progress)
         found = collar(pixels, smallest)
-        if is_plain(image) and found.mean() > _COLLAR:
+        if is_plain(image) and found.mean() > COLLAR:
             collars[side] = {"value": smallest, "share": round(float(found.mean()), 4)}
             pixels[found] = np.nan
         small.append(pixels)
@@ -125,11 +124,6 @@ def find_here(left: Image, right: Image, progress: Progress) -> Found:
     """Find the search range of a pair with the cores of this machine; see `search_range`."""
     with Connection(Cluster(), Path()) as connection:
         return search_range(connection.client(), left, right, {}, progress)
-
-
-def is_plain(image: Image) -> bool:
-    """Return whether nothing declares pixels of an image as no data."""
-    return image.nodata is None and not image.use_mask and image.alpha is None and image.mask is None
 
 
 def _reduced(client: Client, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:

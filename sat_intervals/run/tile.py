@@ -13,6 +13,7 @@ from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
 from sat_intervals.match.borders import Border, Place, borders_of, trace_patch
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
 from sat_intervals.match.patch import Patch, match_patch, patch_window, patch_windows, path_window
+from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_views, read_window
@@ -22,6 +23,9 @@ from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
 from sat_intervals.store.borders import read_border, write_border
 from sat_intervals.tiling import Tile, Views, Window
+
+# Tiles along each side of the grid, at most, in which the quality of a pair is looked at.
+_LOOKS = 4
 
 _LOG = logging.getLogger(__name__)
 
@@ -74,8 +78,17 @@ def _match_tile(job: Job, tile: Tile) -> None:
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     with timed(seconds, "write"):
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files})
+    looks = [look._asdict() for look in _looks(views, tile, job)]
+    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files, "looks": looks})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
+
+
+def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
+    """Look at the quality of the pair in some of the tiles, unless the search for its range did so."""
+    grid, search = job.store.grid, job.config.disparity
+    if job.found or tile.grid_row % -(-grid.rows // _LOOKS) or tile.grid_column % -(-grid.columns // _LOOKS):
+        return []
+    return look_in_tile(views, tile.core, search.minimum, search.maximum)
 
 
 def _trace_tile(job: Job, tile: Tile, wavefront: int) -> None:

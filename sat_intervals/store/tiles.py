@@ -41,7 +41,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 5
+LAYOUT = 6
 
 # Marker files in the folder of a run.
 # Present while a run replaces an earlier one.
