@@ -25,8 +25,9 @@ def batch(
 ) -> None:
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
-    Columns: name, left, right, minimum, maximum, left_mask, right_mask, and any setting such as sgm.p2. A failed pair
-    does not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
+    Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
+    sgm.p2. A failed pair does not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if
+    any failed.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.config.pairs import REPORT, read_batch

@@ -9,7 +9,6 @@ import click
 from sat_intervals.cli.options import image_options, log_options, named, quiet_option
 
 if TYPE_CHECKING:
-    from sat_intervals.match.search_range import Found
     from sat_intervals.raster import Image
     from sat_intervals.tiling import Window
 
@@ -51,7 +50,7 @@ def search_range(
         click.echo(line)
 
 
-def _rows(found: "Found") -> list[tuple[str, str]]:
+def _rows(found: Any) -> list[tuple[str, str]]:
     rows = [("search range", f"{found.minimum} to {found.maximum} px")]
     rows.append(("consistent matches", f"{100 * found.matched:.1f} % of the left pixels"))
     for level in found.levels:

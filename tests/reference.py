@@ -29,6 +29,9 @@ from sat_intervals.products import (
     NO_DISPARITY,
     NOT_REFINED,
     OCCLUSION,
+    OPEN_ABOVE,
+    OPEN_BELOW,
+    RANGE_END,
     RANGE_INCOMPLETE,
     REGULARIZED,
     REJECTED,
@@ -496,6 +499,10 @@ def match_arrays(left, right, left_state, right_state, config):
         bounds = alpha_cut(volume, config.interval.alpha, cost_span, extend=config.refinement is not None)
         lower, upper = (np.where(searched, b + minimum, np.nan).astype(np.float32) for b in bounds)
         lower[untextured], upper[untextured] = minimum, maximum
+    count = maximum - minimum + 1
+    below, above = (searched & ~untextured & end for end in (winner <= 1, winner >= count - 2))
+    if count > 8:
+        flags[below | above] |= RANGE_END
     raw = SimpleNamespace(volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags)
 
     flags = flags.copy()
@@ -509,6 +516,10 @@ def match_arrays(left, right, left_state, right_state, config):
         amounts = ambiguity(volume, config.ambiguity.eta_max, config.ambiguity.eta_step, cost_span)
         amounts[untextured] = len(etas(config.ambiguity.eta_max, config.ambiguity.eta_step)) * config.disparity.count
         confidence = normalize(amounts, searched, *percentiles_of(amounts, searched, config))
+    if config.disparity.open_ends and count > 8:
+        confidence[below | above] = 0
+        flags[below] |= OPEN_BELOW
+        flags[above] |= OPEN_ABOVE
 
     if config.median is not None:
         disparity = median(disparity, kept, config.median.size)

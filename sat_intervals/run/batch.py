@@ -32,6 +32,7 @@ from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
 from sat_intervals.store.tiles import finished_run, remove_tiles
+from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
 
@@ -121,7 +122,15 @@ def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Pat
 
 
 def _images(pair: PairOfBatch) -> tuple[Image, Image]:
-    return open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
+    def opened(side: str, path: str, mask: str | None) -> Image:
+        options = {name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")}
+        return open_image(path, **options, mask=mask)
+
+    return opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
+
+
+def _window(pair: PairOfBatch) -> Window | None:
+    return Window(*pair.window) if pair.window else None
 
 
 def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
@@ -130,7 +139,8 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
     if not is_complete(folder):
         return None
     run = open_run(folder)
-    if changes := changes_since(run.report, *_images(pair), fitted_to_jobs(with_range_of(run.report, settings))):
+    config = fitted_to_jobs(with_range_of(run.report, settings))
+    if changes := changes_since(run.report, *_images(pair), config, _window(pair)):
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
@@ -139,7 +149,9 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack, find: Search) -> Job:
     """Prepare the job of a pair, lock its folder and open its store."""
-    job = prepare(*_images(pair), out / pair.name, settings, overwrite=overwrite, pair=pair.name, find=find)
+    job = prepare(
+        *_images(pair), out / pair.name, settings, window=_window(pair), overwrite=overwrite, pair=pair.name, find=find
+    )
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin(overwrite=overwrite)
     return job

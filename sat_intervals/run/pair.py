@@ -3,6 +3,7 @@
 import errno
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,10 +101,7 @@ def _match_pair(
     """Match a pair on a cluster; see `match_pair`."""
     seconds: dict[str, float] = {}
 
-    def find(left: Image, right: Image, files: dict[str, dict[str, Any]]) -> Found:
-        with logged_stage(seconds, "start.range"):
-            return search_range(connection.client(), left, right, files, progress)
-
+    find = partial(_find, connection, seconds, progress)
     with logged_stage(seconds, "start"):
         job = prepare(*pair, out, config, window=window, overwrite=overwrite, find=find)
 
@@ -135,6 +133,19 @@ def _match_pair(
         if not keep_tiles:
             job.store.remove()
     return report
+
+
+def _find(
+    connection: Connection,
+    seconds: dict[str, float],
+    progress: Progress,
+    left: Image,
+    right: Image,
+    files: dict[str, dict[str, Any]],
+) -> Found:
+    """Find the search range of a pair; see `search_range`."""
+    with logged_stage(seconds, "start.range"):
+        return search_range(connection.client(), left, right, files, progress)
 
 
 def assemble_repaired(
