@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from sat_intervals.kernels.compiled import cached
-from sat_intervals.kernels.cost import Candidates, Costs, cost_curve, padded_to_lanes
+from sat_intervals.kernels.cost import Candidates, Cells, Costs, Ranges, cost_curve, one_cell, padded_to_lanes
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
 from sat_intervals.kernels.reading import (
     Rectangle,
@@ -65,6 +65,9 @@ class Settings(NamedTuple):
         uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine
         Whether winners are refined, and bounds extended by one for it.
+    offset, total
+        First disparity, and number of disparities, of the whole search range that this one is a part of: ``minimum -
+        offset`` is the first. 0: this is the whole range.
     """
 
     minimum: int
@@ -76,6 +79,8 @@ class Settings(NamedTuple):
     cut_level: int
     weights: np.ndarray
     refine: bool
+    offset: int = 0
+    total: int = 0
 
 
 class Raw(NamedTuple):
@@ -124,6 +129,10 @@ class _Buffers(NamedTuple):
 
     Attributes
     ----------
+    ranges
+        Those of the pixels of the row.
+    usable
+        ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
     possible
         ``(columns,)`` int64: number of possible candidates of each pixel of the row.
     curve
@@ -135,6 +144,9 @@ class _Buffers(NamedTuple):
     """
 
     candidates: Candidates
+    cells: Cells
+    ranges: Ranges
+    usable: np.ndarray
     possible: np.ndarray
     penalties: Penalties
     paths: Paths
@@ -148,14 +160,24 @@ def _rectangle(window: Window) -> Rectangle:
 
 
 def _prepare(
-    costs: Costs, gradients: Gradients | None, settings: Settings, inside: Window, rings: tuple[Ring, ...]
+    costs: Costs,
+    gradients: Gradients | None,
+    settings: Settings,
+    inside: Window,
+    rings: tuple[Ring, ...],
+    cells: Cells | None,
 ) -> _Buffers:
-    columns, size = costs.left_state.shape[1], padded_to_lanes(settings.count)
-    beyond = np.zeros(size, np.uint16)
-    beyond[settings.count :] = WALL
+    (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
+    cells = cells or one_cell(rows, columns, settings.count)
+    k = np.arange(size)
+    beyond = (k < cells.first[..., np.newaxis]) | (k > cells.last[..., np.newaxis])
+    walls = np.where(beyond.reshape(-1, size), np.uint16(WALL), np.uint16(0))
     slots = 1 + 3 * columns
     return _Buffers(
-        Candidates(costs, np.zeros(columns + size, np.uint16), beyond),
+        Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
+        cells,
+        Ranges(np.zeros(columns, np.int64), np.zeros(columns, np.int64)),
+        np.zeros(columns + settings.count, np.int64),
         np.zeros(columns, np.int64),
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
         Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
@@ -171,21 +193,31 @@ def _enter_row(buffers, gradients, settings, r, down):
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    (costs, barrier, _), possible, penalties, paths, _, inside, rings = buffers
+    candidates, cells, ranges, usable, possible, penalties, paths, _, inside, rings = buffers
+    costs, barrier = candidates.costs, candidates.barrier
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
-    usable = 0
-    for x in range(settings.count - 1):
-        usable += costs.right_state[r, x] == 0
+        usable[x + 1] = usable[x] + (costs.right_state[r, x] == 0)
+    _enter_cells(candidates, cells, ranges, r)
     for c in range(possible.size):
-        usable += costs.right_state[r, c + settings.count - 1] == 0
-        possible[c] = usable if costs.left_state[r, c] == 0 else 0
-        usable -= costs.right_state[r, c] == 0
+        inner = usable[c + ranges.last[c] + 1] - usable[c + ranges.first[c]]
+        possible[c] = inner if costs.left_state[r, c] == 0 else 0
     falling, rising = -r % possible.size, r % possible.size
     enter_row(paths, possible.size, falling, rising, down)
     take_over(paths, rings, inside, r, falling, rising, down)
     fill_row(gradients, r, down, penalties.row)
     return falling, rising
+
+
+@njit(nogil=True)
+def _enter_cells(candidates, cells, ranges, r):
+    """Set the search ranges of the pixels of a row, and where their walls are."""
+    i, number = (r + cells.row) // cells.height, cells.first.shape[1]
+    for j in range(number):
+        start, stop = max(0, j * cells.width - cells.column), (j + 1) * cells.width - cells.column
+        ranges.first[start:stop] = cells.first[i, j]
+        ranges.last[start:stop] = cells.last[i, j]
+        candidates.walls[start:stop] = (i * number + j) * candidates.beyond.shape[1]
 
 
 @njit(nogil=True, forceinline=True)
@@ -199,7 +231,7 @@ def _columns(inside, r, down):
 @cached
 def _trace(buffers, gradients, settings, wave, down, target):
     """Advance the paths of one wave through a patch and copy the states that leave it to ``target``, a `Ring`."""
-    candidates, possible, penalties, paths, _, inside, _ = buffers
+    candidates, _, _, _, possible, penalties, paths, _, inside, _ = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
@@ -217,7 +249,7 @@ def _trace(buffers, gradients, settings, wave, down, target):
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, possible, penalties, paths, curve, inside, _ = buffers
+    candidates, _, _, _, possible, penalties, paths, curve, inside, _ = buffers
     for r in range(output.row_stop):
         falling, rising = _enter_row(buffers, gradients, settings, r, True)
         for c in _columns(inside, r, True):
@@ -234,7 +266,7 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
     """Finish and read the curves of the pixels of ``output``, and update the right view."""
-    candidates, possible, penalties, paths, curve, inside, _ = buffers
+    candidates, _, ranges, _, possible, penalties, paths, curve, inside, _ = buffers
     winner, lower, upper, disparity, cost, ambiguity, validity = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
@@ -248,8 +280,9 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             if not contains(output, r, c):
                 continue
             i, j = r - output.row, c - output.column
-            if possible[c] < settings.count:
-                validity[i, j] = search_flags(costs, r, c, settings.count, possible[c])
+            least, most = ranges.first[c], ranges.last[c]
+            if possible[c] < most + 1 - least:
+                validity[i, j] = search_flags(costs, r, c, least, most, possible[c])
             if possible[c] == 0:
                 if keep:
                     volume[i, j] = IMPOSSIBLE_COST
@@ -260,7 +293,7 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
                 cost_curve(candidates, r, c, curve)
             lowest = close_impossible(curve, candidates, c)
             winner[i, j], shift, refined, lower[i, j], upper[i, j], ambiguity[i, j] = read_curve(
-                curve, lowest, settings
+                curve, lowest, settings, least, most
             )
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
@@ -271,11 +304,11 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
                 volume[i, j] = curve
 
 
-def _sweep(costs, gradients, settings, output, core, keep, borders):
+def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     """Run both sweeps; return the raw products, the right view and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
     borders = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
-    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2])
+    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2], cells)
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
@@ -303,7 +336,12 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
 
 
 def trace(
-    costs: Costs, settings: Settings, borders: Borders, wavefront: int, gradients: Gradients | None = None
+    costs: Costs,
+    settings: Settings,
+    borders: Borders,
+    wavefront: int,
+    gradients: Gradients | None = None,
+    cells: Cells | None = None,
 ) -> Ring:
     """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
 
@@ -311,7 +349,8 @@ def trace(
     Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]
-    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2] if down else borders.rings[2:])
+    rings = borders.rings[:2] if down else borders.rings[2:]
+    buffers = _prepare(costs, gradients, settings, borders.inside, rings, cells)
     inside, size = borders.inside, buffers.curve.size
     target = Ring(np.empty((inside.height, 2, size), np.uint16), np.empty((inside.width, 2, size), np.uint16))
     _trace(buffers, gradients, settings, wave, down, target)
@@ -325,6 +364,7 @@ def match_costs(
     core: Window | None = None,
     gradients: Gradients | None = None,
     borders: Borders | None = None,
+    cells: Cells | None = None,
 ) -> tuple[Raw, RightView]:
     """Match a patch: matching costs in, raw products and the right view's winners out.
 
@@ -342,6 +382,8 @@ def match_costs(
         Gradients that P1 and P2 follow; by default P1 and P2 are those of ``settings``.
     borders
         Path states around the patch; by default every path starts at the edge of the patch.
+    cells
+        Search ranges of the pixels within that of ``settings``; by default all search all of it.
 
     Returns
     -------
@@ -350,7 +392,7 @@ def match_costs(
     RightView
         Of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False, borders)
+    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False, borders, cells)
     return raw, right_view
 
 
@@ -360,4 +402,4 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True, None)[2][:, :, : settings.count]
+    return _sweep(costs, gradients, settings, whole, whole, True, None, None)[2][:, :, : settings.count]

@@ -52,10 +52,11 @@ def contains(rectangle, r, c):
 
 @njit(nogil=True, forceinline=True)
 def close_impossible(curve, candidates, c):
-    """Set impossible candidates and lanes behind the range to IMPOSSIBLE_COST; return the lowest cost."""
+    """Set impossible candidates and those that are not searched to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
     for k in range(0, curve.size, LANES):
-        closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), load(candidates.beyond, k)))
+        wall = load(candidates.beyond, candidates.walls[c] + k)
+        closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), wall))
         costs = larger(load(curve, k), closed)
         store(curve, k, costs)
         lowest = smaller(lowest, costs)
@@ -74,11 +75,11 @@ def _winner(curve, lowest):
 
 
 @njit(nogil=True, forceinline=True)
-def _interval(curve, lowest, count, cut_level, refine):
+def _interval(curve, lowest, least, most, cut_level, refine):
     """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
     first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
-    first -= refine & (first > 0) & (curve[first] == lowest)
-    last += refine & (last < count - 1) & (curve[last] == lowest)
+    first -= refine & (first > least) & (curve[first] == lowest)
+    last += refine & (last < most) & (curve[last] == lowest)
     return first, last
 
 
@@ -115,31 +116,47 @@ def update_right(curve, right, r, c):
 
 
 @njit(nogil=True)
-def search_flags(costs, r, c, count, possible):
+def search_flags(costs, r, c, first, last, possible):
     """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
     flags = 0
     if costs.left_state[r, c] != 0:
         flags |= LEFT_WINDOW
     usable, masked = 0, False
-    for x in range(c, c + count):
+    for x in range(c + first, c + last + 1):
         usable += costs.right_state[r, x] == 0
         masked |= costs.right_state[r, x] & MASKED != 0
     if usable == 0:
         flags |= RIGHT_MASKED if masked else NO_CANDIDATE
-    elif 0 < possible < count:
+    elif 0 < possible < last + 1 - first:
         flags |= RANGE_INCOMPLETE
     return flags
 
 
 @njit(nogil=True, forceinline=True)
-def read_curve(curve, lowest, settings):
-    """Winner, sub-pixel shift, whether it was refined, both bounds and ambiguity of a finished curve."""
+def read_curve(curve, lowest, settings, least, most):
+    """Winner, sub-pixel shift, whether it was refined, both bounds and ambiguity of a finished curve.
+
+    ``least`` and ``most`` are the first and the last candidate searched.
+    """
     k = _winner(curve, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
     lower = upper = NO_DISPARITY
     if settings.cut_level >= 0:
-        first, last = _interval(curve, lowest, settings.count, settings.cut_level, settings.refine)
+        first, last = _interval(curve, lowest, least, most, settings.cut_level, settings.refine)
         lower, upper = settings.minimum + first, settings.minimum + last
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
-    count = settings.count if settings.weights.size else 0
-    return settings.minimum + k, shift, refined, lower, upper, ambiguity(curve, count, lowest, settings.weights)
+    stop = most + 1 if settings.weights.size else least
+    amount = ambiguity(curve, least, stop, lowest, settings.weights)
+    if stop > least and _distrusts(k, least, most, settings):
+        amount += settings.weights[0] * (settings.total - (stop - least))
+    return settings.minimum + k, shift, refined, lower, upper, amount
+
+
+@njit(nogil=True, forceinline=True)
+def _distrusts(k, least, most, settings):
+    """Whether a winner stands at an end of its cell's range that is no end of the whole range, or next to it.
+
+    The true disparity may then be among the candidates of the whole range that were not searched: they are ambiguous.
+    """
+    first, last = settings.offset + least, settings.offset + most
+    return (k <= least + 1 and first > 0) or (k >= most - 1 and last < settings.total - 1)

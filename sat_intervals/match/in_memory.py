@@ -43,10 +43,10 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     config = load_config(config)
     pixels = _pixels(left, "left"), _pixels(right, "right")
     _check_rows(*pixels)
-    images = _image(pixels[0]), _image(pixels[1])
     if config.disparity.is_auto:
-        config = with_range(config, _found(*images))
+        config = with_range(config, _found(_image(pixels[0]), _image(pixels[1])))
     _check_fit(*pixels, config)
+    images = _image(pixels[0]), _image(pixels[1])
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
