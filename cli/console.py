@@ -102,8 +102,10 @@ class Console:
         table.add_column(style="bold")
         table.add_column(justify="right")
         pixels = counts["pixels"]
-        if report.get("search"):
+        if report.get("search") and report["requested"]["disparity"]["minimum"] == "auto":
             table.add_row("search range, found", f"{report['search']['minimum']} to {report['search']['maximum']} px")
+        if report.get("local_ranges"):
+            table.add_row("local ranges, of the whole", f"{100 * report['local_ranges']['share']:.0f} %")
         table.add_row("valid pixels", _share(counts["valid"], pixels))
         for flag, count in counts["causes"].items():
             if count:

@@ -9,7 +9,9 @@ import click
 from sat_intervals.cli.options import (
     check_strict,
     disparity_option,
+    grid_option,
     image_options,
+    local_option,
     named,
     path,
     run_options,
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 @click.argument("right", callback=named)
 @click.argument("out", callback=path)
 @disparity_option
+@local_option
+@grid_option
 @image_options
 @click.option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
 @settings_options
@@ -36,6 +40,8 @@ def match(
     right: str,
     out: Path,
     disparity: tuple[int, int] | None,
+    local_range: bool,
+    range_grid: str | None,
     open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     dry_run: bool,
@@ -59,7 +65,7 @@ def match(
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
 
-    config = load_config(config_file, with_range(given, disparity))
+    config = load_config(config_file, with_range(given, disparity, local_range, range_grid))
     if dry_run:
         from sat_intervals.run.batch_system import job_script
 

@@ -46,6 +46,12 @@ cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching co
 store_option = click.option(
     "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles during the run."
 )
+local_option = click.option(
+    "--local-range", is_flag=True, help="Search a range of its own in each cell of the image, found from the images."
+)
+grid_option = click.option(
+    "--range-grid", callback=named, metavar="FILE", help="Raster of two bands, minimum and maximum of each pixel."
+)
 disparity_option = click.option(
     "--disparity",
     type=int,
@@ -182,11 +188,16 @@ def log_options(command: Command) -> Command:
     )
 
 
-def with_range(given: dict[str, Any], disparity: tuple[int, int] | None) -> dict[str, Any]:
-    """Add the search range of the command line to its sections."""
-    if disparity is None:
-        return given
-    return {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
+def with_range(
+    given: dict[str, Any], disparity: tuple[int, int] | None, local_range: bool = False, range_grid: str | None = None
+) -> dict[str, Any]:
+    """Add the search range and the local ranges of the command line to its sections."""
+    section: dict[str, Any] = dict(zip(("minimum", "maximum"), disparity or (), strict=False))
+    if local_range:
+        section["local"] = True
+    if range_grid is not None:
+        section["grid"] = range_grid
+    return {**given, "disparity": section} if section else given
 
 
 def check_strict(strict: bool, warnings: Sequence[str]) -> None:

@@ -74,6 +74,21 @@ class Disparity(Section):
         False, description="confidence 0 and an open interval at the ends of the range; true where it was found"
     )
 
+    local: bool = Field(False, description="search a range of its own in each cell of the image, found from the images")
+    grid: str | None = Field(
+        None, description="raster of two bands, minimum and maximum, for local ranges; null: found from the images"
+    )
+
+    @field_validator("grid")
+    @classmethod
+    def _make_absolute(cls, value: str | None) -> str | None:
+        return None if value is None else os.path.abspath(value)
+
+    @property
+    def is_local(self) -> bool:
+        """Return whether cells have ranges of their own."""
+        return self.local or self.grid is not None
+
     @property
     def is_auto(self) -> bool:
         """Return whether the range is to be found from the images."""

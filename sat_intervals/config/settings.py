@@ -84,6 +84,10 @@ class Config(Section):
                 f"regularization needs {' and '.join(off)}, set to null: give {' and '.join(off)} or set "
                 "regularization to null too"
             )
+        if self.disparity.is_local and self.cross_check and self.cross_check.method == "accurate":
+            raise ValueError(
+                "disparity has local ranges, which cross_check.method accurate does not know: use fast, or one range"
+            )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
         if self.tiles.overlap == "exact":

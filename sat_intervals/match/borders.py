@@ -12,10 +12,11 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.matching import trace
-from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
+from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Ring
+from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, cost_areas
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import kernel_settings, patch_window, path_window
+from sat_intervals.match.patch import patch_settings, patch_window, path_window
 from sat_intervals.tiling import Views, Window
 
 Place = tuple[int, int]
@@ -55,6 +56,22 @@ def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
     return Ring(borders[beside].ring.column if beside in borders else nothing, row)
 
 
+def rehulled(ring: Ring, minimum: int, config: Config) -> Ring:
+    """States of a neighbour, whose first disparity is ``minimum``, over the search range of ``config``.
+
+    What one of both does not search is beyond the cells of the pixels that they share: a wall.
+    """
+    size, shift = padded_to_lanes(config.disparity.count), config.disparity.minimum - minimum
+    found = []
+    for states in ring:
+        both = np.full((*states.shape[:2], size), WALL, np.uint16)
+        first, last = max(0, -shift), min(size, states.shape[2] - shift)
+        both[..., first : max(first, last)] = states[..., first + shift : max(first, last) + shift]
+        both[..., config.disparity.count :] = WALL
+        found.append(both)
+    return Ring(*found)
+
+
 def borders_of(
     core: Window, region: Window, whole: Window, config: Config, found: Sequence[Mapping[Place, Border]]
 ) -> Borders:
@@ -71,6 +88,7 @@ def trace_patch(
     wavefront: int,
     config: Config,
     statistics: PairStatistics | None = None,
+    ranges: LocalRanges | None = None,
 ) -> Ring:
     """Path states that a tile hands on in a wavefront.
 
@@ -84,8 +102,10 @@ def trace_patch(
         States that it takes over, see `borders_of`.
     wavefront
         Index of WAVEFRONTS.
-    config, statistics
+    config, statistics, ranges
         As for `match_patch`.
     """
-    (cost,) = cost_areas(views, [Area.of(patch, config)], config, statistics)
-    return trace(cost.costs, kernel_settings(config), borders, wavefront, cost.gradients)
+    settings, cells = patch_settings(patch, config, ranges)
+    area = Area.of(patch, narrowed(ranges, patch, config))
+    (cost,) = cost_areas(views, [area], config, statistics, cells)
+    return trace(cost.costs, settings, borders, wavefront, cost.gradients, cells)

@@ -43,14 +43,20 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     config = load_config(config)
     pixels = _pixels(left, "left"), _pixels(right, "right")
     _check_rows(*pixels)
-    if config.disparity.is_auto:
-        config = with_range(config, _found(_image(pixels[0]), _image(pixels[1])))
+    ranges = None
+    if config.disparity.grid:
+        raise SatIntervalsError("a raster of local ranges needs files: use match_pair, or disparity local")
+    if config.disparity.is_auto or config.disparity.local:
+        found = _found(_image(pixels[0]), _image(pixels[1]))
+        config = with_range(config, found) if config.disparity.is_auto else config
+        if config.disparity.local:
+            ranges = found.local.clipped(config.disparity.minimum, config.disparity.maximum)
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
-    final = match_whole(*images, config, statistics)
+    final = match_whole(*images, config, statistics, ranges)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
     dataset = xr.Dataset(coords=labels.coords)
     for band, layer in zip(BANDS, final[:4], strict=True):
@@ -97,7 +103,7 @@ def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
     step = finest_step(left.shape[0], max(left.shape[1], right.shape[1]))
     small = [reduced(image.filled(0), np.ma.getmaskarray(image).view(np.uint8), step) for image in (left, right)]
     try:
-        return find_range(small[0], small[1], step, left.shape[0])[0]
+        return find_range(small[0], small[1], step, left.shape)[0]
     except NoRangeError as error:
         raise NoRangeError(
             f"the arrays have no common search range: {error}: give disparity minimum and maximum"

@@ -8,7 +8,7 @@ import numpy as np
 
 from sat_intervals.config import Config, InverseSgm, Mccnn, MccnnSgm, NegativeSgm
 from sat_intervals.kernels.correlation import correlate
-from sat_intervals.kernels.cost import Codes, Costs, between, census, padded_to_lanes, window_state
+from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.match.mccnn import RADIUS, Network, load_network, weights_file
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
@@ -83,7 +83,11 @@ def _around(windows: Sequence[Window]) -> Window:
 
 
 def cost_areas(
-    views: Views, areas: Sequence[Area], config: Config, statistics: PairStatistics | None = None
+    views: Views,
+    areas: Sequence[Area],
+    config: Config,
+    statistics: PairStatistics | None = None,
+    cells: Cells | None = None,
 ) -> list[MatchingCost]:
     """Costs and gradients of areas of two views.
 
@@ -97,6 +101,8 @@ def cost_areas(
         Settings.
     statistics
         Mean and standard deviation of the whole images; None if the matching cost needs none.
+    cells
+        Local search ranges of the first area, the only one then; by default all pixels search all of it.
     """
     radius = config.cost.window // 2
     if isinstance(config.cost, Mccnn):
@@ -110,7 +116,7 @@ def cost_areas(
             found,
             _gradients(area, views, config, statistics),
             views[area.mirrored].inner(views[area.mirrored].state, area.base),
-            _textureless(found, *_of_area(area, views, varying, radius)),
+            _textureless(found, *_of_area(area, views, varying, radius), cells),
         )
         for area, found in zip(areas, costs, strict=True)
     ]
@@ -140,7 +146,7 @@ def _varies(view: View, radius: int) -> np.ndarray:
     return varies
 
 
-def _textureless(costs: Costs, base_varies: np.ndarray, there_varies: np.ndarray) -> np.ndarray:
+def _textureless(costs: Costs, base_varies: np.ndarray, there_varies: np.ndarray, cells: Cells | None) -> np.ndarray:
     """Pixels of the base whose window, and all usable windows that face it, do not vary along any row.
 
     All their candidates cost the same. SGM would still choose among them, by costs carried in from the image borders.
@@ -150,7 +156,12 @@ def _textureless(costs: Costs, base_varies: np.ndarray, there_varies: np.ndarray
     textured = there_varies[rows] & (costs.right_state[rows] == 0)
     cumulative = np.pad(np.cumsum(textured, axis=1, dtype=np.int32), [(0, 0), (1, 0)])
     columns = flat.shape[1]
-    flat[rows] &= cumulative[:, -columns:] == cumulative[:, :columns]
+    if cells is None:
+        flat[rows] &= cumulative[:, -columns:] == cumulative[:, :columns]
+        return flat
+    row, column = (np.flatnonzero(rows) + cells.row) // cells.height, (np.arange(columns) + cells.column) // cells.width
+    first, last = (bound[row[:, np.newaxis], column] + np.arange(columns) for bound in (cells.first, cells.last))
+    flat[rows] &= np.take_along_axis(cumulative, last + 1, 1) == np.take_along_axis(cumulative, first, 1)
     return flat
 
 

@@ -5,11 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, CosineSgm, Disparity, Sgm
+from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
 from sat_intervals.kernels.sgm import Borders
+from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY, RANGE_END
+from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, NO_DISPARITY, RANGE_END
 from sat_intervals.tiling import Views, Window, facing
 
 # Number of disparities up to which a range has no ends of its own.
@@ -51,6 +53,25 @@ def kernel_settings(config: Config) -> Settings:
     )
 
 
+def patch_settings(base: Window, config: Config, ranges: LocalRanges | None) -> tuple[Settings, Cells | None]:
+    """Settings of the kernels for a patch, and the ranges of its cells; ``base`` is its window of the left image."""
+    if ranges is None:
+        return kernel_settings(config), None
+    settings = kernel_settings(ranges.within(base, config))
+    search = config.disparity
+    whole = settings._replace(offset=settings.minimum - search.minimum, total=search.count)
+    return whole, ranges.cells(base, settings.minimum)
+
+
+def _of_whole_range(view: RightView, core: Window, settings: Settings) -> RightView:
+    """Right view in the layout of the whole search range, in which the strips of all tiles are put together."""
+    shape = core.height, core.width + settings.total - 1
+    cost, winner = np.full(shape, IMPOSSIBLE_COST, np.uint16), np.full(shape, NO_DISPARITY, np.int16)
+    here = slice(settings.offset, settings.offset + view.cost.shape[1])
+    cost[:, here], winner[:, here] = view.cost, view.winner
+    return RightView(cost, winner)
+
+
 def path_window(core: Window, region: Window, whole: Window, config: Config) -> Window:
     """Pixels whose paths a tile computes: its core and, at the ends of the region, the pixels that support it."""
     around = _supported(region, whole, config)
@@ -70,15 +91,19 @@ def _supported(region: Window, whole: Window, config: Config) -> Window:
     return region.grown(config.tiles.support, config.tiles.support).clipped(whole)
 
 
-def patch_areas(core: Window, region: Window, whole: Window, config: Config) -> list[Area]:
+def patch_areas(
+    core: Window, region: Window, whole: Window, config: Config, ranges: LocalRanges | None = None
+) -> list[Area]:
     """Area of a core with what it reads around it and, for accurate cross-checking, that of the right view.
 
     ``whole`` is the window of all left pixels. The area may leave the region, but not the image.
     """
     overlap = config.tiles.overlap
     if overlap == "exact":
-        return [Area.of(patch_window(core, region, whole, config), config)]
-    areas = [Area.of(core.grown(overlap, overlap).clipped(whole), config)]
+        base = patch_window(core, region, whole, config)
+        return [Area.of(base, narrowed(ranges, base, config))]
+    base = core.grown(overlap, overlap).clipped(whole)
+    areas = [Area.of(base, narrowed(ranges, base, config))]
     if config.cross_check and config.cross_check.method == "accurate":
         areas.append(_right_area(core, whole, overlap, config))
     return areas
@@ -92,9 +117,11 @@ def _right_area(core: Window, whole: Window, overlap: int, config: Config) -> Ar
     return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
 
 
-def patch_windows(core: Window, region: Window, whole: Window, config: Config) -> tuple[Window, Window]:
+def patch_windows(
+    core: Window, region: Window, whole: Window, config: Config, ranges: LocalRanges | None = None
+) -> tuple[Window, Window]:
     """Windows of both images that matching a core needs; see `patch_areas`."""
-    return view_windows(patch_areas(core, region, whole, config), config)
+    return view_windows(patch_areas(core, region, whole, config, ranges), config)
 
 
 def match_patch(
@@ -105,6 +132,7 @@ def match_patch(
     config: Config,
     statistics: PairStatistics | None = None,
     borders: Borders | None = None,
+    ranges: LocalRanges | None = None,
 ) -> Patch:
     """Match a core.
 
@@ -124,16 +152,26 @@ def match_patch(
         Mean and standard deviation of the whole images; None if the matching cost needs none.
     borders
         Path states of the neighbours; by default every path starts where the patch does.
+    ranges
+        Local search ranges; by default all pixels search the whole range.
     """
-    settings = kernel_settings(config)
     output = core if config.tiles.overlap == "exact" else core.grown(1, 1).clipped(region)
-    area, *of_right = patch_areas(core, region, whole, config)
-    cost, *cost_of_right = cost_areas(views, [area, *of_right], config, statistics)
+    area, *of_right = patch_areas(core, region, whole, config, ranges)
+    settings, cells = patch_settings(area.base, config, ranges)
+    cost, *cost_of_right = cost_areas(views, [area, *of_right], config, statistics, cells)
     wants_fast = config.cross_check is not None and config.cross_check.method == "fast"
     right_core = core if wants_fast else Window(core.row, core.column, 0, 0)
     raw, right_view = match_costs(
-        cost.costs, settings, output.relative_to(area.base), right_core.relative_to(area.base), cost.gradients, borders
+        cost.costs,
+        settings,
+        output.relative_to(area.base),
+        right_core.relative_to(area.base),
+        cost.gradients,
+        borders,
+        cells,
     )
+    if ranges:
+        right_view = _of_whole_range(right_view, right_core, settings)
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
     _mark_ambiguous(raw, cost.textureless[inside], config)

@@ -4,7 +4,9 @@ A level has its step: the images averaged over ``rows x columns`` pixels. The co
 one within what the level before found. Disparities of a level are in its own pixels; times the step they are in pixels.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +15,7 @@ from sat_intervals.config import Config, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.components import component_sizes
 from sat_intervals.kernels.disparity import median
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.whole import match_whole
 
 # Columns of the coarsest level at most, of the finest level at least, and the largest step of the finest level.
@@ -37,6 +40,9 @@ _FEWEST = 0.1
 # Bytes of the cost volume of a strip of a level, and its rows above and below that support it.
 _STRIP_BYTES, _SUPPORT = 1 << 26, 16
 _BINS = 32
+# Side of a cell of the local ranges in pixels of the level, share of its usable pixels that must be matched, and the
+# margin of its range: pixels of the level, and pixels.
+_CELL, _UNDERSTOOD, _LOCAL_MARGIN = 32, 0.2, (2, 1)
 
 
 class NoRangeError(SatIntervalsError):
@@ -77,6 +83,8 @@ class Found:
     quality
         ``noise`` and ``row_offset``, see `sampling.summary`, and ``collars``: the value and share of pixels of the
         `collar` of an image, by side.
+    cells
+        The local ranges, see `LocalRanges.report`.
     """
 
     minimum: int
@@ -85,6 +93,12 @@ class Found:
     levels: tuple[Level, ...]
     histogram: dict[str, list[float]] = field(default_factory=dict)
     quality: dict[str, Any] = field(default_factory=dict)
+    cells: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def local(self) -> LocalRanges:
+        """Return the local ranges."""
+        return LocalRanges.of_report(self.cells)
 
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold."""
@@ -197,7 +211,7 @@ def collar(image: np.ndarray, smallest: float) -> np.ndarray:
     return found
 
 
-def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tuple[Found, Matches]:
+def find_range(left: np.ndarray, right: np.ndarray, step: Step, shape: tuple[int, int]) -> tuple[Found, Matches]:
     """Find the search range of a pair.
 
     Parameters
@@ -206,8 +220,8 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tu
         Both images at the finest level: float32, NaN where not usable; of the same number of rows.
     step
         The `finest_step`.
-    rows
-        Of the images themselves.
+    shape
+        Rows and columns of the left image itself.
 
     Returns
     -------
@@ -221,7 +235,7 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tu
     pyramid = [(step, left, right)]
     while max(pyramid[-1][1].shape[1], pyramid[-1][2].shape[1]) > _TOP:
         here, left, right = pyramid[-1]
-        more = Step(2 if 2 * here.rows <= min(2 * here.columns, _most_rows(rows)) else 1, 2)
+        more = Step(2 if 2 * here.rows <= min(2 * here.columns, _most_rows(shape[0])) else 1, 2)
         there = Step(here.rows * more.rows, here.columns * more.columns)
         pyramid.append((there, _coarser(left, more), _coarser(right, more)))
     levels: list[Level] = []
@@ -246,7 +260,41 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, rows: int) -> tu
     counts, edges = np.histogram(matches.disparity[matches.kept] * size, _BINS)
     histogram = {"edges": [round(float(edge), 2) for edge in edges], "counts": counts.tolist()}
     minimum, maximum = int(np.floor(low)), int(np.ceil(high))
-    return Found(minimum, maximum, round(matches.matched, 4), tuple(levels), histogram), matches
+    cells = _local(matches, minimum, maximum, shape).report()
+    return Found(minimum, maximum, round(matches.matched, 4), tuple(levels), histogram, cells=cells), matches
+
+
+def _local(matches: Matches, minimum: int, maximum: int, shape: tuple[int, int]) -> LocalRanges:
+    """Local ranges from the matches of a level: those of a cell and its neighbours, with a margin.
+
+    Cells without enough matches get the whole range: the level does not understand them. Cells without a usable pixel
+    take the range of their neighbours.
+    """
+    rows, columns = (-(-side // (_CELL * size)) for side, size in zip(shape, matches.step, strict=True))
+
+    def in_cells(values: np.ndarray, nothing: Any) -> np.ndarray:
+        whole = np.full((rows * _CELL, columns * _CELL), nothing, values.dtype)
+        whole[: values.shape[0], : values.shape[1]] = values
+        return whole.reshape(rows, _CELL, columns, _CELL)
+
+    usable = in_cells(np.isfinite(matches.images[0]), False).sum(axis=(1, 3))
+    kept = in_cells(matches.kept, False)
+    disparity = in_cells(matches.disparity, 0)
+    low = _around(np.where(kept, disparity, np.inf).min(axis=(1, 3)), np.minimum)
+    high = _around(np.where(kept, disparity, -np.inf).max(axis=(1, 3)), np.maximum)
+    unknown = ((kept.sum(axis=(1, 3)) < _UNDERSTOOD * usable) & (usable > 0)) | (low > high)
+    size = matches.step.columns
+    least = np.floor(np.where(unknown, minimum, low * size - _LOCAL_MARGIN[0] * size - _LOCAL_MARGIN[1]))
+    most = np.ceil(np.where(unknown, maximum, high * size + _LOCAL_MARGIN[0] * size + _LOCAL_MARGIN[1]))
+    least, most = (np.clip(bound, minimum, maximum).astype(np.int16) for bound in (least, most))
+    return LocalRanges(least, most, _CELL * matches.step.rows, _CELL * size)
+
+
+def _around(values: np.ndarray, choose: Callable[..., np.ndarray]) -> np.ndarray:
+    """Smallest or largest of each value and its eight neighbours."""
+    padded = np.pad(values, 1, mode="edge")
+    parts = [padded[r : r + values.shape[0], c : c + values.shape[1]] for r in range(3) for c in range(3)]
+    return reduce(choose, parts)
 
 
 def settings(first: int, last: int) -> Config:

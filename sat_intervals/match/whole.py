@@ -4,6 +4,7 @@ import numpy as np
 
 from sat_intervals.config import Config
 from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
@@ -12,15 +13,21 @@ from sat_intervals.tiling import View, Window
 
 
 def match_whole(
-    left: np.ma.MaskedArray, right: np.ma.MaskedArray, config: Config, statistics: PairStatistics | None = None
+    left: np.ma.MaskedArray,
+    right: np.ma.MaskedArray,
+    config: Config,
+    statistics: PairStatistics | None = None,
+    ranges: LocalRanges | None = None,
 ) -> Bands:
     """Match two images of finite floats, ``(rows, columns)``; masked pixels are no data.
 
-    ``statistics`` are those of the images; None if the matching cost needs none.
+    ``statistics`` are those of the images; None if the matching cost needs none. ``ranges`` are local search ranges;
+    None: all pixels search the whole range.
     """
     whole = Window(0, 0, *left.shape)
-    windows = patch_windows(whole, whole, whole, config)
-    patch = match_patch((_view(left, windows[0]), _view(right, windows[1])), whole, whole, whole, config, statistics)
+    windows = patch_windows(whole, whole, whole, config, ranges)
+    views = _view(left, windows[0]), _view(right, windows[1])
+    patch = match_patch(views, whole, whole, whole, config, statistics, ranges=ranges)
     raw, scale = patch.raw, ConfidenceScale(np.nan, np.nan)
     if config.ambiguity:
         histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)

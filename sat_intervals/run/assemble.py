@@ -179,6 +179,7 @@ def _report(
         "settings": config.model_dump(mode="json"),
         "requested": {"disparity": job.requested},
         "search": job.found and job.found.report(),
+        "local_ranges": job.local and job.local.report() | {"share": job.local.share},
         "inputs": job.inputs,
         "tiles": {
             "region": asdict(grid.region),

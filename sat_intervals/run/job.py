@@ -10,14 +10,16 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.mccnn import load_network, weights_file
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.search_range import Found, with_range
+from sat_intervals.match.search_range import Found
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
+from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, holds_run, is_complete
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
@@ -52,7 +54,11 @@ class Job:
     requested
         The section ``disparity`` as the user gave it.
     found
-        The search range that was found from the images, None if it was given.
+        What the search for the range found, None if none was made.
+    grid
+        Digest of the local search ranges, None without them.
+    local
+        The local search ranges; not on workers, which read them from the store.
     """
 
     left: Image
@@ -64,11 +70,13 @@ class Job:
     files: dict[str, dict[str, Any]]
     requested: dict[str, Any]
     found: Found | None = None
+    grid: str | None = None
+    local: LocalRanges | None = None
 
     @property
     def manifest(self) -> dict[str, Any]:
         """Return all that decides the bytes of a tile."""
-        return _manifest(self.config, self.inputs, self.store.grid.region)
+        return _manifest(self.config, self.inputs, self.store.grid.region, self.grid)
 
     @property
     def name(self) -> str:
@@ -89,8 +97,9 @@ class Job:
             raise holds_run(self.out, OUTPUTS)
         check_output(self.out, overwrite)
         self.store.open(self.manifest, overwrite=overwrite)
-        if self.found:
-            self.store.write_search({"of": _origin(self.inputs), "found": self.found.report()})
+        if self.found or self.local:
+            search = {"of": _origin(self.inputs), "found": self.found and self.found.report()}
+            self.store.write_search(search | {"ranges": self.local and self.local.report()})
 
     def check_inputs(self) -> None:
         """Raise if an input changed since the start of the run, or this process has other weights.
@@ -121,6 +130,29 @@ class Job:
             )
         return PairStatistics.of_report(normalization)
 
+    def ranges(self) -> LocalRanges | None:
+        """Return the local search ranges, None without them.
+
+        Raises
+        ------
+        DamagedTilesError
+            They are missing in the store.
+        """
+        if not self.config.disparity.is_local:
+            return None
+        if self.local is None:
+            stored = (self.store.search() or {}).get("ranges")
+            if stored is None or digest(stored) != self.grid:
+                raise DamagedTilesError(
+                    f"the local search ranges in {self.store.folder} are missing: rerun the same command: it resumes"
+                )
+            return LocalRanges.of_report(stored)
+        return self.local
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what workers read from the store, see `ranges`."""
+        return self.__dict__ | {"local": None}
+
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""
         done = self.store.done()
@@ -144,32 +176,37 @@ def prepare(
     not given; one that an interrupted run has found is taken over.
     """
     config, out = load_config(config), Path(out)
-    requested, found = config.disparity.model_dump(mode="json"), None
+    requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
     check_output(out, overwrite)
     home, elsewhere = out / "tiles", None
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
-    if config.disparity.is_auto:
-        before = None if overwrite else search_before(home, config.cluster.store)
-        found = _found_before(before, inputs) or (find and find(left, right, files))
-        if found is None:
-            raise SatIntervalsError("the search range is auto: give it as numbers")
-        config = with_range(config, found)
-        checked_pair(left, right, config)
+    before = None if overwrite else search_before(home, config.cluster.store)
+    config, found, local = searched(
+        config, left, lambda: _found_before(before, inputs) or _find(find, left, right, files)
+    )
+    marked = digest(local.report()) if local else None
+    checked_pair(left, right, config)
     config = fitted_to_jobs(config)
     check_tiles(config, region)
     check_space(out, RUN_FILES, region.height, region.width)
     read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
-        name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
+        name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region, marked)))))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
     # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
     store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
-    return Job(left, right, config, store, out, inputs, files, requested, found)
+    return Job(left, right, config, store, out, inputs, files, requested, found, marked, local)
+
+
+def _find(find: Search | None, left: Image, right: Image, files: dict[str, dict[str, Any]]) -> Found:
+    if find is None:
+        raise SatIntervalsError("the search range is auto: give it as numbers")
+    return find(left, right, files)
 
 
 def _origin(inputs: Mapping[str, Any]) -> str:
@@ -180,12 +217,15 @@ def _origin(inputs: Mapping[str, Any]) -> str:
 
 def _found_before(search: Mapping[str, Any] | None, inputs: Mapping[str, Any]) -> Found | None:
     """Return the search range that an interrupted run of the same images has stored, None without one."""
-    return Found.of_report(search["found"]) if search and search.get("of") == _origin(inputs) else None
+    if not search or search.get("of") != _origin(inputs) or not search.get("found"):
+        return None
+    return Found.of_report(search["found"])
 
 
-def _manifest(config: Config, inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
+def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
     """Return all that decides the bytes of a tile."""
     return {
+        **({"local_ranges": grid} if grid else {}),
         "version": version("sat-intervals"),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,

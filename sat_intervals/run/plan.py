@@ -9,12 +9,12 @@ from typing import Any
 from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
-from sat_intervals.match.search_range import with_range
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image
 from sat_intervals.run.cluster import tiles_at_once
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.search_range import find_here
 from sat_intervals.run.submit import reason
@@ -91,9 +91,8 @@ def plan(
     """
     config = load_config(config)
     left, right = checked_pair(left, right, config)
-    if config.disparity.is_auto:
-        config = with_range(config, find_here(left, right, progress))
-        checked_pair(left, right, config)
+    config, _, _ = searched(config, left, lambda: find_here(left, right, progress))
+    checked_pair(left, right, config)
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
     workers = workers or tiles_at_once(config.cluster)
     region = checked_region(left, window)

@@ -109,7 +109,7 @@ def search_range(client: Client, left: Image, right: Image, files: _Files, progr
             pixels[found] = np.nan
         small.append(pixels)
     try:
-        searched, matches = find_range(small[0], small[1], step, left.height)
+        searched, matches = find_range(small[0], small[1], step, (left.height, left.width))
     except NoRangeError as error:
         raise NoRangeError(
             f"{left.path} and {right.path}: {error}: give the search range with --disparity MIN MAX, or check that the "

@@ -10,7 +10,8 @@ import numpy as np
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
-from sat_intervals.match.borders import Border, Place, borders_of, trace_patch
+from sat_intervals.match.borders import Border, Place, borders_of, rehulled, trace_patch
+from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
 from sat_intervals.match.patch import Patch, match_patch, patch_window, patch_windows, path_window
 from sat_intervals.match.sampling import Look, look_in_tile
@@ -71,10 +72,11 @@ def _match_tile(job: Job, tile: Tile) -> None:
     job.store.check_space(tile)
     region, whole = job.store.grid.region, _image(job)
     seconds: dict[str, float] = {}
-    views, statistics = _read(job, patch_windows(tile.core, region, whole, job.config), seconds)
-    borders = _borders(job, tile, range(len(WAVEFRONTS))) if job.config.hands_states_on else None
+    ranges = job.ranges()
+    views, statistics = _read(job, patch_windows(tile.core, region, whole, job.config, ranges), seconds)
+    borders = _borders(job, tile, range(len(WAVEFRONTS)), ranges) if job.config.hands_states_on else None
     with timed(seconds, "match"):
-        patch = match_patch(views, tile.core, region, whole, job.config, statistics, borders)
+        patch = match_patch(views, tile.core, region, whole, job.config, statistics, borders, ranges)
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     with timed(seconds, "write"):
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
@@ -93,9 +95,10 @@ def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
 
 def _trace_tile(job: Job, tile: Tile, wavefront: int) -> None:
     region, whole = job.store.grid.region, _image(job)
-    views, statistics = _read(job, patch_windows(tile.core, region, whole, job.config), {})
-    borders, patch = _borders(job, tile, [wavefront]), patch_window(tile.core, region, whole, job.config)
-    ring = trace_patch(views, patch, borders, wavefront, job.config, statistics)
+    ranges, patch = job.ranges(), patch_window(tile.core, region, whole, job.config)
+    views, statistics = _read(job, patch_windows(tile.core, region, whole, job.config, ranges), {})
+    borders = _borders(job, tile, [wavefront], ranges)
+    ring = trace_patch(views, patch, borders, wavefront, job.config, statistics, ranges)
     write_border(job.store.folder, f"{tile.name}_{wavefront}", *ring)
 
 
@@ -116,9 +119,10 @@ def _read(job: Job, windows: tuple[Window, Window], seconds: dict[str, float]) -
     return views, statistics
 
 
-def _borders(job: Job, tile: Tile, wavefronts: Iterable[int]) -> Borders:
+def _borders(job: Job, tile: Tile, wavefronts: Iterable[int], ranges: LocalRanges | None) -> Borders:
     """Read the path states that a tile takes over from its neighbours."""
     grid, whole = job.store.grid, _image(job)
+    here = narrowed(ranges, patch_window(tile.core, grid.region, whole, job.config), job.config)
     found: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
     for wavefront in wavefronts:
         for step in needs(grid, Step(tile, wavefront)):
@@ -130,8 +134,12 @@ def _borders(job: Job, tile: Tile, wavefronts: Iterable[int]) -> Borders:
                 )
             place = step.tile.grid_row - tile.grid_row, step.tile.grid_column - tile.grid_column
             inside = path_window(step.tile.core, grid.region, whole, job.config)
-            found[wavefront][place] = Border(inside, Ring(*states))
-    return borders_of(tile.core, grid.region, whole, job.config, found)
+            ring = Ring(*states)
+            if ranges:
+                around = patch_window(step.tile.core, grid.region, whole, job.config)
+                ring = rehulled(ring, narrowed(ranges, around, job.config).disparity.minimum, here)
+            found[wavefront][place] = Border(inside, ring)
+    return borders_of(tile.core, grid.region, whole, here, found)
 
 
 def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:

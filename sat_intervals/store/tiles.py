@@ -224,6 +224,10 @@ class Store:
         """Write the search range that was found, so that it is not searched again, see `search_before`."""
         self.folder.write(SEARCH, sealed(search))
 
+    def search(self) -> dict[str, Any] | None:
+        """Read what `write_search` wrote; None if missing or damaged."""
+        return unsealed(self.folder.read(SEARCH))
+
     def write_failure(self, tile: str, reason: str) -> None:
         """Write why a tile failed, for `failures`; a later record replaces it."""
         with suppress(OSError):  # a full disk must not end the run

@@ -44,5 +44,5 @@ def test_look_in_tile__tells_nothing_of_empty_images(scene):
 def test_coarse_rows__sees_an_offset_of_a_coarse_pixel(scene):
     step = Step(2, 2)
     left, right = (reduced(v.pixels, v.state, step) for v in map(view, (scene.left[2:], scene.right[:-2])))
-    matches = find_range(left, right, step, 258)[1]
+    matches = find_range(left, right, step, (258, 360))[1]
     assert coarse_rows(left, right, matches) == pytest.approx(2, abs=0.6)

@@ -19,7 +19,7 @@ def small(image, step):
 
 def searched(left, right):
     step = finest_step(left.shape[0], max(left.shape[1], right.shape[1]))
-    return find_range(small(left, step), small(right, step), step, left.shape[0])[0]
+    return find_range(small(left, step), small(right, step), step, left.shape)[0]
 
 
 def test_find_range__holds_the_truth_and_is_narrow(scene):
