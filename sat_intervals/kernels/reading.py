@@ -147,8 +147,12 @@ def read_curve(curve, lowest, settings, least, most):
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
     stop = most + 1 if settings.weights.size else least
     amount = ambiguity(curve, least, stop, lowest, settings.weights)
-    if stop > least and _distrusts(k, least, most, settings):
-        amount += settings.weights[0] * (settings.total - (stop - least))
+    count = stop - least
+    if 0 < count < settings.total:
+        if _distrusts(k, least, most, settings):
+            amount += settings.weights[0] * (settings.total - count)
+        else:
+            amount += amount * (settings.total - count) // count
     return settings.minimum + k, shift, refined, lower, upper, amount
 
 
