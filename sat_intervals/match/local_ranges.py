@@ -57,6 +57,12 @@ class LocalRanges:
         row, column = window.row - rows.start * self.height, window.column - columns.start * self.width
         return Cells(first, last, self.height, self.width, row, column)
 
+    def at(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
+        """First and last disparity of the cell of each pixel of a window."""
+        rows = np.arange(window.row, window.row_stop) // self.height
+        columns = np.arange(window.column, window.column_stop) // self.width
+        return self.minimum[np.ix_(rows, columns)], self.maximum[np.ix_(rows, columns)]
+
     def report(self) -> dict[str, Any]:
         """Return the mapping that the store and run.json hold; bounds are int16 in base 64, compressed by zlib."""
         bounds = {name: getattr(self, name).astype("<i2").tobytes() for name in ("minimum", "maximum")}

@@ -11,7 +11,7 @@ from sat_intervals.kernels.sgm import Borders
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, NO_DISPARITY, RANGE_END
+from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, MISMATCH, NO_DISPARITY, RANGE_END
 from sat_intervals.tiling import Views, Window, facing
 
 # Number of disparities up to which a range has no ends of its own.
@@ -176,6 +176,8 @@ def match_patch(
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
     _mark_ambiguous(raw, cost.textureless[inside], config)
     _mark_ends(raw, cost.textureless[inside], config.disparity)
+    if ranges:
+        _reject_ends(raw, *ranges.at(output), config.disparity)
     if of_right:
         right_view = match_right(cost_of_right[0], of_right[0], core, settings)
     return Patch(raw, output, right_view)
@@ -196,6 +198,17 @@ def _mark_ends(raw: Raw, textureless: np.ndarray, search: Disparity) -> None:
     if search.count > _SHORT:
         ends = (raw.winner <= search.minimum + 1) | (raw.winner >= search.maximum - 1)
         raw.validity[ends & (raw.winner != NO_DISPARITY) & ~textureless] |= RANGE_END
+
+
+def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparity) -> None:
+    """Reject winners at an end of their cell's range, or next to it, that is no end of the whole range: no minima.
+
+    The cross-check would reject most of them in a search of the whole range. ``least`` and ``most`` are those ends.
+    """
+    ends = (raw.winner <= least + 1) & (least > search.minimum)
+    ends |= (raw.winner >= most - 1) & (most < search.maximum)
+    ends &= raw.winner != NO_DISPARITY
+    raw.validity[ends] |= MISMATCH
 
 
 def match_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:
