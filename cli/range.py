@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import image_options, log_options, named, quiet_option
+from sat_intervals.cli.options import image_options, log_options, named, path, quiet_option
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from sat_intervals.raster import Image
     from sat_intervals.tiling import Window
 
@@ -20,6 +22,7 @@ _BARS = 8
 @click.argument("left", callback=named)
 @click.argument("right", callback=named)
 @image_options
+@click.option("--output", callback=path, metavar="FILE", help="Write the local ranges, for --range-grid of match.")
 @click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
 @quiet_option
 @log_options
@@ -28,19 +31,25 @@ def search_range(
     right: str,
     open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
+    output: "Path | None",
     as_json: bool,
     quiet: bool,
 ) -> None:
     """Find the search range of the epipolar images LEFT and RIGHT, as match does without --disparity.
 
-    Prints the range and its evidence. --window has no effect: a range is always that of the whole images.
+    Prints the range and its evidence; --output keeps the ranges of the cells. --window has no effect: a range is always
+    that of the whole images.
     """
     from sat_intervals.cli.console import Console
+    from sat_intervals.run.local_ranges import write_ranges
     from sat_intervals.run.quality import doubts
     from sat_intervals.run.search_range import find_here
 
     with Console(quiet or as_json) as console:
-        found = find_here(*open_images(left, right), console.progress)
+        images = open_images(left, right)
+        found = find_here(*images, console.progress)
+        if output:
+            write_ranges(output, found.local, images[0])
     if as_json:
         click.echo(json.dumps(found.report(), indent=1))
         return
@@ -53,6 +62,7 @@ def search_range(
 def _rows(found: Any) -> list[tuple[str, str]]:
     rows = [("search range", f"{found.minimum} to {found.maximum} px")]
     rows.append(("consistent matches", f"{100 * found.matched:.1f} % of the left pixels"))
+    rows.append(("local ranges, of the whole", f"{100 * found.local.share:.0f} %"))
     for level in found.levels:
         searched = f"{level.minimum} to {level.maximum} px searched, {100 * level.matched:.1f} % matched"
         rows.append((f"  images reduced {level.step} times", searched))

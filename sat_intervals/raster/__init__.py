@@ -12,6 +12,7 @@ from sat_intervals.raster.layers import (
     whole_file,
     write_layer,
     write_once,
+    write_rows,
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
@@ -54,4 +55,5 @@ __all__ = [
     "whole_file",
     "write_layer",
     "write_once",
+    "write_rows",
 ]

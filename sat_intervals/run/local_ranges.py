@@ -1,6 +1,7 @@
 """The search range and the local ranges of a pair: given, found, or read from the raster that the user gives."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -8,11 +9,14 @@ from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
-from sat_intervals.raster import Image, open_image, read_shape, read_window
+from sat_intervals.raster import Image, open_image, read_shape, read_window, write_rows
+from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.tiling import Window
 
 # Side of the cells that a raster of ranges is reduced to, in pixels.
 _CELL = 64
+# Rows written at a time.
+_STRIP = 256
 
 
 def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
@@ -42,6 +46,16 @@ def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
         raise SatIntervalsError(f"{config.disparity.grid} has no data: give another raster, or the search range")
     ends = {"minimum": int(raster.minimum[known].min()), "maximum": int(raster.maximum[known].max())}
     return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
+
+
+def write_ranges(path: str | Path, ranges: LocalRanges, left: Image) -> None:
+    """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
+    check_not_replaced([left.path], [Path(path)])
+    rows = (
+        np.stack(ranges.at(Window(row, 0, min(_STRIP, left.height - row), left.width)))
+        for row in range(0, left.height, _STRIP)
+    )
+    write_rows(path, rows, (2, left.height, left.width), left.georeferencing)
 
 
 def read_ranges(path: str, left: Image) -> LocalRanges:

@@ -4,9 +4,10 @@ import json
 
 import numpy as np
 import pytest
+import rasterio
 from helpers import PLACE, bands, invoke, write_pair
 
-from sat_intervals import SatIntervalsError, match_pair
+from sat_intervals import SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run_pair
@@ -63,38 +64,42 @@ def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
-def write_ranges(file, low, high):
-    from rasterio import Env
-    from rasterio import open as create
-
-    with (
-        Env(),
-        create(
-            file, "w", driver="GTiff", count=2, height=low.shape[0], width=low.shape[1], dtype="float32", nodata=np.nan
-        ) as dataset,
-    ):
+def write_bands(file, low, high):
+    options = {"count": 2, "height": low.shape[0], "width": low.shape[1], "dtype": "float32", "nodata": np.nan}
+    with rasterio.open(file, "w", driver="GTiff", **options, **PLACE.creation_options()) as dataset:
         dataset.write(np.stack([low, high]).astype(np.float32))
 
 
 def test_read_ranges__takes_the_hull_of_a_cell_rounded_outwards(folder, tmp_path):
-    from sat_intervals import open_image
-
     left = open_image(folder / "left.tif")
     low, high = np.full((180, 420), -3.5), np.full((180, 420), 4.2)
     low[10, 10], high[70, 70], low[150, 410] = -9.1, 12.5, np.nan
     file = tmp_path / "ranges.tif"
-    write_ranges(file, low, high)
+    write_bands(file, low, high)
     found = read_ranges(str(file), left).clipped(-20, 20)
     assert (found.minimum[0, 0], found.maximum[0, 0]) == (-10, 5)
     assert (found.minimum[1, 1], found.maximum[1, 1]) == (-4, 13)
     assert (found.minimum[2, 6], found.maximum[2, 6]) == (-20, 20)
     low[3, 4] = 9
-    write_ranges(file, low, high)
+    write_bands(file, low, high)
     with pytest.raises(SatIntervalsError, match=r"minimum 9 above maximum 4\.2 at row 3, column 4"):
         read_ranges(str(file), left)
     write_layer(file, low, np.nan, PLACE)
     with pytest.raises(SatIntervalsError, match="has 1 bands of 180 x 420 pixels"):
         read_ranges(str(file), left)
+
+
+def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):
+    images = folder / "left.tif", folder / "right.tif"
+    assert invoke("range", *images, "--output", tmp_path / "range.tif", "-q").exit_code == 0
+    report = run(folder, tmp_path / "out", disparity={"grid": str(tmp_path / "range.tif")}, tiles={"size": 128})
+    search = report["settings"]["disparity"]
+    with rasterio.open(tmp_path / "range.tif") as dataset:
+        low, high = dataset.read()
+    assert (search["minimum"], search["maximum"]) == (low.min(), high.max())
+    (disparity, *_), _ = bands(tmp_path / "out")
+    assert report["local_ranges"]["share"] < 0.95
+    assert np.isfinite(disparity).mean() > 0.5
 
 
 def test_match__names_a_wider_range_and_is_strict(folder, tmp_path):
