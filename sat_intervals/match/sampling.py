@@ -16,7 +16,7 @@ from sat_intervals.tiling import View, Views, Window, facing
 
 # Side of a window in pixels of the image, and windows along each side of the image; side in pixels of the part of a
 # level that tells the row offset.
-_SIDE, _WINDOWS, _PART = 64, 3, 128
+_SIDE, _WINDOWS, _PART = 64, 2, 128
 # Rows up and down that are tried, and the box over which costs are summed.
 ROWS, _BOX = 2, 9
 # Side of the middle of a tile that is looked at, what it is reduced by first, and pixels of a surface there.

@@ -18,8 +18,9 @@ from sat_intervals.kernels.disparity import median
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.whole import match_whole
 
-# Columns of the coarsest level at most, of the finest level at least, and the largest step of the finest level.
-_TOP, _FINEST, _LARGEST_STEP = 400, 300, 8
+# Columns of the coarsest level at most, and of the finest level at least by its step: larger steps are refined less,
+# since there the time counts.
+_TOP, _FINEST = 400, {2: 300, 4: 300, 8: 240}
 # Rows of a level at least, where the image has them.
 _ROWS = 100
 # Share of the width that disparities of the coarsest level are first searched in, to both sides.
@@ -147,9 +148,7 @@ class Matches(NamedTuple):
 
 def finest_step(rows: int, columns: int) -> Step:
     """Step of the finest level of a pair of this size."""
-    step = 1
-    while step < _LARGEST_STEP and columns >= 2 * step * _FINEST:
-        step *= 2
+    step = max((step for step, least in _FINEST.items() if columns >= step * least), default=1)
     return Step(min(step, _most_rows(rows)), step)
 
 
@@ -355,7 +354,7 @@ def match_level(left: np.ndarray, right: np.ndarray, searched: tuple[int, int], 
         disparity[row:stop] = np.where(known, found.disparity, np.nan)[row - top : stop - top]
     known = np.isfinite(disparity)
     disparity = np.nan_to_num(disparity)
-    steady = known & (np.abs(disparity - median(disparity, known, 5)) <= 1)
+    steady = known & (np.abs(disparity - median(disparity, known, 3)) <= 1)
     sizes = component_sizes(disparity, steady)
     kept = steady & (sizes >= speckle)
     large = kept & (sizes >= _LARGE * usable)

@@ -58,7 +58,7 @@ def test_find_range__few_rows_are_averaged_less():
     assert finest_step(400, 30_000) == Step(4, 8)
     assert finest_step(12, 3000) == Step(1, 8)
     assert finest_step(3000, 500) == Step(1, 1)
-    assert finest_step(3000, 2000) == Step(4, 4)
+    assert finest_step(3000, 1900) == Step(4, 4)
 
 
 def test_reduced__averages_usable_pixels_where_half_of_a_block_is_usable():
