@@ -179,6 +179,8 @@ def prepare(
     requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
+    if not config.disparity.is_auto:
+        check_tiles(fitted_to_jobs(config), region)
     check_output(out, overwrite)
     home, elsewhere = out / "tiles", None
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
