@@ -8,6 +8,7 @@ import click
 from sat_intervals.cli.options import log_options
 
 _FILE = click.Path(path_type=Path)
+_PICTURES = ("overview", "errors", "coverage", "profile", "curve", "dsm")
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
@@ -44,7 +45,6 @@ def plot(
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
     from sat_intervals.show.coverage import draw_coverage
@@ -53,32 +53,30 @@ def plot(
     from sat_intervals.show.marks import check_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
 
+    results = open_results(out, truth)
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
-    results = open_results(out, truth)
+    is_judged = results.truth is not None and results.config.interval is not None
+    if beside and not is_judged:
+        raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
     if row is not None:
         results.check_part(row, columns)
     if pixel is not None:
         results.check_pixel(*pixel)
-    pictures = [out / f"{name}.png" for name in ("overview", "errors", "coverage", "profile", "curve", "dsm")]
-    results.check_kept(pictures, [truth, out / "dsm.tif"])
+    results.check_kept([out / f"{name}.png" for name in _PICTURES], [truth, out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
-    if results.truth is not None and results.config.interval is not None:
+    if is_judged:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)
-        reports = [evaluate_run(folder, truth) for folder in (out, *beside)]
-        title = f"{out.name}: intervals and truth"
-        drawings["coverage"] = lambda path: draw_coverage(reports, path, title, dpi)
-    elif beside:
-        raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
+        drawings["coverage"] = lambda path: draw_coverage([out, *beside], truth, path, dpi)
     if row is not None:
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
     if pixel is not None:
         drawings["curve"] = lambda path: draw_curve(results, path, *pixel, dpi)
-    surface = out / "dsm.tif"
-    if surface.exists() and results.report["finished"] not in read_tags(surface).get("RUNS", ""):
-        click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
-    elif surface.exists():
-        drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
+    if (surface := out / "dsm.tif").exists():
+        if results.report["finished"] in read_tags(surface).get("RUNS", ""):
+            drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
+        else:
+            click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
     check_made_here(out / f"{name}.png" for name in drawings)
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
