@@ -45,7 +45,6 @@ def plot(
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
@@ -56,12 +55,12 @@ def plot(
     results = open_results(out, truth)
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
-    is_judged = results.truth is not None and results.config.interval is not None
+    is_judged = None not in (results.truth, results.config.interval)
     if beside and not is_judged:
         raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
     if row is not None:
         results.check_part(row, columns)
-    if pixel is not None:
+    if pixel:
         results.check_pixel(*pixel)
     results.check_kept([out / f"{name}.png" for name in _PICTURES], [truth, out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
@@ -70,14 +69,21 @@ def plot(
         drawings["coverage"] = lambda path: draw_coverage([out, *beside], truth, path, dpi)
     if row is not None:
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
-    if pixel is not None:
+    if pixel:
         drawings["curve"] = lambda path: draw_curve(results, path, *pixel, dpi)
-    if (surface := out / "dsm.tif").exists():
-        if results.report["finished"] in read_tags(surface).get("RUNS", ""):
-            drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
-        else:
-            click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
+    if _is_current(surface := out / "dsm.tif", results.report["finished"]):
+        drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
     check_made_here(out / f"{name}.png" for name in drawings)
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
+
+
+def _is_current(surface: Path, finished: str) -> bool:
+    """Return whether there is a surface model of the run; say so if it belongs to another one."""
+    from sat_intervals.raster import read_tags
+
+    if not surface.exists() or finished in read_tags(surface).get("RUNS", ""):
+        return surface.exists()
+    click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
+    return False
