@@ -20,7 +20,7 @@ from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image.
 SAMPLE = 512
-# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed), strips of the final bands, files.
+# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each level of bounds), strips of the final bands, files.
 _STORE_BYTES, _STRIP_BYTES, _FILE_BYTES = 12, 18, 10
 
 
@@ -107,7 +107,7 @@ def plan(
         worker_bytes=PROCESS_BYTES + tile_bytes(config),
         together=together,
         together_bytes=PROCESS_BYTES + together * tile_bytes(config),
-        disk_bytes=pixels * (_STORE_BYTES + _STRIP_BYTES + _FILE_BYTES),
+        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels + _STRIP_BYTES + _FILE_BYTES),
         seconds=_expected_seconds(left, right, config, workers, work, region),
     )
 
