@@ -20,7 +20,8 @@ from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image.
 SAMPLE = 512
-# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each level of bounds), strips of the final bands, files.
+# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each sub-pixel level),
+# strips of the final bands, files.
 _STORE_BYTES, _STRIP_BYTES, _FILE_BYTES = 12, 18, 10
 
 
