@@ -469,4 +469,5 @@ def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
     result = invoke("status", out)
     assert "10 of 12 tiles done, 1 failed, 1 left; no run is active" in result.stdout
+    assert "; 45 path states are handed on\n" in result.stdout  # 11 tiles in three wavefronts, 12 with their matching
     assert "tile 0_1: no more disk" in result.stdout
