@@ -63,9 +63,23 @@ def show_scene(scene: SceneMetrics) -> None:
     rows = _areas(report, "")
     if report["with_rejected"]:
         rows += _areas(report["with_rejected"], ", with rejected")
-    show(["", "pixels", "accuracy", "relative size", "mean width (px)", "overestimation"], rows, scene.name)
+    header = [
+        "",
+        "pixels",
+        "accuracy",
+        "relative size",
+        "mean width (px)",
+        "overestimation",
+        "median width (px)",
+        "interval score (px)",
+    ]
+    show(header, rows, scene.name)
     if not report["all"]["count"]:
         click.echo("no valid pixel has a known truth: check truth and mask")
+    if report["nominal"] is not None:
+        click.echo(
+            f"nominal coverage, or alpha: {report['nominal']:g}; the interval score judges for it, less is better"
+        )
     bad = [_figure(report[name]) for name in ("bad1", "bad3")]
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
     if report["tolerance"]:
@@ -96,7 +110,9 @@ def show_surface(name: str, report: dict[str, Any]) -> None:
 
 def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
     """Return rows for all pixels counted and for those of high and low confidence."""
-    columns = ("accuracy", "relative_size", "mean_width", "relative_overestimation")
+    columns = (
+        "accuracy", "relative_size", "mean_width", "relative_overestimation", "median_width", "interval_score",
+    )  # fmt: skip
     names = {"all": "all pixels" if where else "valid pixels", "high": "high confidence", "low": "low confidence"}
     return [[name + where, *_measures(report[key], *columns)] for key, name in names.items()]
 
