@@ -4,13 +4,12 @@ Letters: r row, c column, k disparity index, s and t segments (runs of low-confi
 """
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.kernels.vector import LANES, first_lane, lanes_above_last, lanes_at_most, load
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def alpha_cut(curve, limit):
     """First and last index whose cost is at most ``limit = lowest + floor((1 - alpha) * span)`` (paper eq. 5 to 7).
 
@@ -32,7 +31,7 @@ def alpha_cut(curve, limit):
     return first, last
 
 
-@njit(nogil=True)
+@part
 def find_segments(low):
     """Find the runs of low-confidence pixels.
 
@@ -61,7 +60,7 @@ def find_segments(low):
     return start, stop, row_start
 
 
-@njit(nogil=True)
+@part
 def find_touching(start, stop, row_start, neighbours, step):
     """Fill ``neighbours[s]`` with ``first, stop`` of the segments in row ``r + step`` that share a column with s."""
     rows = row_start.size - 1
@@ -79,7 +78,7 @@ def find_touching(start, stop, row_start, neighbours, step):
             neighbours[s, 0], neighbours[s, 1] = first, last
 
 
-@njit(nogil=True)
+@part
 def _area(s, depth, above, below, visited, area):
     """Collect the segments reached from s in at most ``depth`` steps, marked s in ``visited``; return their number."""
     area[0] = s
@@ -99,7 +98,7 @@ def _area(s, depth, above, below, visited, area):
     return count
 
 
-@njit(nogil=True)
+@part
 def _count_bounds(steps, segment_row, start, stop, area, members, counts):
     """Fill the histograms of both bounds over the pixels of an area; return the number of pixels."""
     counts[:] = 0
@@ -114,7 +113,7 @@ def _count_bounds(steps, segment_row, start, stop, area, members, counts):
     return size
 
 
-@njit(nogil=True)
+@part
 def _quantile(counts, size, quantile):
     """Quantile of the ``size`` values of a histogram, interpolated linearly between the two nearest ranks."""
     rank = quantile * (size - 1)
@@ -131,7 +130,7 @@ def _quantile(counts, size, quantile):
     return first + (value - first) * (rank - below)
 
 
-@njit(nogil=True)
+@part
 def _half_pixels(lower, upper, low, minimum):
     """Convert bounds to half-pixel steps above ``minimum``; return the number of bins and ``(2, rows, columns)`` steps.
 
@@ -148,11 +147,13 @@ def _half_pixels(lower, upper, low, minimum):
     return int(2 * (most - least)) + 1, steps
 
 
-@njit(nogil=True)
+@part
 def _same_neighbours(s, t, above, below):
     """Whether two segments of a row touch the same segments, and at least one."""
-    same = (above[s] == above[t]).all() and (below[s] == below[t]).all()
-    return same and (above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1])
+    for neighbours in (above, below):
+        if neighbours[s, 0] != neighbours[t, 0] or neighbours[s, 1] != neighbours[t, 1]:
+            return False
+    return above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1]
 
 
 @cached
