@@ -295,6 +295,7 @@ def test_cost_volume__penalties_without_gradients_are_constant(scene):
     np.testing.assert_array_equal(varying_volume(scene, gradients), volume(scene))
 
 
+@pytest.mark.peer("onnxruntime", "mc_cnn")  # only MC-CNN stores costs: kernels compiled for no other test
 @few
 @given(scene=reference.scenes(windows=(3, 5)))
 def test_cost_volume__of_stored_costs_equals_that_of_codes(scene):
