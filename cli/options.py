@@ -67,6 +67,17 @@ _IMAGE_OPTIONS = (
 # Their parameters without the window.
 _OF_IMAGES = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
 _OF_IMAGES += ("left_mask", "right_mask")
+
+
+class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """``exact`` or a number of pixels."""
+
+    name = "exact|PIXELS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        return "exact" if value == "exact" else int(click.INT.convert(value, param, ctx))
+
+
 _SETTINGS_OPTIONS = (
     click.option(
         "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
@@ -74,7 +85,9 @@ _SETTINGS_OPTIONS = (
     preset_option,
     cost_option,
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
-    click.option("--overlap", type=int, help="Pixels read around a core."),
+    click.option(
+        "--overlap", type=_Overlap(), help="exact (default): no result depends on the tiles; or pixels around a core."
+    ),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     click.option(
         "--cluster",
@@ -124,7 +137,7 @@ def settings_options(command: Command) -> Command:
         preset: str | None,
         cost: str | None,
         tile_size: int | None,
-        overlap: int | None,
+        overlap: int | str | None,
         workers: int | None,
         cluster: str | None,
         store: str | None,

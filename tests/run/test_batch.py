@@ -315,7 +315,7 @@ def test_match_jobs__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(
                 match_tile(jobs[1], tile)
 
     with connected(Cluster(workers=1), tmp_path) as client:
-        for job, failures in match_jobs(client, jobs, progress):
+        for job, failures, _ in match_jobs(client, jobs, progress):
             assert not failures
             ended.append(job)
     assert ended == jobs
@@ -470,4 +470,5 @@ def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
     result = invoke("status", out)
     assert "10 of 12 tiles done, 1 failed, 1 left; no run is active" in result.stdout
+    assert "; 45 path states are handed on\n" in result.stdout  # 11 tiles in three wavefronts, 12 with their matching
     assert "tile 0_1: no more disk" in result.stdout
