@@ -10,12 +10,14 @@ READY := $(VENV)/.has-$(EXTRAS)
 PYTEST := $(BIN)/python -m pytest $(OPTIONS)
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 
+# Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-all lint bench bench-seams tune pictures clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite
-	$(BIN)/sat-intervals plot demo-out
-	$(BIN)/sat-intervals report demo-out
+	$(BIN)/sat-intervals plot demo-out & $(BIN)/sat-intervals report demo-out && wait $$!
 	@echo 'Open demo-out/overview.png and demo-out/report.html'
 
 # Tests that need no services, no other extras and no real pairs; three minutes on two cores.

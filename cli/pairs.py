@@ -41,6 +41,7 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
         ),
         click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
+        click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
     ]
     for option in reversed(options):

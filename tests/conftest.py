@@ -8,10 +8,11 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-from helpers import write_pair
+from helpers import wait_until, write_pair
 
-from sat_intervals import match_pair
+from sat_intervals import load_config, match_pair
 from sat_intervals.demo import make_scene
+from sat_intervals.match.warm_up import compile_kernels
 
 pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
 
@@ -47,6 +48,29 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
     if report.skipped and item.config.getoption("--skip-nothing"):
         report.outcome = "failed"
     return report
+
+
+# Settings that need different machine code: a worker compiles for the first, another one for the next two.
+LEAST = {"cross_check": None, "median": None, "regularization": None}
+VARIANTS = ({}, {"sgm": {"penalty": "negative", "alpha": 1, "gamma": 40}} | LEAST, {"preset": "satellite"} | LEAST)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Parallel workers share the compilation of kernels before their first test, so that none is compiled twice."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    shared = tmp_path_factory.getbasetemp().parent
+    for number, settings in enumerate(VARIANTS):
+        try:
+            (shared / f"kernels{number}").mkdir()
+        except FileExistsError:  # another worker compiles these
+            continue
+        try:
+            compile_kernels(load_config({"disparity": {"minimum": 0, "maximum": 9}} | settings))
+        finally:
+            (shared / f"kernels{number}" / "done").touch()
+    wait_until(lambda: len(list(shared.glob("kernels*/done"))) == len(VARIANTS), "kernels", seconds=600)
 
 
 @pytest.fixture(scope="session")

@@ -4,14 +4,13 @@ Letters: r row, c column, k disparity index, s and t segments (runs of low-confi
 """
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined, inlined_unchecked, part
 from sat_intervals.kernels.vector import LANES, first_lane, lanes_above_last, lanes_at_most, load
 from sat_intervals.products import IMPOSSIBLE_COST
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def alpha_cut(curve, limit):
     """First and last index whose cost is at most ``limit = lowest + floor((1 - alpha) * span)`` (paper eq. 5 to 7).
 
@@ -33,14 +32,14 @@ def alpha_cut(curve, limit):
     return first, last
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _ceil(value):
     """Round up a number that is not negative."""
     whole = np.int64(value)
     return whole + (whole < value)
 
 
-@njit(nogil=True, forceinline=True, error_model="numpy")
+@inlined_unchecked
 def _crossing(curve, inside, outside, limit, settings):
     """Steps from index ``inside`` to where the linear curve crosses ``limit`` before ``outside``, rounded up.
 
@@ -53,13 +52,13 @@ def _crossing(curve, inside, outside, limit, settings):
     return steps * ((near == outside) & (there != IMPOSSIBLE_COST))
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _limit(lowest, level):
     """Largest whole cost of a cut at a level above the lowest cost."""
     return np.uint16(min(lowest + np.int64(level), IMPOSSIBLE_COST - 1))
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _whole_cuts(curve, one, other):
     """First and last index of the cuts at two limits, in one pass over the curve: ``(first, last)`` of each.
 
@@ -77,7 +76,7 @@ def _whole_cuts(curve, one, other):
     return (first_1, last_1), (first_2, last_2)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _subpixel_cut(curve, limit, cut, winner, settings):
     """Bounds in steps where the curve crosses ``limit`` outside the whole cut, widened to hold ``winner``."""
     first, last = cut
@@ -86,7 +85,7 @@ def _subpixel_cut(curve, limit, cut, winner, settings):
     return min(lower, np.int64(winner)), max(upper, _ceil(winner))
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def subpixel_cuts(curve, lowest, disparity, settings):
     """Bounds of the cuts at the levels ``high`` and ``low`` above ``lowest``, in steps (METHOD.md, section 16).
 
@@ -101,7 +100,7 @@ def subpixel_cuts(curve, lowest, disparity, settings):
     )
 
 
-@njit(nogil=True)
+@part
 def find_segments(low):
     """Find the runs of low-confidence pixels.
 
@@ -130,7 +129,7 @@ def find_segments(low):
     return start, stop, row_start
 
 
-@njit(nogil=True)
+@part
 def find_touching(start, stop, row_start, neighbours, step):
     """Fill ``neighbours[s]`` with ``first, stop`` of the segments in row ``r + step`` that share a column with s."""
     rows = row_start.size - 1
@@ -148,7 +147,7 @@ def find_touching(start, stop, row_start, neighbours, step):
             neighbours[s, 0], neighbours[s, 1] = first, last
 
 
-@njit(nogil=True)
+@part
 def _area(s, depth, above, below, visited, area):
     """Collect the segments reached from s in at most ``depth`` steps, marked s in ``visited``; return their number."""
     area[0] = s
@@ -168,7 +167,7 @@ def _area(s, depth, above, below, visited, area):
     return count
 
 
-@njit(nogil=True)
+@part
 def _count_bounds(steps, segment_row, start, stop, area, members, counts):
     """Fill the histograms of both bounds over the pixels of an area; return the number of pixels."""
     counts[:] = 0
@@ -183,7 +182,7 @@ def _count_bounds(steps, segment_row, start, stop, area, members, counts):
     return size
 
 
-@njit(nogil=True)
+@part
 def _quantile(counts, size, quantile):
     """Quantile of the ``size`` values of a histogram, interpolated linearly between the two nearest ranks."""
     rank = quantile * (size - 1)
@@ -200,7 +199,7 @@ def _quantile(counts, size, quantile):
     return first + (value - first) * (rank - below)
 
 
-@njit(nogil=True)
+@part
 def _in_steps(lower, upper, low, minimum, per_pixel):
     """Convert bounds to steps above ``minimum``, rounded outwards; return the number of bins and the steps.
 
@@ -218,11 +217,13 @@ def _in_steps(lower, upper, low, minimum, per_pixel):
     return int(np.ceil(scale * (most - least))) + 1, steps
 
 
-@njit(nogil=True)
+@part
 def _same_neighbours(s, t, above, below):
     """Whether two segments of a row touch the same segments, and at least one."""
-    same = (above[s] == above[t]).all() and (below[s] == below[t]).all()
-    return same and (above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1])
+    for neighbours in (above, below):
+        if neighbours[s, 0] != neighbours[t, 0] or neighbours[s, 1] != neighbours[t, 1]:
+            return False
+    return above[s, 0] < above[s, 1] or below[s, 0] < below[s, 1]
 
 
 @cached

@@ -10,9 +10,8 @@ Letters: r row, c column, k disparity index (disparity = minimum + k).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.kernels.cost import Candidates, Costs, cost_curve, padded_to_lanes
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
 from sat_intervals.kernels.reading import (
@@ -33,6 +32,7 @@ from sat_intervals.kernels.sgm import (
     add_curve,
     advance_pixel,
     advance_wave,
+    copy_curve,
     enter_row,
     hand_on,
     no_borders,
@@ -205,7 +205,7 @@ def _prepare(
     )
 
 
-@njit(nogil=True)
+@part
 def _enter_row(buffers, gradients, settings, r, down):
     """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
 
@@ -228,7 +228,7 @@ def _enter_row(buffers, gradients, settings, r, down):
     return falling, rising
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _columns(inside, r, down):
     """Columns of row ``r`` that lie inside, in the order of the sweep."""
     if not inside.row <= r < inside.row_stop:
@@ -309,7 +309,7 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             if contains(right.core, r, c):
                 update_right(curve, right, r, c)
             if keep:
-                volume[i, j] = curve
+                copy_curve(curve, volume[i, j])
         if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
             hand_on(paths, inside, r, falling, rising, 1, False, leaving)
 

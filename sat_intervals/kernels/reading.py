@@ -6,8 +6,8 @@ Letters: r row, c column, k disparity index (disparity = minimum + k).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.disparity import vfit
 from sat_intervals.kernels.intervals import alpha_cut, subpixel_cuts
@@ -44,13 +44,13 @@ class Rectangle(NamedTuple):
     column_stop: int
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def contains(rectangle, r, c):
     """Whether a rectangle contains the pixel ``(r, c)``."""
     return rectangle.row <= r < rectangle.row_stop and rectangle.column <= c < rectangle.column_stop
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def close_impossible(curve, candidates, c):
     """Set impossible candidates and lanes behind the range to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
@@ -62,7 +62,7 @@ def close_impossible(curve, candidates, c):
     return smallest(lowest)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _winner(curve, lowest):
     """First index with the lowest cost: 14 ns for 64 disparities by vectors, 36 ns by single costs."""
     k = 0
@@ -73,7 +73,7 @@ def _winner(curve, lowest):
     return k + first_lane(mask)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _interval(curve, lowest, count, cut_level, refine):
     """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
     first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
@@ -99,7 +99,7 @@ class RightPixels(NamedTuple):
     best: np.ndarray
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def update_right(curve, right, r, c):
     """Update the right pixels that a left pixel faces with its candidates.
 
@@ -114,7 +114,7 @@ def update_right(curve, right, r, c):
         store(right.cost, start + k, smaller(candidate, known))
 
 
-@njit(nogil=True)
+@part
 def search_flags(costs, r, c, count, possible):
     """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
     flags = 0
@@ -131,7 +131,7 @@ def search_flags(costs, r, c, count, possible):
     return flags
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def read_curve(curve, lowest, settings):
     """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
 

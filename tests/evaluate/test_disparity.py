@@ -427,8 +427,8 @@ def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
     reports = json.loads(text)
     assert list(reports) == ["one", "two", str(run)]
     assert reports["one"] == reports[str(run)]
-    status, text, _ = command("evaluate", pair, other)
-    assert status == 0
+    status, text, shown = command("evaluate", pair, other, "--quiet")
+    assert (status, shown) == (0, "")
     label, scenes, reached, accuracy, *_ = text.splitlines()[2].split()
     assert (label, scenes) == ("synthetic", "2")
     accuracies = [reports[name]["all"]["accuracy"] for name in ("one", "two")]

@@ -11,7 +11,6 @@ from sat_intervals.demo import make_scene
 from sat_intervals.run import pair as run
 
 SETTINGS = {
-    "paper": {},
     "satellite": {"preset": "satellite"},
     "gradients": {"sgm": {"penalty": "negative", "alpha": 0.5, "gamma": 40}, "cross_check": None},
     "window 3": {"cost": {"window": 3}},
@@ -24,13 +23,20 @@ SETTINGS = {
 def folder(tmp_path_factory):
     """A pair with no data inside."""
     folder = tmp_path_factory.mktemp("pair")
-    scene = make_scene(150, 190, seed=5)
+    scene = make_scene(140, 150, seed=5)
     random = np.random.default_rng(0)
     for image in (scene.left, scene.right):
-        image[random.integers(0, 150, 20), random.integers(0, 190, 20)] = 0
+        image[random.integers(0, 140, 20), random.integers(0, 150, 20)] = 0
         image[60:75, 100:130] = 0
     write_pair(folder, scene)
     return folder
+
+
+@pytest.fixture(scope="module")
+def whole(folder):
+    """A run with the settings of the paper in one tile."""
+    match(folder, folder / "whole", 1024, {})
+    return folder / "whole"
 
 
 def match(folder, out, size, settings, **options):
@@ -46,13 +52,16 @@ def test_match_pair__of_exact_tiles_equals_the_whole(folder, tmp_path, name):
     assert hashes(tmp_path / "tiled") == hashes(tmp_path / "whole")
     assert tiled["counts"] == whole["counts"]
     assert (tiled["tiles"]["overlap"], tiled["overlap_left"]) == ("exact", None)
-    overlapping = {"tiles": {"size": 1024, "overlap": 20}}
-    match(folder, tmp_path / "alone", 1024, settings | overlapping)
-    assert hashes(tmp_path / "alone") == hashes(tmp_path / "whole")
+
+
+def test_match_pair__of_exact_tiles_equals_one_tile_with_overlap(folder, whole, tmp_path):
+    match(folder, tmp_path / "tiled", 64, {})
+    match(folder, tmp_path / "alone", 1024, {"tiles": {"size": 1024, "overlap": 20}})
+    assert hashes(tmp_path / "tiled") == hashes(tmp_path / "alone") == hashes(whole)
 
 
 def test_match_pair__of_exact_tiles_of_a_window_equals_one_tile(folder, tmp_path):
-    window = Window(20, 30, 101, 140)
+    window = Window(20, 30, 101, 110)
     for size in (64, 1024):
         match(folder, tmp_path / str(size), size, {}, window=window)
     assert hashes(tmp_path / "64") == hashes(tmp_path / "1024")
@@ -72,7 +81,6 @@ def exchange(files):
 
 
 DAMAGES = {
-    "empty": lambda files: [file.write_bytes(b"") for file in files],
     "short": lambda files: [file.write_bytes(b"short") for file in files],
     "flipped": flip,
     "exchanged": exchange,
@@ -80,7 +88,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("how", DAMAGES)
-def test_match_pair__computes_damaged_path_states_again(folder, tmp_path, monkeypatch, how):
+def test_match_pair__computes_damaged_path_states_again(folder, whole, tmp_path, monkeypatch, how):
     def damage_and_match(job, tile):
         DAMAGES[how](list((tmp_path / "out" / "tiles" / "borders").glob("1_[01]_0")))
         return match_tile(job, tile)
@@ -91,12 +99,11 @@ def test_match_pair__computes_damaged_path_states_again(folder, tmp_path, monkey
         with pytest.raises(RunError, match="missing or damaged: rerun the same command: it resumes"):
             match(folder, tmp_path / "out", 64, {})
     match(folder, tmp_path / "out", 64, {})
-    match(folder, tmp_path / "whole", 1024, {})
-    assert hashes(tmp_path / "out") == hashes(tmp_path / "whole")
+    assert hashes(tmp_path / "out") == hashes(whole)
     assert not (tmp_path / "out" / "tiles").exists()
 
 
-def test_match_pair__takes_no_path_states_of_another_run(folder, tmp_path, monkeypatch):
+def test_match_pair__takes_no_path_states_of_another_run(folder, whole, tmp_path, monkeypatch):
     def end(job, tile):
         raise RunError("before the first tile")
 
@@ -111,8 +118,7 @@ def test_match_pair__takes_no_path_states_of_another_run(folder, tmp_path, monke
     for file in (tmp_path / "other" / "tiles" / "borders").iterdir():
         shutil.copy(file, borders)
     match(folder, tmp_path / "out", 64, {})
-    match(folder, tmp_path / "whole", 1024, {})
-    assert hashes(tmp_path / "out") == hashes(tmp_path / "whole")
+    assert hashes(tmp_path / "out") == hashes(whole)
 
 
 @pytest.mark.peer("onnxruntime", "mc_cnn")
