@@ -1,0 +1,198 @@
+"""Choose the levels of a calibration from intervals that were made at a ladder of levels (METHOD.md, section 16).
+
+Every pair is matched at each rung of the ladder, through the whole chain. So a coverage is known at the rungs, and
+linear between them. Confidence classes are `HIGH` and low; low-confidence pixels are measured once for each quantile
+of the regularisation, and once without it.
+
+Letters of shapes: rungs (levels of the ladder), schemes (high, then low with each of QUANTILES), fields.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.config import Config
+
+# Quantiles of the regularisation that are tried; None: no regularisation.
+QUANTILES = (None, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+HIGH, SCHEMES = 0, 1 + len(QUANTILES)
+FEWEST = 1000  # pixels with truth, of all pairs
+
+# Rungs: level 0, and from a fraction of the span to the level that holds every candidate, a third of an octave apart.
+_LOWEST, _RUNGS = 1 / 256, 25
+# Widths are counted in steps of 1/64 px up to 8 px, and of 1 % above.
+_STEPS, _FINE, _RATIO = 64, 8, 1.01
+_COARSE = ceil(np.log(32000 / _FINE) / np.log(_RATIO)) + 1
+_WIDTHS = np.concatenate([np.arange(_FINE * _STEPS) / _STEPS, _FINE * _RATIO ** (np.arange(_COARSE) + 0.5)])
+# Fields of a measurement: pixels that hold the truth, sum of widths, sum of distances that miss, counts by width.
+INSIDE, WIDTH, MISSED, COUNTS = 0, 1, 2, 3
+FIELDS = COUNTS + _WIDTHS.size
+
+
+class Choice(NamedTuple):
+    """Levels of a coverage.
+
+    Attributes
+    ----------
+    high, low
+        Levels of high and low confidence, excess aggregated costs.
+    quantile
+        Of the regularisation of low confidence; None without it.
+    notes
+        What a reader must know: a class with too few pixels, or a coverage that no level reaches.
+    """
+
+    high: float
+    low: float
+    quantile: float | None
+    notes: tuple[str, ...] = ()
+
+
+class Measured(NamedTuple):
+    """Measurements of a pair, or of a block of one.
+
+    Attributes
+    ----------
+    group
+        Parts of one group are left out together.
+    weight
+        Of a pixel: one over the pixels of the pair, so that every pair weighs the same.
+    table
+        ``(rungs, schemes, fields)`` float64 sums over pixels.
+    """
+
+    group: str
+    weight: float
+    table: np.ndarray
+
+
+def ladder(config: Config) -> np.ndarray:
+    """Levels at which pairs are matched: ascending float64, the last holds every possible candidate."""
+    levels = np.geomspace(config.cost_span * _LOWEST, config.largest_sum, _RUNGS)
+    return np.concatenate([[0.0], levels])
+
+
+def measure(lower: np.ndarray, upper: np.ndarray, truth: np.ndarray, tolerance: float) -> np.ndarray:
+    """Measure some intervals: ``(fields,)``.
+
+    Parameters
+    ----------
+    lower, upper, truth
+        ``(pixels,)`` finite numbers of pixels.
+    tolerance
+        Distance up to which a truth outside an interval counts as inside.
+    """
+    width, truth = upper.astype(np.float64) - lower, truth.astype(np.float64)
+    missed = np.maximum(np.maximum(lower - truth, truth - upper) - tolerance, 0)
+    fields = np.zeros(FIELDS)
+    fields[:COUNTS] = np.count_nonzero(missed == 0), width.sum(), missed.sum()
+    coarse = _FINE * _STEPS + np.log(np.maximum(width, _FINE) / _FINE) / np.log(_RATIO)
+    place = np.where(width < _FINE, np.rint(width * _STEPS), coarse).astype(np.int64)
+    fields[COUNTS:] = np.bincount(place, minlength=_WIDTHS.size)
+    return fields
+
+
+def pooled(parts: Iterable[Measured]) -> np.ndarray:
+    """Weighted sums of all parts: ``(rungs, schemes, fields)``."""
+    return np.sum([part.weight * part.table for part in parts], axis=0)
+
+
+def count(parts: Iterable[Measured]) -> tuple[int, int]:
+    """Pixels with truth of high and of low confidence."""
+    found = [part.table[0, [HIGH, HIGH + 1], COUNTS:].sum(axis=-1) for part in parts]
+    high, low = np.sum(found, axis=0)
+    return int(high), int(low)
+
+
+def choose(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Choice:
+    """Choose the levels of a coverage: each class reaches it; of the quantiles that do, the best interval score.
+
+    A class with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class
+    without regularisation.
+    """
+    table, notes = pooled(parts), []
+    needed = ceil(max(200, 10 / (1 - coverage)) - 1e-9)
+    few = [pixels < needed for pixels in count(parts)]
+    reached = [_level(table[:, scheme], levels, coverage) for scheme in range(SCHEMES)]
+    if few[0] or few[1]:
+        scheme, name, other = (HIGH + 1, "high", "low") if few[0] else (HIGH, "low", "high")
+        level = reached[scheme] if reached[scheme] is not None else float(levels[-1])
+        pixels = count(parts)[0 if few[0] else 1]
+        notes.append(f"{pixels} pixels of {name} confidence, {needed} are needed: they take the level of {other}")
+        return Choice(level, level, None, tuple(notes))
+    if (high := reached[HIGH]) is None:
+        high = float(levels[-1])
+        notes.append("high confidence does not reach it at any level")
+    scores = {
+        scheme: score(at_level(table[:, scheme], levels, level), coverage)
+        for scheme in range(1, SCHEMES)
+        if (level := reached[scheme]) is not None
+    }
+    if not scores:
+        notes.append("low confidence does not reach it at any level")
+        return Choice(high, float(levels[-1]), None, tuple(notes))
+    best = min(scores, key=lambda scheme: (scores[scheme], scheme))
+    low = reached[best]
+    assert low is not None  # it has a score
+    return Choice(high, low, QUANTILES[best - 1], tuple(notes))
+
+
+def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | None:
+    """Smallest level that reaches a coverage, linear between rungs; None if none does."""
+    pixels = fields[0, COUNTS:].sum()
+    if pixels == 0:
+        return None
+    covered = np.maximum.accumulate(fields[:, INSIDE] / pixels)  # regularisation is not quite monotone
+    rung = int(np.searchsorted(covered, coverage - 1e-9))
+    if rung == levels.size:
+        return None
+    if rung == 0:
+        return float(levels[0])
+    return float(np.interp(coverage, covered[rung - 1 : rung + 1], levels[rung - 1 : rung + 1]))
+
+
+def at_level(fields: np.ndarray, levels: np.ndarray, level: float) -> np.ndarray:
+    """Measurement at a level, linear between rungs: ``(rungs, fields)`` to ``(fields,)``."""
+    above = int(np.clip(np.searchsorted(levels, level), 1, levels.size - 1))
+    share = (level - levels[above - 1]) / (levels[above] - levels[above - 1])
+    return np.asarray((1 - share) * fields[above - 1] + share * fields[above])
+
+
+def score(fields: np.ndarray, coverage: float) -> float:
+    """Interval score (Gneiting and Raftery 2007): mean of width + 2 / (1 - coverage) x distance of the truth."""
+    pixels = fields[COUNTS:].sum()
+    return float((fields[WIDTH] + 2 / (1 - coverage) * fields[MISSED]) / pixels)
+
+
+def expected(parts: Sequence[Measured], levels: np.ndarray, choice: Choice, coverage: float) -> dict[str, float | None]:
+    """Figures of some parts with given levels: coverage of all, high and low, widths in pixels, interval score."""
+    table = pooled(parts)
+    high = at_level(table[:, HIGH], levels, choice.high)
+    low = at_level(table[:, 1 + QUANTILES.index(choice.quantile)], levels, choice.low)
+    both = high + low
+    if not both[COUNTS:].sum():
+        return dict.fromkeys(("all", "high", "low", "mean_width", "median_width", "score"))
+    upto = np.cumsum(both[COUNTS:])
+    return {
+        **{name: _share(fields, INSIDE) for name, fields in (("all", both), ("high", high), ("low", low))},
+        "mean_width": _share(both, WIDTH),
+        "median_width": float(_WIDTHS[np.searchsorted(upto, upto[-1] / 2)]),
+        "score": score(both, coverage),
+    }
+
+
+def _share(fields: np.ndarray, which: int) -> float | None:
+    pixels = fields[COUNTS:].sum()
+    return float(fields[which] / pixels) if pixels else None
+
+
+def left_out(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Mapping[str, dict[str, float | None]]:
+    """Figures of each group with the levels chosen on the others; empty for a single group."""
+    groups = list(dict.fromkeys(part.group for part in parts))
+    found: dict[str, dict[str, float | None]] = {}
+    for group in groups if len(groups) > 1 else ():
+        choice = choose([part for part in parts if part.group != group], levels, coverage)
+        found[group] = expected([part for part in parts if part.group == group], levels, choice, coverage)
+    return found
