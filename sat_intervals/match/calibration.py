@@ -60,12 +60,21 @@ class Measured(NamedTuple):
     weight
         Of a pixel: one over the pixels of the pair, so that every pair weighs the same.
     table
-        ``(rungs, schemes, fields)`` float64 sums over pixels.
+        ``(rungs, schemes, fields)`` float64 sums over kept pixels with truth.
+    known, good
+        Pixels with truth, and those of them that are kept and within 1 px of it.
     """
 
     group: str
     weight: float
     table: np.ndarray
+    known: int
+    good: int
+
+    @property
+    def kept(self) -> int:
+        """Return the number of kept pixels with truth."""
+        return sum(count([self]))
 
 
 def ladder(config: Config) -> np.ndarray:
@@ -196,3 +205,11 @@ def left_out(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> 
         choice = choose([part for part in parts if part.group != group], levels, coverage)
         found[group] = expected([part for part in parts if part.group == group], levels, choice, coverage)
     return found
+
+
+def means(groups: Iterable[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Means of the figures of groups where they are known, and ``lowest``, the smallest coverage of all pixels."""
+    found = list(groups)
+    known = {name: [one[name] for one in found if one[name] is not None] for name in (found[0] if found else ())}
+    figures = {name: float(np.mean(values)) if values else None for name, values in known.items()}
+    return figures | {"lowest": min(known["all"]) if known.get("all") else None}
