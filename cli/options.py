@@ -73,6 +73,15 @@ _SETTINGS_OPTIONS = (
     ),
     preset_option,
     cost_option,
+    click.option(
+        "--coverage",
+        type=float,
+        metavar="C",
+        help="Share of true disparities to be inside, .5 to .99, instead of alpha.",
+    ),
+    click.option(
+        "--calibration", callback=named, metavar="FILE", help="Calibration for --coverage; default the built-in one."
+    ),
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
     click.option("--overlap", type=int, help="Pixels read around a core."),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
@@ -123,6 +132,8 @@ def settings_options(command: Command) -> Command:
         *,
         preset: str | None,
         cost: str | None,
+        coverage: float | None,
+        calibration: str | None,
         tile_size: int | None,
         overlap: int | None,
         workers: int | None,
@@ -133,6 +144,7 @@ def settings_options(command: Command) -> Command:
         is_address = cluster is not None and "://" in cluster
         sections: dict[str, dict[str, Any]] = {
             "cost": {"method": cost},
+            "interval": {"coverage": coverage, "calibration": calibration},
             "tiles": {"size": tile_size, "overlap": overlap},
             "cluster": {
                 "workers": workers,

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from sat_intervals.config.reading import LARGEST_TABLE, load_yaml, read_small
+from sat_intervals.config.files import LARGEST_TABLE, load_yaml, read_small
 from sat_intervals.errors import SatIntervalsError
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")

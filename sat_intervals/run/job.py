@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.config import Config, Mccnn, load_config
+from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
-from sat_intervals.match.mccnn import load_network, weights_file
+from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image
