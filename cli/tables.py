@@ -1,5 +1,6 @@
 """Print tables: formatted on a terminal, plain aligned text elsewhere."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,7 +41,7 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
     cells = []
     for row in rows:
         own = [row.label, str(row.scenes), str(row.at_objective)] if row.scenes else [f"  {row.label}", "", ""]
-        cells.append([*own, *map(_figure, row.figures.values())])
+        cells.append([*own, *map(figure, row.figures.values())])
     show(header, cells, title)
     if any(row.scenes is None for row in rows):
         click.echo(
@@ -52,7 +53,7 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
 def show_missed(scenes: Sequence[SceneMetrics]) -> None:
     """List the scenes below the paper's objective."""
     accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
-    missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
+    missed = [f"{name} ({figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
     if missed:
         click.echo(f"below {OBJECTIVE}: {', '.join(missed)}")
 
@@ -66,14 +67,14 @@ def show_scene(scene: SceneMetrics) -> None:
     show(["", "pixels", "accuracy", "relative size", "mean width (px)", "overestimation"], rows, scene.name)
     if not report["all"]["count"]:
         click.echo("no valid pixel has a known truth: check truth and mask")
-    bad = [_figure(report[name]) for name in ("bad1", "bad3")]
+    bad = [figure(report[name]) for name in ("bad1", "bad3")]
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
     if report["tolerance"]:
         click.echo(f"truth up to {report['tolerance']:g} px outside an interval counts as inside")
     if report["bias"] is not None:
-        click.echo(f"median of disparity - truth, added to the truth: {_figure(report['bias'])} px")
+        click.echo(f"median of disparity - truth, added to the truth: {figure(report['bias'])} px")
     if report["truth_outside_range"]:
-        share = _figure(report["truth_outside_range"])
+        share = figure(report["truth_outside_range"])
         click.echo(f"truth outside the search range, always missed: {share} (its sign: x_right = x_left + disparity)")
     deciles = [
         ["{:.3f} to {:.3f}".format(*decile["confidence"]), *_measures(decile, "accuracy", "mean_width")]
@@ -102,9 +103,9 @@ def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
 
 
 def _measures(area: dict[str, float | None], *columns: str) -> list[str]:
-    return [str(area["count"]), *(_figure(area.get(column)) for column in columns)]
+    return [str(area["count"]), *(figure(area.get(column)) for column in columns)]
 
 
-def _figure(value: float | None) -> str:
-    """Format a figure with three decimals, or a dash for None."""
-    return "-" if value is None else f"{value:.3f}"
+def figure(value: float | None) -> str:
+    """Format a figure with three decimals, or a dash for None and NaN."""
+    return "-" if value is None or math.isnan(value) else f"{value:.3f}"

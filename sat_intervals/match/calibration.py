@@ -105,7 +105,7 @@ def measure(lower: np.ndarray, upper: np.ndarray, truth: np.ndarray, tolerance: 
 
 def pooled(parts: Iterable[Measured]) -> np.ndarray:
     """Weighted sums of all parts: ``(rungs, schemes, fields)``."""
-    return np.sum([part.weight * part.table for part in parts], axis=0)
+    return np.asarray(np.sum([part.weight * part.table for part in parts], axis=0))
 
 
 def count(parts: Iterable[Measured]) -> tuple[int, int]:
@@ -127,7 +127,8 @@ def choose(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Ch
     reached = [_level(table[:, scheme], levels, coverage) for scheme in range(SCHEMES)]
     if few[0] or few[1]:
         scheme, name, other = (HIGH + 1, "high", "low") if few[0] else (HIGH, "low", "high")
-        level = reached[scheme] if reached[scheme] is not None else float(levels[-1])
+        found = reached[scheme]
+        level = float(levels[-1]) if found is None else found
         pixels = count(parts)[0 if few[0] else 1]
         notes.append(f"{pixels} pixels of {name} confidence, {needed} are needed: they take the level of {other}")
         return Choice(level, level, None, tuple(notes))
@@ -175,14 +176,14 @@ def score(fields: np.ndarray, coverage: float) -> float:
     return float((fields[WIDTH] + 2 / (1 - coverage) * fields[MISSED]) / pixels)
 
 
-def expected(parts: Sequence[Measured], levels: np.ndarray, choice: Choice, coverage: float) -> dict[str, float | None]:
+def expected(parts: Sequence[Measured], levels: np.ndarray, choice: Choice, coverage: float) -> dict[str, float]:
     """Figures of some parts with given levels: coverage of all, high and low, widths in pixels, interval score."""
     table = pooled(parts)
     high = at_level(table[:, HIGH], levels, choice.high)
     low = at_level(table[:, 1 + QUANTILES.index(choice.quantile)], levels, choice.low)
     both = high + low
     if not both[COUNTS:].sum():
-        return dict.fromkeys(("all", "high", "low", "mean_width", "median_width", "score"))
+        return dict.fromkeys(("all", "high", "low", "mean_width", "median_width", "score"), np.nan)
     upto = np.cumsum(both[COUNTS:])
     return {
         **{name: _share(fields, INSIDE) for name, fields in (("all", both), ("high", high), ("low", low))},
@@ -192,24 +193,26 @@ def expected(parts: Sequence[Measured], levels: np.ndarray, choice: Choice, cove
     }
 
 
-def _share(fields: np.ndarray, which: int) -> float | None:
+def _share(fields: np.ndarray, which: int) -> float:
     pixels = fields[COUNTS:].sum()
-    return float(fields[which] / pixels) if pixels else None
+    return float(fields[which] / pixels) if pixels else np.nan
 
 
-def left_out(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Mapping[str, dict[str, float | None]]:
+def left_out(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Mapping[str, dict[str, float]]:
     """Figures of each group with the levels chosen on the others; empty for a single group."""
     groups = list(dict.fromkeys(part.group for part in parts))
-    found: dict[str, dict[str, float | None]] = {}
+    found: dict[str, dict[str, float]] = {}
     for group in groups if len(groups) > 1 else ():
         choice = choose([part for part in parts if part.group != group], levels, coverage)
         found[group] = expected([part for part in parts if part.group == group], levels, choice, coverage)
     return found
 
 
-def means(groups: Iterable[Mapping[str, float | None]]) -> dict[str, float | None]:
+def means(groups: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Means of the figures of groups where they are known, and ``lowest``, the smallest coverage of all pixels."""
     found = list(groups)
-    known = {name: [one[name] for one in found if one[name] is not None] for name in (found[0] if found else ())}
-    figures = {name: float(np.mean(values)) if values else None for name, values in known.items()}
-    return figures | {"lowest": min(known["all"]) if known.get("all") else None}
+    figures = {}
+    for name in found[0] if found else ():
+        known = [one[name] for one in found if np.isfinite(one[name])]
+        figures[name] = float(np.mean(known)) if known else np.nan
+    return figures | {"lowest": min(one["all"] for one in found)} if found else {}

@@ -1,10 +1,13 @@
 """Calibrate: match pairs with truth at a ladder of levels, tile by tile, and measure their intervals."""
 
+import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from decimal import Decimal
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +24,26 @@ from sat_intervals.match.calibration import (
     QUANTILES,
     SCHEMES,
     Measured,
+    choose,
+    count,
     ladder,
+    left_out,
+    means,
     measure,
 )
 from sat_intervals.match.histogram import bias_histogram
-from sat_intervals.match.postprocess import RawRows, confidence_scale, halo, postprocess_rows, with_halo
+from sat_intervals.match.postprocess import (
+    ConfidenceScale,
+    RawRows,
+    confidence_scale,
+    halo,
+    postprocess_rows,
+    with_halo,
+)
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image
+from sat_intervals.raster import Image, open_image
 from sat_intervals.results import Layer
 from sat_intervals.run.assemble import STRIP_PIXELS, check_done, check_matched
 from sat_intervals.run.cluster import connected
@@ -76,6 +90,17 @@ class Subject:
     window: Window | None = None
     tolerance: float = 0.0
     remove_bias: bool = False
+
+
+def truth_of(left: Image, path: str | Path) -> Layer:
+    """Open the truth of a whole left image; raise if it has another size."""
+    truth = open_image(path)
+    if (truth.height, truth.width) != (left.height, left.width):
+        raise SatIntervalsError(
+            f"{truth.path} has {truth.height} x {truth.width} pixels, {left.path} {left.height} x {left.width}: "
+            "give the truth of the left image"
+        )
+    return Layer(truth, 0, 0)
 
 
 def check_subjects(subjects: Sequence[Subject]) -> None:
@@ -154,8 +179,7 @@ def _of_subject(
     gauge: _Gauge | None = None
     with ExitStack() as stack:
         jobs = [
-            _begun(subject, levels[first : first + 2], folder / str(first), stack)
-            for first in range(0, levels.size, 2)
+            _begun(subject, levels[first : first + 2], folder / str(first), stack) for first in range(0, levels.size, 2)
         ]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
@@ -184,8 +208,44 @@ def _at_levels(config: Config, high: float, low: float, quantile: float | None) 
     """Return settings whose intervals are cut at two levels, whatever the coverage."""
     rows = [{"coverage": coverage, "high": high, "low": low, "quantile": quantile} for coverage in COVERAGES]
     constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
-    interval = Interval(coverage=COVERAGES[0], calibration=constant)
+    interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
     return config.model_copy(update={"interval": interval})
+
+
+def calibration_from(
+    parts: Sequence[Measured], subjects: Sequence[Subject], name: str
+) -> tuple[Calibration, list[dict[str, float]]]:
+    """Return the calibration of measured subjects, and what to expect of it.
+
+    Expected figures are means over the groups, each with the levels chosen on the others, see `left_out`: a row for
+    each coverage. The calibration's provenance has them too.
+    """
+    config = subjects[0].config
+    levels, rows, expected, notes = ladder(config), [], [], []
+    for coverage in COVERAGES:
+        choice = choose(parts, levels, coverage)
+        rows.append({"coverage": coverage, "high": choice.high, "low": choice.low, "quantile": choice.quantile})
+        notes += [f"coverage {coverage:g}: {note}" for note in choice.notes]
+        expected.append({"coverage": coverage, **means(left_out(parts, levels, coverage).values())})
+    high, low = count(parts)
+    provenance = {
+        "software": f"sat-intervals {version('sat-intervals')}",
+        "pairs": [
+            {"name": subject.name, "group": subject.group, "search_range": [search.minimum, search.maximum]}
+            | {"tolerance": subject.tolerance, "remove_bias": subject.remove_bias}
+            for subject in subjects
+            for search in (subject.config.disparity,)
+        ],
+        "pixels": {"high": high, "low": low},
+        "notes": notes,
+        "expected": [{key: _rounded(value) for key, value in row.items()} for row in expected],
+    }
+    content = {"name": name, "key": key_of(config), "levels": rows, "provenance": provenance}
+    return Calibration.model_validate(content), expected
+
+
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
 
 
 class _Gauge:
@@ -236,10 +296,13 @@ class _Gauge:
         for row, strip, first, last, scale in _strips(job):
             truth, parts = self._truth(row, last - first) + self._bias, self._parts(row, last - first)
             for cut in (0, 1):
-                rows = strip.with_one_cut(cut)
+                lower, upper = (strip.lower_low, strip.upper_low) if cut else (strip.lower, strip.upper)
+                rows = strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper)
                 for scheme, quantile in enumerate(QUANTILES, start=HIGH + 1):
                     final = postprocess_rows(rows, first, last, scale, _at_levels(config, 0.0, 0.0, quantile))
-                    low = low_confidence(final.confidence, config.regularization.threshold, config.regularization.kernel)
+                    low = low_confidence(
+                        final.confidence, config.regularization.threshold, config.regularization.kernel
+                    )
                     kept = final.valid & np.isfinite(truth)
                     if scheme == HIGH + 1:
                         self._add(rung + cut, HIGH, final, truth, parts, kept & ~low)
@@ -262,8 +325,8 @@ class _Gauge:
             counts += np.bincount(parts[chosen], minlength=counts.size)
 
 
-def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, "object"]]:
-    """Yield the raw rows of a job with their halo, as `with_halo`: first row of the region, strip, first, last, scale."""
+def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:
+    """Yield first row of the region, raw rows with their halo, ``first`` and ``last`` of `with_halo`, and the scale."""
     records, region = job.store.records(), job.store.grid.region
     check_done(job, records)
     histogram = job.store.histogram(records)
