@@ -26,6 +26,8 @@ _LOWEST, _RUNGS = 1 / 256, 25
 _STEPS, _FINE, _RATIO = 64, 8, 1.01
 _COARSE = ceil(np.log(32000 / _FINE) / np.log(_RATIO)) + 1
 _WIDTHS = np.concatenate([np.arange(_FINE * _STEPS) / _STEPS, _FINE * _RATIO ** (np.arange(_COARSE) + 0.5)])
+# Of quantiles whose scores differ by less than this, the one with the narrowest intervals is chosen.
+_SAME_SCORE = 1.02
 # Fields of a measurement: pixels that hold the truth, sum of widths, sum of distances that miss, counts by width.
 INSIDE, WIDTH, MISSED, COUNTS = 0, 1, 2, 3
 FIELDS = COUNTS + _WIDTHS.size
@@ -116,9 +118,9 @@ def count(parts: Iterable[Measured]) -> tuple[int, int]:
 
 
 def choose(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Choice:
-    """Choose the levels of a coverage: each class reaches it; of the quantiles that do, the best interval score.
+    """Choose the levels with which each class reaches a coverage.
 
-    A class with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class
+    Of the quantiles whose interval score is nearly the best, the one with the narrowest intervals is chosen. A class with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class
     without regularisation.
     """
     table, notes = pooled(parts), []
@@ -127,26 +129,27 @@ def choose(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Ch
     reached = [_level(table[:, scheme], levels, coverage) for scheme in range(SCHEMES)]
     if few[0] or few[1]:
         scheme, name, other = (HIGH + 1, "high", "low") if few[0] else (HIGH, "low", "high")
-        found = reached[scheme]
-        level = float(levels[-1]) if found is None else found
+        level = reached[scheme]
+        level = float(levels[-1]) if level is None else level
         pixels = count(parts)[0 if few[0] else 1]
         notes.append(f"{pixels} pixels of {name} confidence, {needed} are needed: they take the level of {other}")
         return Choice(level, level, None, tuple(notes))
     if (high := reached[HIGH]) is None:
         high = float(levels[-1])
         notes.append("high confidence does not reach it at any level")
-    scores = {
-        scheme: score(at_level(table[:, scheme], levels, level), coverage)
-        for scheme in range(1, SCHEMES)
-        if (level := reached[scheme]) is not None
-    }
-    if not scores:
+    # level, interval score and sum of widths of each quantile that reaches it
+    found = {}
+    for scheme, quantile in enumerate(QUANTILES, start=HIGH + 1):
+        if (level := reached[scheme]) is not None:
+            fields = at_level(table[:, scheme], levels, level)
+            found[quantile] = level, interval_score(fields, coverage), fields[WIDTH]
+    if not found:
         notes.append("low confidence does not reach it at any level")
         return Choice(high, float(levels[-1]), None, tuple(notes))
-    best = min(scores, key=lambda scheme: (scores[scheme], scheme))
-    low = reached[best]
-    assert low is not None  # it has a score
-    return Choice(high, low, QUANTILES[best - 1], tuple(notes))
+    best = min(score for _, score, _ in found.values())
+    good = {quantile: width for quantile, (_, score, width) in found.items() if score <= _SAME_SCORE * best}
+    quantile = min(good, key=lambda quantile: good[quantile])
+    return Choice(high, found[quantile][0], quantile, tuple(notes))
 
 
 def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | None:
@@ -170,7 +173,7 @@ def at_level(fields: np.ndarray, levels: np.ndarray, level: float) -> np.ndarray
     return np.asarray((1 - share) * fields[above - 1] + share * fields[above])
 
 
-def score(fields: np.ndarray, coverage: float) -> float:
+def interval_score(fields: np.ndarray, coverage: float) -> float:
     """Interval score (Gneiting and Raftery 2007): mean of width + 2 / (1 - coverage) x distance of the truth."""
     pixels = fields[COUNTS:].sum()
     return float((fields[WIDTH] + 2 / (1 - coverage) * fields[MISSED]) / pixels)
@@ -189,7 +192,7 @@ def expected(parts: Sequence[Measured], levels: np.ndarray, choice: Choice, cove
         **{name: _share(fields, INSIDE) for name, fields in (("all", both), ("high", high), ("low", low))},
         "mean_width": _share(both, WIDTH),
         "median_width": float(_WIDTHS[np.searchsorted(upto, upto[-1] / 2)]),
-        "score": score(both, coverage),
+        "score": interval_score(both, coverage),
     }
 
 
