@@ -3,33 +3,91 @@
 Letters: r row, c column, k disparity index, s and t segments (runs of low-confidence pixels in a row).
 """
 
+import math
+
 import numpy as np
 from numba import njit
 
 from sat_intervals.kernels.compiled import cached
 from sat_intervals.kernels.vector import LANES, first_lane, lanes_above_last, lanes_at_most, load
+from sat_intervals.products import IMPOSSIBLE_COST
 
 
 @njit(nogil=True, forceinline=True)
-def alpha_cut(curve, limit):
+def alpha_cut(curve, limit, first, last):
     """First and last index whose cost is at most ``limit = lowest + floor((1 - alpha) * span)`` (paper eq. 5 to 7).
 
     ``curve`` is padded to whole vectors with costs above every limit; at least one cost is at most ``limit``.
+    ``first`` and ``last`` are known bounds of the indices: those of a larger limit, or the ends of the curve.
     Vectors take 19 ns for 64 disparities and 38 ns for 128, single costs 70 and 129 ns.
     """
-    first = 0
+    first -= first % LANES
+    last -= last % LANES
     cut = lanes_at_most(load(curve, first), limit)
     while cut == 0:
         first += LANES
         cut = lanes_at_most(load(curve, first), limit)
     first += first_lane(cut)
-    last = curve.size - LANES
     cut = lanes_at_most(load(curve, last), limit)
     while cut == 0:
         last -= LANES
         cut = lanes_at_most(load(curve, last), limit)
     last += LANES - 1 - lanes_above_last(cut)
     return first, last
+
+
+@njit(nogil=True, forceinline=True, error_model="numpy")
+def _crossing(curve, inside, outside, count, limit, steps):
+    """Steps from index ``inside`` to where the linear curve crosses ``limit`` before ``outside``, rounded up.
+
+    0 at the end of the range and beside an impossible candidate. ``curve[outside]`` is above ``limit``.
+    """
+    if not 0 <= outside < count or curve[outside] == IMPOSSIBLE_COST:
+        return 0
+    rise = np.int64(curve[outside]) - np.int64(curve[inside])
+    return np.int64(math.ceil(steps * (limit - curve[inside]) / rise))
+
+
+@njit(nogil=True, forceinline=True)
+def _limit(lowest, level):
+    """Largest whole cost of a cut at a level above the lowest cost."""
+    return np.uint16(min(lowest + np.int64(level), IMPOSSIBLE_COST - 1))
+
+
+@njit(nogil=True, forceinline=True)
+def _subpixel_cut(curve, lowest, whole, level, disparity, settings):
+    """Ends of the cut at a level in steps above the first disparity, rounded outwards.
+
+    ``whole`` has the first and last index of the cut, ``disparity`` the refined winner in pixels above the first one.
+    """
+    first, last = whole
+    limit = lowest + level
+    lower = first * settings.steps - _crossing(curve, first, first - 1, settings.count, limit, settings.steps)
+    upper = last * settings.steps + _crossing(curve, last, last + 1, settings.count, limit, settings.steps)
+    return (
+        min(lower, np.int64(math.floor(disparity * settings.steps))),
+        max(upper, np.int64(math.ceil(disparity * settings.steps))),
+    )
+
+
+@njit(nogil=True, forceinline=True)
+def subpixel_cuts(curve, lowest, disparity, settings):
+    """Bounds at the level ``high``, and at ``low`` if it is not negative (METHOD.md, section 16), in steps.
+
+    Both whole cuts take one pass from each end of the curve: the one of the smaller level begins where the other ends.
+    ``disparity`` is the refined winner, ``k + shift``. Returns ``(lower, upper)`` of both.
+    """
+    high, low = settings.high, settings.low
+    outer = alpha_cut(curve, _limit(lowest, max(high, low)), 0, curve.size - 1)
+    if low < 0:
+        one = _subpixel_cut(curve, lowest, outer, high, disparity, settings)
+        return one, one
+    inner = alpha_cut(curve, _limit(lowest, min(high, low)), outer[0], outer[1])
+    first, second = (outer, inner) if high >= low else (inner, outer)
+    return (
+        _subpixel_cut(curve, lowest, first, high, disparity, settings),
+        _subpixel_cut(curve, lowest, second, low, disparity, settings),
+    )
 
 
 @njit(nogil=True)
@@ -132,20 +190,21 @@ def _quantile(counts, size, quantile):
 
 
 @njit(nogil=True)
-def _half_pixels(lower, upper, low, minimum):
-    """Convert bounds to half-pixel steps above ``minimum``; return the number of bins and ``(2, rows, columns)`` steps.
+def _in_steps(lower, upper, low, minimum, per_pixel):
+    """Convert bounds to steps above ``minimum``, rounded outwards; return the number of bins and the steps.
 
-    uint16 takes half the time of int32, and suffices for disparities within 32000 pixels of each other.
+    The steps are ``(2, rows, columns)`` uint16, which takes half the time of int32.
     """
     rows, columns = low.shape
     least = most = np.float32(minimum)
+    scale = np.float32(per_pixel)
     steps = np.empty((2, rows, columns), np.uint16)
     for r in range(rows):
         for c in range(columns):  # selections, not branches: they vectorise
             most = max(most, upper[r, c] if low[r, c] else most)
-            steps[0, r, c] = np.uint16(2 * (lower[r, c] - least)) if low[r, c] else 0
-            steps[1, r, c] = np.uint16(2 * (upper[r, c] - least)) if low[r, c] else 0
-    return int(2 * (most - least)) + 1, steps
+            steps[0, r, c] = np.uint16(np.floor(scale * (lower[r, c] - least))) if low[r, c] else 0
+            steps[1, r, c] = np.uint16(np.ceil(scale * (upper[r, c] - least))) if low[r, c] else 0
+    return int(np.ceil(scale * (most - least))) + 1, steps
 
 
 @njit(nogil=True)
@@ -156,7 +215,7 @@ def _same_neighbours(s, t, above, below):
 
 
 @cached
-def regularize(lower, upper, low, minimum, depth, quantile, first, last):
+def regularize(lower, upper, low, minimum, depth, quantile, rows, per_pixel):
     """Widen the intervals of low-confidence areas to quantiles of the area's bounds (paper section 3.5).
 
     A segment's area is made of the segments reached in at most ``depth`` steps between segments of adjacent rows
@@ -165,8 +224,7 @@ def regularize(lower, upper, low, minimum, depth, quantile, first, last):
     Parameters
     ----------
     lower, upper
-        ``(rows, columns)`` float32 bounds in pixels, within 32000 pixels of each other. Where ``low`` they are
-        multiples of half a pixel (integers and means of two), so that quantiles come from histograms.
+        ``(rows, columns)`` float32 bounds in pixels.
     low
         bool of the same shape: low-confidence pixels.
     minimum
@@ -176,13 +234,17 @@ def regularize(lower, upper, low, minimum, depth, quantile, first, last):
         Largest number of steps, and so of rows that an area reaches above and below.
     quantile
         Of the upper bounds; the lower bounds take ``1 - quantile``.
-    first, last
-        The rows ``[first, last)`` are returned; areas may reach the others.
+    rows
+        ``(first, last)``: the rows ``[first, last)`` are returned; areas may reach the others.
+    per_pixel
+        Steps per pixel of the histograms that quantiles come from; bounds are rounded outwards to them. Bounds in
+        whole pixels, and medians of them, are multiples of a half. All bounds are within ``65535 / per_pixel`` pixels.
 
     Returns
     -------
     ``(lower, upper)``, float32 of shape ``(last - first, columns)``; pixels that are not low keep their bounds.
     """
+    first, last = rows
     start, stop, row_start = find_segments(low)
     segments = start.size
     above, below = np.zeros((segments, 2), np.int64), np.zeros((segments, 2), np.int64)
@@ -192,7 +254,7 @@ def regularize(lower, upper, low, minimum, depth, quantile, first, last):
     for r in range(row_start.size - 1):
         segment_row[row_start[r] : row_start[r + 1]] = r
     visited, area = np.full(segments, -1, np.int64), np.empty(segments, np.int64)
-    bins, steps = _half_pixels(lower, upper, low, minimum)
+    bins, steps = _in_steps(lower, upper, low, minimum, per_pixel)
     counts = np.empty((2, bins), np.int32)
     new_lower, new_upper = lower[first:last].copy(), upper[first:last].copy()
     low_bound = high_bound = 0.0
@@ -203,8 +265,8 @@ def regularize(lower, upper, low, minimum, depth, quantile, first, last):
         if not (depth > 1 and s > row_start[segment_row[s]] and _same_neighbours(s - 1, s, above, below)):
             members = _area(s, depth, above, below, visited, area)
             size = _count_bounds(steps, segment_row, start, stop, area, members, counts)
-            low_bound = minimum + 0.5 * _quantile(counts[0], size, 1.0 - quantile)
-            high_bound = minimum + 0.5 * _quantile(counts[1], size, quantile)
+            low_bound = minimum + _quantile(counts[0], size, 1.0 - quantile) / per_pixel
+            high_bound = minimum + _quantile(counts[1], size, quantile) / per_pixel
         new_lower[segment_row[s] - first, start[s] : stop[s]] = low_bound
         new_upper[segment_row[s] - first, start[s] : stop[s]] = high_bound
     return new_lower, new_upper

@@ -33,6 +33,7 @@ class Patch(NamedTuple):
 
 def kernel_settings(config: Config) -> Settings:
     """Convert a configuration to the settings of the kernels."""
+    cuts = config.cuts
     # penalties that follow gradients come with these
     constant = config.sgm if isinstance(config.sgm, Sgm | CosineSgm) else None
     return Settings(
@@ -42,9 +43,12 @@ def kernel_settings(config: Config) -> Settings:
         p1=config.in_steps(constant.p1) if constant else 0,
         p2=config.in_steps(constant.p2) if constant else 0,
         regularized=config.sgm is not None,
-        cut_level=-1 if config.cut_level is None else config.cut_level,
+        cut_level=-1 if cuts or config.cut_level is None else config.cut_level,
         weights=np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights,
         refine=config.refinement is not None,
+        high=cuts.high if cuts else -1.0,
+        low=cuts.low if cuts and config.subpixel_levels == 2 else -1.0,
+        steps=config.bound_steps,
     )
 
 
@@ -145,14 +149,20 @@ def _mark_ambiguous(raw: Raw, textureless: np.ndarray, config: Config) -> None:
         return
     ambiguous = textureless & (raw.winner != NO_DISPARITY)
     if config.interval:
-        raw.lower[ambiguous], raw.upper[ambiguous] = config.disparity.minimum, config.disparity.maximum
+        search, steps = config.disparity, config.bound_steps
+        first, last = (0, steps * (search.count - 1)) if steps else (search.minimum, search.maximum)
+        raw.lower[ambiguous], raw.upper[ambiguous] = first, last
+        if config.subpixel_levels == 2:
+            raw.lower_low[ambiguous], raw.upper_low[ambiguous] = first, last
     raw.ambiguity[ambiguous] = config.largest_ambiguity
 
 
 def match_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:
     """Match the right view of a core with its own volume: the images swap, and disparities change sign."""
     maximum = settings.minimum + settings.count - 1
-    mirrored = settings._replace(minimum=-maximum, cut_level=-1, weights=np.zeros(0, np.uint16), refine=False)
+    mirrored = settings._replace(
+        minimum=-maximum, cut_level=-1, low=-1.0, steps=0, weights=np.zeros(0, np.uint16), refine=False
+    )
     reach = facing(core, settings.minimum, maximum).relative_to(area.base)
     raw, _ = match_costs(cost.costs, mirrored, reach, reach, cost.gradients)
     return RightView(raw.cost, np.where(raw.winner == NO_DISPARITY, NO_DISPARITY, -raw.winner).astype(np.int16))

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, calibration_of
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
@@ -173,9 +173,22 @@ def _tags(config: Config) -> dict[str, str]:
         "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
         "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
     }
-    if config.interval:
-        tags["ALPHA"] = f"{config.interval.alpha} (level of possibility, not a probability)"
+    interval = config.interval
+    if interval and interval.coverage is not None:
+        calibration = calibration_of(config)
+        tags["COVERAGE"] = f"{interval.coverage} (mean over pixels like those of the calibration, not of each pixel)"
+        tags["CALIBRATION"] = f"{calibration.name} {calibration.sha256}"
+    elif interval:
+        tags["ALPHA"] = f"{interval.alpha} (level of possibility, not a probability)"
     return tags
+
+
+def _calibration(config: Config) -> dict[str, Any] | None:
+    """Return what the run took from its calibration, whose content is in the settings."""
+    if config.interval is None or config.interval.coverage is None or config.cuts is None:
+        return None
+    calibration = calibration_of(config)
+    return {"name": calibration.name, "sha256": calibration.sha256, **config.cuts._asdict()}
 
 
 def _report(
@@ -201,6 +214,7 @@ def _report(
             "overlap": config.tiles.overlap,
         },
         "cost_span": config.cost_span,
+        "calibration": _calibration(config),
         "normalization": statistics and statistics.report(),
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),

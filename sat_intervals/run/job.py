@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, Mccnn, load_config
+from sat_intervals.config import Config, Mccnn, load_config, resolved
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
@@ -130,7 +130,7 @@ def prepare(
 
     ``pair`` distinguishes otherwise equal pairs of a batch in an external store.
     """
-    config, out = fitted_to_jobs(load_config(config)), Path(out)
+    config, out = resolved(fitted_to_jobs(load_config(config))), Path(out)
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
     check_tiles(config, region)
@@ -146,7 +146,7 @@ def prepare(
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
-    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
+    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, config.subpixel_levels, elsewhere)
     return Job(left, right, config, store, out, inputs, files)
 
 

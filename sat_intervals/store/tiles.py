@@ -40,7 +40,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 5
+LAYOUT = 6
 
 # Marker files in the folder of a run.
 # Present while a run replaces an earlier one.
@@ -70,6 +70,8 @@ class Store:
         Number of disparities of the search range.
     ambiguities
         Largest possible ambiguity of a pixel.
+    levels
+        Levels of sub-pixel bounds, see `TileArrays`.
     elsewhere
         Folder of the tiles in the store that the user names; by default ``home``.
     """
@@ -78,6 +80,7 @@ class Store:
     grid: Grid
     count: int
     ambiguities: int
+    levels: int
     elsewhere: str | None = None
 
     @property
@@ -87,7 +90,7 @@ class Store:
 
     @property
     def _arrays(self) -> TileArrays:
-        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities)
+        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels)
 
     def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
         """Create the store or resume an existing one; call it while ``home`` is locked.
@@ -365,4 +368,4 @@ def store_of(home: Path, store: str | None = None) -> Store:
     text = folder.read(MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} has no run: give the folder that match was given")
-    return Store(home, grid_of(parsed(text, folder), folder), 1, 0, str(folder))
+    return Store(home, grid_of(parsed(text, folder), folder), 1, 0, 0, str(folder))

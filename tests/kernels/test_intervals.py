@@ -159,7 +159,7 @@ def test_regularize__worked_example():
     new_lower = np.array([[0.2, 0.2, 9, 2.1], [9, 0.2, 9, 2.2], [9, 9, 9, 3.4]], np.float32)
     new_upper = np.array([[11, 11, 9, 5.8], [9, 11, 9, 7.6], [9, 9, 9, 7.8]], np.float32)
     for result in (
-        regularize(lower, upper, low, 0, 1, 0.9, 0, 3),
+        regularize(lower, upper, low, 0, 1, 0.9, (0, 3), 2),
         reference.regularize(lower, upper, low, 1, 0.9),
     ):
         np.testing.assert_allclose(result[0], new_lower, rtol=1e-6)
@@ -175,7 +175,7 @@ def test_regularize__reaches_back_into_the_same_row():
     bounds = np.array([[0, 99, 8], [4, 4, 4]], np.float32)
     for depth, first, last in ((0, (0, 0), (8, 8)), (1, (0, 4), (4, 8)), (2, (0, 8), (0, 8))):
         for lower, upper in (
-            regularize(bounds, bounds, low, 0, depth, 1.0, 0, 2),
+            regularize(bounds, bounds, low, 0, depth, 1.0, (0, 2), 2),
             reference.regularize(bounds, bounds, low, depth, 1.0),
         ):
             assert (lower[0, 0], upper[0, 0]) == first
@@ -188,7 +188,7 @@ def test_regularize__corners_do_not_touch():
     #     . x     9 5
     low = np.eye(2, dtype=bool)
     bounds = np.array([[1, 9], [9, 5]], np.float32)
-    lower, upper = regularize(bounds, bounds, low, 0, 2, 0.9, 0, 2)
+    lower, upper = regularize(bounds, bounds, low, 0, 2, 0.9, (0, 2), 2)
     np.testing.assert_array_equal(lower, bounds)
     np.testing.assert_array_equal(upper, bounds)
 
@@ -200,7 +200,7 @@ def test_regularize__long_segments():
     low[1] = True
     low[0, ::2] = True
     lower = np.arange(3 * columns, dtype=np.float32).reshape(3, columns)
-    new_lower, new_upper = regularize(lower, lower, low, 0, 2, 0.9, 0, 3)
+    new_lower, new_upper = regularize(lower, lower, low, 0, 2, 0.9, (0, 3), 2)
     area = lower[low].astype(np.float64)
     assert new_lower[low].tolist() == pytest.approx([np.quantile(area, 0.1)] * low.sum())
     assert new_upper[low].tolist() == pytest.approx([np.quantile(area, 0.9)] * low.sum())
@@ -229,7 +229,7 @@ MINIMUM = -8
 def test_regularize__equals_reference(strip, depth, quantile):
     lower, upper, low = strip
     rows = len(low)
-    result = regularize(lower, upper, low, MINIMUM, depth, quantile, 0, rows)
+    result = regularize(lower, upper, low, MINIMUM, depth, quantile, (0, rows), 2)
     expected = reference.regularize(lower, upper, low, depth, quantile)
     np.testing.assert_allclose(result, expected, rtol=1e-6, atol=1e-6)
     assert result[0].dtype == result[1].dtype == np.float32
@@ -241,10 +241,10 @@ def test_regularize__a_halo_of_depth_rows_is_enough(strip, depth, quantile, data
     lower, upper, low = strip
     first = data.draw(st.integers(0, len(low) - 1))
     last = data.draw(st.integers(first + 1, len(low)))
-    whole = regularize(lower, upper, low, MINIMUM, depth, quantile, 0, len(low))
+    whole = regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2)
     start, stop = max(0, first - depth), min(len(low), last + depth)
     halo = np.s_[start:stop]
-    part = regularize(lower[halo], upper[halo], low[halo], MINIMUM, depth, quantile, first - start, last - start)
+    part = regularize(lower[halo], upper[halo], low[halo], MINIMUM, depth, quantile, (first - start, last - start), 2)
     np.testing.assert_array_equal(part[0], whole[0][first:last])
     np.testing.assert_array_equal(part[1], whole[1][first:last])
 
@@ -254,7 +254,7 @@ def test_regularize__a_halo_of_depth_rows_is_enough(strip, depth, quantile, data
 def test_regularize__keeps_order_and_what_is_not_low(strip, depth, quantile):
     lower, upper, low = strip
     before = lower.copy(), upper.copy()
-    new_lower, new_upper = regularize(lower, upper, low, MINIMUM, depth, quantile, 0, len(low))
+    new_lower, new_upper = regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2)
     np.testing.assert_array_equal((lower, upper), before)
     np.testing.assert_array_equal(new_lower[~low], lower[~low])
     np.testing.assert_array_equal(new_upper[~low], upper[~low])
@@ -265,7 +265,9 @@ def test_regularize__keeps_order_and_what_is_not_low(strip, depth, quantile):
 @given(strip=strips(), depth=st.integers(0, 3))
 def test_regularize__a_larger_quantile_never_narrows(strip, depth):
     lower, upper, low = strip
-    results = [regularize(lower, upper, low, MINIMUM, depth, quantile, 0, len(low)) for quantile in (0.5, 0.8, 1.0)]
+    results = [
+        regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2) for quantile in (0.5, 0.8, 1.0)
+    ]
     for narrow, wide in pairwise(results):
         assert (wide[0][low] <= narrow[0][low]).all()
         assert (wide[1][low] >= narrow[1][low]).all()
