@@ -76,7 +76,7 @@ class Measured(NamedTuple):
     @property
     def kept(self) -> int:
         """Return the number of kept pixels with truth."""
-        return sum(count([self]))
+        return int(self.table[0, [HIGH, HIGH + 1], COUNTS:].sum())
 
 
 def ladder(config: Config) -> np.ndarray:
@@ -85,8 +85,10 @@ def ladder(config: Config) -> np.ndarray:
     return np.concatenate([[0.0], levels])
 
 
-def measure(lower: np.ndarray, upper: np.ndarray, truth: np.ndarray, tolerance: float) -> np.ndarray:
-    """Measure some intervals: ``(fields,)``.
+def measure(
+    lower: np.ndarray, upper: np.ndarray, truth: np.ndarray, tolerance: float, part: np.ndarray, parts: int
+) -> np.ndarray:
+    """Measure some intervals: ``(parts, fields)``.
 
     Parameters
     ----------
@@ -94,45 +96,60 @@ def measure(lower: np.ndarray, upper: np.ndarray, truth: np.ndarray, tolerance: 
         ``(pixels,)`` finite numbers of pixels.
     tolerance
         Distance up to which a truth outside an interval counts as inside.
+    part, parts
+        Part of each pixel, and number of parts.
     """
-    width, truth = upper.astype(np.float64) - lower, truth.astype(np.float64)
+    width = upper.astype(np.float64) - lower
     missed = np.maximum(np.maximum(lower - truth, truth - upper) - tolerance, 0)
-    fields = np.zeros(FIELDS)
-    fields[:COUNTS] = np.count_nonzero(missed == 0), width.sum(), missed.sum()
     coarse = _FINE * _STEPS + np.log(np.maximum(width, _FINE) / _FINE) / np.log(_RATIO)
     place = np.where(width < _FINE, np.rint(width * _STEPS), coarse).astype(np.int64)
-    fields[COUNTS:] = np.bincount(place, minlength=_WIDTHS.size)
+    fields = np.zeros((parts, FIELDS))
+    for field, weights in ((INSIDE, missed == 0), (WIDTH, width), (MISSED, missed)):
+        fields[:, field] = np.bincount(part, weights, parts)
+    counts = np.bincount(part * _WIDTHS.size + place, minlength=parts * _WIDTHS.size)
+    fields[:, COUNTS:] = counts.reshape(parts, -1)
     return fields
 
 
-def pooled(parts: Iterable[Measured]) -> np.ndarray:
-    """Weighted sums of all parts: ``(rungs, schemes, fields)``."""
-    return np.asarray(np.sum([part.weight * part.table for part in parts], axis=0))
+class Pool(NamedTuple):
+    """Several measurements together.
+
+    Attributes
+    ----------
+    table
+        Weighted sums ``(rungs, schemes, fields)``.
+    pixels
+        Number of pixels of high and of low confidence.
+    """
+
+    table: np.ndarray
+    pixels: tuple[int, int]
 
 
-def count(parts: Iterable[Measured]) -> tuple[int, int]:
-    """Pixels with truth of high and of low confidence."""
-    found = [part.table[0, [HIGH, HIGH + 1], COUNTS:].sum(axis=-1) for part in parts]
-    high, low = np.sum(found, axis=0)
-    return int(high), int(low)
+def pooled(parts: Iterable[Measured]) -> Pool:
+    """Put measurements together."""
+    parts = list(parts)
+    high, low = np.sum([part.table[0, [HIGH, HIGH + 1], COUNTS:].sum(axis=-1) for part in parts], axis=0)
+    return Pool(np.asarray(sum(part.weight * part.table for part in parts)), (int(high), int(low)))
 
 
-def choose(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Choice:
+def choose(pool: Pool, levels: np.ndarray, coverage: float) -> Choice:
     """Choose the levels with which each class reaches a coverage.
 
-    Of the quantiles whose interval score is nearly the best, the one with the narrowest intervals is chosen. A class with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class
+    Of the quantiles whose interval score is nearly the best, the one with the narrowest intervals is chosen. A class
+    with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class
     without regularisation.
     """
-    table, notes = pooled(parts), []
+    (table, pixels), notes = pool, []
     needed = ceil(max(200, 10 / (1 - coverage)) - 1e-9)
-    few = [pixels < needed for pixels in count(parts)]
+    few = [number < needed for number in pixels]
     reached = [_level(table[:, scheme], levels, coverage) for scheme in range(SCHEMES)]
     if few[0] or few[1]:
         scheme, name, other = (HIGH + 1, "high", "low") if few[0] else (HIGH, "low", "high")
         level = reached[scheme]
         level = float(levels[-1]) if level is None else level
-        pixels = count(parts)[0 if few[0] else 1]
-        notes.append(f"{pixels} pixels of {name} confidence, {needed} are needed: they take the level of {other}")
+        number = pixels[0 if few[0] else 1]
+        notes.append(f"{number} pixels of {name} confidence, {needed} are needed: they take the level of {other}")
         return Choice(level, level, None, tuple(notes))
     if (high := reached[HIGH]) is None:
         high = float(levels[-1])
@@ -179,9 +196,11 @@ def interval_score(fields: np.ndarray, coverage: float) -> float:
     return float((fields[WIDTH] + 2 / (1 - coverage) * fields[MISSED]) / pixels)
 
 
-def expected(parts: Sequence[Measured], levels: np.ndarray, choice: Choice, coverage: float) -> dict[str, float]:
-    """Figures of some parts with given levels: coverage of all, high and low, widths in pixels, interval score."""
-    table = pooled(parts)
+def expected(table: np.ndarray, levels: np.ndarray, choice: Choice, coverage: float) -> dict[str, float]:
+    """Figures with given levels: coverage of all, high and low, widths in pixels, interval score; NaN without pixels.
+
+    ``table`` is that of a `Pool`.
+    """
     high = at_level(table[:, HIGH], levels, choice.high)
     low = at_level(table[:, 1 + QUANTILES.index(choice.quantile)], levels, choice.low)
     both = high + low
@@ -201,14 +220,23 @@ def _share(fields: np.ndarray, which: int) -> float:
     return float(fields[which] / pixels) if pixels else np.nan
 
 
-def left_out(parts: Sequence[Measured], levels: np.ndarray, coverage: float) -> Mapping[str, dict[str, float]]:
-    """Figures of each group with the levels chosen on the others; empty for a single group."""
+def left_out(
+    parts: Sequence[Measured], levels: np.ndarray, coverages: Iterable[float]
+) -> list[dict[str, dict[str, float]]]:
+    """For each coverage, figures of each group, see `expected`, with the levels chosen on the others.
+
+    Empty for a single group.
+    """
     groups = list(dict.fromkeys(part.group for part in parts))
-    found: dict[str, dict[str, float]] = {}
-    for group in groups if len(groups) > 1 else ():
-        choice = choose([part for part in parts if part.group != group], levels, coverage)
-        found[group] = expected([part for part in parts if part.group == group], levels, choice, coverage)
-    return found
+    own = {group: pooled(part for part in parts if part.group == group).table for group in groups}
+    rest = {group: pooled(part for part in parts if part.group != group) for group in groups if len(groups) > 1}
+    return [
+        {
+            group: expected(own[group], levels, choose(others, levels, coverage), coverage)
+            for group, others in rest.items()
+        }
+        for coverage in coverages
+    ]
 
 
 def means(groups: Iterable[Mapping[str, float]]) -> dict[str, float]:

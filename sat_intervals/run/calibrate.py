@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,7 +17,6 @@ from distributed import Client
 from sat_intervals.config import Calibration, Config, Interval, key_of
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.match.calibration import (
     FEWEST,
     FIELDS,
@@ -25,17 +25,19 @@ from sat_intervals.match.calibration import (
     SCHEMES,
     Measured,
     choose,
-    count,
     ladder,
     left_out,
     means,
     measure,
+    pooled,
 )
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.postprocess import (
     ConfidenceScale,
     RawRows,
     confidence_scale,
+    filter_rows,
+    finish_rows,
     halo,
     postprocess_rows,
     with_halo,
@@ -163,13 +165,19 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
     try:
         with connected(subjects[0].config.cluster, scratch) as client:
             for number, subject in enumerate(subjects):
-                progress("subjects", number, len(subjects))
-                found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, progress)
+                one = progress if len(subjects) == 1 else partial(_of_all, progress, number, len(subjects))
+                one("subjects", 0, 1)
+                found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found
+
+
+def _of_all(progress: Progress, number: int, total: int, *_: object) -> None:
+    """Report the progress of one of several subjects."""
+    progress("subjects", number, total)
 
 
 def _of_subject(
@@ -221,13 +229,12 @@ def calibration_from(
     each coverage. The calibration's provenance has them too.
     """
     config = subjects[0].config
-    levels, rows, expected, notes = ladder(config), [], [], []
-    for coverage in COVERAGES:
-        choice = choose(parts, levels, coverage)
+    levels, pool, rows, expected, notes = ladder(config), pooled(parts), [], [], []
+    for coverage, groups in zip(COVERAGES, left_out(parts, levels, COVERAGES), strict=True):
+        choice = choose(pool, levels, coverage)
         rows.append({"coverage": coverage, "high": choice.high, "low": choice.low, "quantile": choice.quantile})
         notes += [f"coverage {coverage:g}: {note}" for note in choice.notes]
-        expected.append({"coverage": coverage, **means(left_out(parts, levels, coverage).values())})
-    high, low = count(parts)
+        expected.append({"coverage": coverage, **means(groups.values())})
     provenance = {
         "software": f"sat-intervals {version('sat-intervals')}",
         "pairs": [
@@ -236,7 +243,7 @@ def calibration_from(
             for subject in subjects
             for search in (subject.config.disparity,)
         ],
-        "pixels": {"high": high, "low": low},
+        "pixels": dict(zip(("high", "low"), pool.pixels, strict=True)),
         "notes": notes,
         "expected": [{key: _rounded(value) for key, value in row.items()} for row in expected],
     }
@@ -273,7 +280,7 @@ class _Gauge:
     def _found_bias(self, job: Job) -> float:
         histogram = bias_histogram()
         for row, strip, first, last, scale in _strips(job):
-            final = postprocess_rows(strip, first, last, scale, self._subject.config)
+            final = postprocess_rows(strip, first, last, scale, job.config)
             truth = self._truth(row, last - first)
             chosen = final.valid & np.isfinite(truth)
             histogram.add(final.disparity[chosen].astype(np.float64) - truth[chosen])
@@ -291,18 +298,18 @@ class _Gauge:
 
     def add(self, job: Job, rung: int) -> None:
         """Measure a job, whose levels are the rungs ``rung`` and ``rung + 1``."""
-        config = self._subject.config
-        assert config.regularization is not None  # checked
+        config = job.config
+        at_quantile = {quantile: _at_levels(config, 0.0, 0.0, quantile) for quantile in QUANTILES}
         for row, strip, first, last, scale in _strips(job):
             truth, parts = self._truth(row, last - first) + self._bias, self._parts(row, last - first)
             for cut in (0, 1):
                 lower, upper = (strip.lower_low, strip.upper_low) if cut else (strip.lower, strip.upper)
                 rows = strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper)
+                filtered = filter_rows(rows, scale, config)
+                assert filtered.low is not None  # checked
+                low = filtered.low[first:last]
                 for scheme, quantile in enumerate(QUANTILES, start=HIGH + 1):
-                    final = postprocess_rows(rows, first, last, scale, _at_levels(config, 0.0, 0.0, quantile))
-                    low = low_confidence(
-                        final.confidence, config.regularization.threshold, config.regularization.kernel
-                    )
+                    final = finish_rows(filtered, first, last, at_quantile[quantile])
                     kept = final.valid & np.isfinite(truth)
                     if scheme == HIGH + 1:
                         self._add(rung + cut, HIGH, final, truth, parts, kept & ~low)
@@ -313,10 +320,9 @@ class _Gauge:
     def _add(
         self, rung: int, scheme: int, final: Bands, truth: np.ndarray, parts: np.ndarray, chosen: np.ndarray
     ) -> None:
-        for part in np.unique(parts[chosen]):
-            here = chosen & (parts == part)
-            lower, upper = final.lower[here], final.upper[here]
-            self._tables[part, rung, scheme] += measure(lower, upper, truth[here], self._subject.tolerance)
+        lower, upper, true, part = (band[chosen] for band in (final.lower, final.upper, truth, parts))
+        tolerance, number = self._subject.tolerance, len(self._tables)
+        self._tables[:, rung, scheme] += measure(lower, upper, true, tolerance, part, number)
 
     def _count(self, final: Bands, truth: np.ndarray, parts: np.ndarray) -> None:
         known = np.isfinite(truth)

@@ -74,7 +74,7 @@ def tuned(
         subjects,
         float(np.mean([part.kept / part.known for part in parts if part.known])),
         float(np.mean([part.good / part.known for part in parts if part.known])),
-        means(left_out(parts, ladder(subjects[0].config), COVERAGE).values()),
+        means(left_out(parts, ladder(subjects[0].config), [COVERAGE])[0].values()),
         calibration,
     )
 
