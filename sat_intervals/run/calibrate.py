@@ -49,14 +49,13 @@ from sat_intervals.raster import Image, open_image
 from sat_intervals.results import Layer
 from sat_intervals.run.assemble import STRIP_PIXELS, check_done, check_matched
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.job import Job, prepare
+from sat_intervals.run.job import Job, checked_region, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
 
 # A single pair is judged in blocks, this many along each side.
 _BLOCKS = 4
-_RANGE_STEP = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -120,9 +119,18 @@ def check_subjects(subjects: Sequence[Subject]) -> None:
             )
     known = 0
     for subject in subjects:
-        region = subject.window or Window(0, 0, subject.left.height, subject.left.width)
-        for window in strips(region.height, region.width, _RANGE_STEP):
-            known += int(np.isfinite(subject.truth.read(window)).sum())
+        search, region = subject.config.disparity, checked_region(subject.left, subject.window)
+        here = outside = 0
+        for window in strips(region.height, region.width, STRIP_PIXELS):
+            truth = subject.truth.read(window)
+            here += int(np.isfinite(truth).sum())
+            outside += int(((truth < search.minimum) | (truth > search.maximum)).sum())
+        if 2 * outside > here:
+            raise SatIntervalsError(
+                f"{subject.truth.image.path}: {outside} of {here} truths are outside the search range "
+                f"{search.minimum} to {search.maximum}: check their sign, x_right = x_left + disparity, and the range"
+            )
+        known += here
     check_enough(known, subjects, "known truths")
 
 
