@@ -10,7 +10,7 @@ READY := $(VENV)/.has-$(EXTRAS)
 PYTEST := $(BIN)/python -m pytest $(OPTIONS)
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 
-.PHONY: demo test test-all lint bench tune pictures clean
+.PHONY: demo test test-all lint bench tune calibration coverage pictures clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite
@@ -40,6 +40,14 @@ bench: $(VENV)/.has-bench
 # The tables of docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; about ten minutes.
 tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/tune.py
+
+# The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; about half an hour.
+calibration: $(VENV)/.has-mccnn
+	$(BIN)/python tests/benchmarks/calibrations.py
+
+# The tables of docs/coverage.md, on the same pairs; about half an hour.
+coverage: $(VENV)/.has-mccnn
+	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/coverage.py
 
 # The pictures of README.md and docs; 256 colours keep them small.
 pictures: $(VENV)/.has-dsm,plot

@@ -1,8 +1,8 @@
 """Choose the levels of a calibration from intervals that were made at a ladder of levels (METHOD.md, section 16).
 
 Every pair is matched at each rung of the ladder, through the whole chain. So a coverage is known at the rungs, and
-linear between them. Confidence classes are `HIGH` and low; low-confidence pixels are measured once for each quantile
-of the regularisation, and once without it.
+interpolated between them. Confidence classes are `HIGH` and low. Low-confidence pixels are measured once for each
+quantile of the regularisation, and once without it.
 
 Letters of shapes: rungs (levels of the ladder), schemes (high, then low with each of QUANTILES), fields.
 """
@@ -170,24 +170,38 @@ def choose(pool: Pool, levels: np.ndarray, coverage: float) -> Choice:
 
 
 def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | None:
-    """Smallest level that reaches a coverage, linear between rungs; None if none does."""
+    """Smallest level that reaches a coverage, between rungs as in `at_level`; None if none does."""
     pixels = fields[0, COUNTS:].sum()
     if pixels == 0:
         return None
-    covered = np.maximum.accumulate(fields[:, INSIDE] / pixels)  # regularisation is not quite monotone
-    rung = int(np.searchsorted(covered, coverage - 1e-9))
-    if rung == levels.size:
+    missed = np.minimum.accumulate(1 - fields[:, INSIDE] / pixels)  # regularisation is not quite monotone
+    wanted = 1 - coverage + 1e-9
+    above = int(np.argmax(missed <= wanted))
+    if missed[above] > wanted:
         return None
-    if rung == 0:
+    if above == 0:
         return float(levels[0])
-    return float(np.interp(coverage, covered[rung - 1 : rung + 1], levels[rung - 1 : rung + 1]))
+    before, after = missed[above - 1 : above + 1]
+    share = (before - wanted) / (before - after)
+    if after > 0:
+        share = np.log(before / wanted) / np.log(before / after)
+    return float((1 - share) * levels[above - 1] + share * levels[above])
 
 
 def at_level(fields: np.ndarray, levels: np.ndarray, level: float) -> np.ndarray:
-    """Measurement at a level, linear between rungs: ``(rungs, fields)`` to ``(fields,)``."""
+    """Measurement at a level: ``(rungs, fields)`` to ``(fields,)``.
+
+    Between rungs, misses fall geometrically, since they fall nearly exponentially with the level; the rest is linear.
+    """
     above = int(np.clip(np.searchsorted(levels, level), 1, levels.size - 1))
     share = (level - levels[above - 1]) / (levels[above] - levels[above - 1])
-    return np.asarray((1 - share) * fields[above - 1] + share * fields[above])
+    found = (1 - share) * fields[above - 1] + share * fields[above]
+    pixels = fields[0, COUNTS:].sum()
+    one, other = (np.array([pixels - rung[INSIDE], rung[MISSED]]) for rung in fields[above - 1 : above + 1])
+    falls = (one > 0) & (other > 0)
+    missing = np.where(falls, one ** (1 - share) * other**share, (1 - share) * one + share * other)
+    found[INSIDE], found[MISSED] = pixels - missing[0], missing[1]
+    return np.asarray(found)
 
 
 def interval_score(fields: np.ndarray, coverage: float) -> float:
