@@ -3,8 +3,6 @@
 Letters: r row, c column, k disparity index, s and t segments (runs of low-confidence pixels in a row).
 """
 
-import math
-
 import numpy as np
 from numba import njit
 
@@ -14,20 +12,19 @@ from sat_intervals.products import IMPOSSIBLE_COST
 
 
 @njit(nogil=True, forceinline=True)
-def alpha_cut(curve, limit, first, last):
+def alpha_cut(curve, limit):
     """First and last index whose cost is at most ``limit = lowest + floor((1 - alpha) * span)`` (paper eq. 5 to 7).
 
     ``curve`` is padded to whole vectors with costs above every limit; at least one cost is at most ``limit``.
-    ``first`` and ``last`` are known bounds of the indices: those of a larger limit, or the ends of the curve.
     Vectors take 19 ns for 64 disparities and 38 ns for 128, single costs 70 and 129 ns.
     """
-    first -= first % LANES
-    last -= last % LANES
+    first = 0
     cut = lanes_at_most(load(curve, first), limit)
     while cut == 0:
         first += LANES
         cut = lanes_at_most(load(curve, first), limit)
     first += first_lane(cut)
+    last = curve.size - LANES
     cut = lanes_at_most(load(curve, last), limit)
     while cut == 0:
         last -= LANES
@@ -36,16 +33,24 @@ def alpha_cut(curve, limit, first, last):
     return first, last
 
 
+@njit(nogil=True, forceinline=True)
+def _ceil(value):
+    """Round up a number that is not negative."""
+    whole = np.int64(value)
+    return whole + (whole < value)
+
+
 @njit(nogil=True, forceinline=True, error_model="numpy")
-def _crossing(curve, inside, outside, count, limit, steps):
+def _crossing(curve, inside, outside, limit, settings):
     """Steps from index ``inside`` to where the linear curve crosses ``limit`` before ``outside``, rounded up.
 
-    0 at the end of the range and beside an impossible candidate. ``curve[outside]`` is above ``limit``.
+    0 at the end of the range and beside an impossible candidate. ``curve[outside]`` is above ``limit``. Both cuts of a
+    pixel take 26 ns more than `alpha_cut` with these selections, 110 ns with branches, which are hard to predict.
     """
-    if not 0 <= outside < count or curve[outside] == IMPOSSIBLE_COST:
-        return 0
-    rise = np.int64(curve[outside]) - np.int64(curve[inside])
-    return np.int64(math.ceil(steps * (limit - curve[inside]) / rise))
+    near = min(max(outside, 0), settings.count - 1)
+    here, there = np.int64(curve[inside]), np.int64(curve[near])
+    steps = _ceil(settings.steps * (limit - here) / max(there - here, 1))
+    return steps * ((near == outside) & (there != IMPOSSIBLE_COST))
 
 
 @njit(nogil=True, forceinline=True)
@@ -55,38 +60,44 @@ def _limit(lowest, level):
 
 
 @njit(nogil=True, forceinline=True)
-def _subpixel_cut(curve, lowest, whole, level, disparity, settings):
-    """Ends of the cut at a level in steps above the first disparity, rounded outwards.
+def _whole_cuts(curve, one, other):
+    """First and last index of the cuts at two limits, in one pass over the curve: ``(first, last)`` of each.
 
-    ``whole`` has the first and last index of the cut, ``disparity`` the refined winner in pixels above the first one.
+    Every vector is visited, so that no branch depends on the curve: 9 ns for both, 40 ns by two calls of `alpha_cut`.
     """
-    first, last = whole
-    limit = lowest + level
-    lower = first * settings.steps - _crossing(curve, first, first - 1, settings.count, limit, settings.steps)
-    upper = last * settings.steps + _crossing(curve, last, last + 1, settings.count, limit, settings.steps)
-    return (
-        min(lower, np.int64(math.floor(disparity * settings.steps))),
-        max(upper, np.int64(math.ceil(disparity * settings.steps))),
-    )
+    first_1 = first_2 = curve.size
+    last_1 = last_2 = -1
+    for k in range(0, curve.size, LANES):
+        costs = load(curve, k)
+        inside_1, inside_2 = lanes_at_most(costs, one), lanes_at_most(costs, other)
+        first_1 = min(first_1, k + first_lane(inside_1) if inside_1 != 0 else curve.size)
+        first_2 = min(first_2, k + first_lane(inside_2) if inside_2 != 0 else curve.size)
+        last_1 = k + LANES - 1 - lanes_above_last(inside_1) if inside_1 != 0 else last_1
+        last_2 = k + LANES - 1 - lanes_above_last(inside_2) if inside_2 != 0 else last_2
+    return (first_1, last_1), (first_2, last_2)
+
+
+@njit(nogil=True, forceinline=True)
+def _subpixel_cut(curve, limit, cut, winner, settings):
+    """Bounds in steps where the curve crosses ``limit`` outside the whole cut, widened to hold ``winner``."""
+    first, last = cut
+    lower = first * settings.steps - _crossing(curve, first, first - 1, limit, settings)
+    upper = last * settings.steps + _crossing(curve, last, last + 1, limit, settings)
+    return min(lower, np.int64(winner)), max(upper, _ceil(winner))
 
 
 @njit(nogil=True, forceinline=True)
 def subpixel_cuts(curve, lowest, disparity, settings):
-    """Bounds at the level ``high``, and at ``low`` if it is not negative (METHOD.md, section 16), in steps.
+    """Bounds of the cuts at the levels ``high`` and ``low`` above ``lowest``, in steps (METHOD.md, section 16).
 
-    Both whole cuts take one pass from each end of the curve: the one of the smaller level begins where the other ends.
-    ``disparity`` is the refined winner, ``k + shift``. Returns ``(lower, upper)`` of both.
+    They are rounded outwards and hold ``disparity``, the refined winner ``k + shift``. Returns ``(lower, upper)`` of
+    both levels, without meaning for a level that is off.
     """
-    high, low = settings.high, settings.low
-    outer = alpha_cut(curve, _limit(lowest, max(high, low)), 0, curve.size - 1)
-    if low < 0:
-        one = _subpixel_cut(curve, lowest, outer, high, disparity, settings)
-        return one, one
-    inner = alpha_cut(curve, _limit(lowest, min(high, low)), outer[0], outer[1])
-    first, second = (outer, inner) if high >= low else (inner, outer)
+    high, low = _whole_cuts(curve, _limit(lowest, settings.high), _limit(lowest, max(settings.low, 0.0)))
+    winner = disparity * settings.steps
     return (
-        _subpixel_cut(curve, lowest, first, high, disparity, settings),
-        _subpixel_cut(curve, lowest, second, low, disparity, settings),
+        _subpixel_cut(curve, lowest + settings.high, high, winner, settings),
+        _subpixel_cut(curve, lowest + settings.low, low, winner, settings),
     )
 
 

@@ -76,7 +76,7 @@ def _winner(curve, lowest):
 @njit(nogil=True, forceinline=True)
 def _interval(curve, lowest, count, cut_level, refine):
     """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
-    first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)), 0, curve.size - 1)
+    first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
     first -= refine & (first > 0) & (curve[first] == lowest)
     last += refine & (last < count - 1) & (curve[last] == lowest)
     return first, last
@@ -135,7 +135,7 @@ def search_flags(costs, r, c, count, possible):
 def read_curve(curve, lowest, settings):
     """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
 
-    Bounds are disparities, or steps with sub-pixel cuts; without a second level those of the first.
+    Bounds are disparities, or steps with sub-pixel cuts; NO_DISPARITY for a level that is off.
     """
     k = _winner(curve, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
