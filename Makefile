@@ -47,7 +47,7 @@ calibration: $(VENV)/.has-mccnn
 
 # The tables of docs/coverage.md, on the same pairs; about half an hour.
 coverage: $(VENV)/.has-mccnn
-	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/coverage.py
+	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/coverage_tables.py
 
 # The pictures of README.md and docs; 256 colours keep them small.
 pictures: $(VENV)/.has-dsm,plot
