@@ -197,7 +197,8 @@ def at_level(fields: np.ndarray, levels: np.ndarray, level: float) -> np.ndarray
     share = (level - levels[above - 1]) / (levels[above] - levels[above - 1])
     found = (1 - share) * fields[above - 1] + share * fields[above]
     pixels = fields[0, COUNTS:].sum()
-    one, other = (np.array([pixels - rung[INSIDE], rung[MISSED]]) for rung in fields[above - 1 : above + 1])
+    misses = np.stack([pixels - fields[above - 1 : above + 1, INSIDE], fields[above - 1 : above + 1, MISSED]], axis=1)
+    one, other = np.maximum(misses, 0)  # sums of weights are not exact
     falls = (one > 0) & (other > 0)
     missing = np.where(falls, one ** (1 - share) * other**share, (1 - share) * one + share * other)
     found[INSIDE], found[MISSED] = pixels - missing[0], missing[1]

@@ -217,6 +217,7 @@ def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) ->
     job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name)
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin()
+    stack.callback(job.store.remove)
     return job
 
 

@@ -13,8 +13,8 @@ from sat_intervals.config import load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import write_layer
-from sat_intervals.run.calibrate import Subject
-from sat_intervals.run.tune import Tuned, best_of, candidates, settings_of
+from sat_intervals.run import tune
+from sat_intervals.run.tune import Tuned, best_of, candidates
 
 
 @pytest.fixture(scope="module")
@@ -163,26 +163,26 @@ def test_candidates__are_presets_and_a_ladder_of_different_settings():
     assert not any("mccnn" in name for name, _ in candidates(with_network=False))
 
 
-def tuned(name, good, score, scene=None):
-    subjects, calibration = (), None
-    if scene:
-        config = load_config({"disparity": {"minimum": 0, "maximum": 9}})
-        subjects = [Subject("one", "one", None, None, None, config)]
-        calibration = yaml.safe_load((scene / "calibration.yaml").read_text())
-    return Tuned(name, subjects, 0.9, good, {"score": score}, calibration)
-
-
 def test_best_of__has_the_best_score_of_those_with_many_good_pixels():
-    found = [tuned("few", 0.5, 3.0), tuned("wide", 0.8, 9.0), tuned("best", 0.78, 5.0)]
+    found = [Tuned(name, (), 0.9, good, {"score": score}, None) for name, good, score in CANDIDATES]
     assert best_of(found).name == "best"
 
 
-def test_settings_of__match_takes_them(scene, tmp_path):
-    best = tuned("best", 0.8, 5.0, scene)
-    content = settings_of(best)
-    (tmp_path / "tuned.yaml").write_text(yaml.safe_dump(content))
+CANDIDATES = ("few", 0.5, 3.0), ("wide", 0.8, 9.0), ("best", 0.78, 5.0)
+
+
+def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
+    changes = {"sgm": {"p2": 64}}
+    monkeypatch.setattr(tune, "candidates", lambda with_network: [("stronger", changes)])
+    result = invoke("calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml")
+    assert result.exit_code == 0, result.output
+    line = next(line for line in result.output.splitlines() if line.startswith("stronger *"))
+    kept, good, coverage = map(float, line.split()[2:5])
+    assert 0.5 < good < kept < 1
+    assert 0.8 < coverage < 0.96
     arguments = scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -8, 8
     result = invoke("match", *arguments, "--config", tmp_path / "tuned.yaml", "--quiet")
     assert result.exit_code == 0, result.output
-    settings = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
-    assert settings["interval"]["coverage"] == 0.9
+    used = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
+    assert (used["sgm"]["p2"], used["interval"]["coverage"]) == (64, 0.9)
+    assert used["interval"]["calibration"]["name"] == "stronger"
