@@ -11,14 +11,15 @@ from helpers import matched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.config import load_config
+from sat_intervals.config import key_of, load_config
+from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Settings, match_costs
 from sat_intervals.match.in_memory import match_arrays
 from sat_intervals.match.patch import match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
-from sat_intervals.products import IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
+from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import View, Window
 
 bounded = settings(max_examples=60, derandomize=True, deadline=None)
@@ -132,6 +133,52 @@ def test_match_costs__interval_holds_the_disparity(scene, refine, alpha):
     assert (raw.upper[~found] == N).all()
     assert (raw.lower[found] >= scene.minimum).all()
     assert (raw.upper[found] <= scene.minimum + scene.count - 1).all()
+
+
+# ---- Sub-pixel cuts ----------------------------------------------------------------------------------------
+def test_match_costs__subpixel_cut_worked_example():
+    # Level 2.5, steps of 1/64 above the first disparity.
+    #     9 3 5 9    limit 5.5: down from 1 by 2.5 / 6, up from 2 by 0.5 / 4: 64 - ceil(26.67) = 37, 128 + 8
+    #     4 4 4 7    limit 6.5: from the end of the range; up from 2 by 2.5 / 3: 128 + ceil(53.33) = 182
+    #     . 2 6 4    limit 4.5: beside the impossible candidate, and at the end of the range: 64, 192
+    raw = of_curves(CURVES, -2, refine=False, cuts=(2.5, 0.0), steps=64)
+    assert raw.lower.tolist() == [[37], [0], [64]]
+    assert raw.upper.tolist() == [[136], [182], [192]]
+    assert raw.lower.dtype == np.uint16
+    # Level 0 is the winner, ties included; with refinement the V-fit (1 + 1 / 3, 0.5, unrefined) is inside.
+    assert raw.lower_low.tolist() == [[64], [0], [64]]
+    assert raw.upper_low.tolist() == [[64], [128], [64]]
+    refined = of_curves(CURVES, -2, cuts=(2.5, 0.0), steps=64)
+    assert refined.upper_low.tolist() == [[86], [128], [64]]
+
+
+LEVELS = st.integers(0, 1200).map(lambda quarters: reference.Fraction(quarters, 4))
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@bounded
+@given(scene=reference.scenes(), levels=st.tuples(LEVELS, LEVELS), steps=st.sampled_from([64, 4]))
+def test_match_costs__subpixel_cuts_equal_reference(refine, scene, levels, steps):
+    raw = matched(scene, refine=refine, cuts=levels, steps=steps)[0]
+    found = raw.winner != N
+    for level, bounds in zip(levels, ((raw.lower, raw.upper), (raw.lower_low, raw.upper_low)), strict=True):
+        expected = reference.subpixel_cut(reference.volume_of(scene), level, steps, refine)
+        for bound, of_reference in zip(bounds, expected, strict=True):
+            np.testing.assert_array_equal(bound[found], of_reference[found])
+
+
+@few
+@given(scene=reference.scenes(), levels=st.tuples(LEVELS, LEVELS))
+def test_match_costs__a_higher_level_never_narrows_and_the_disparity_is_inside(scene, levels):
+    low, high = sorted(levels)
+    raw = matched(scene, cuts=(high, low), steps=64)[0]
+    found = raw.winner != N
+    for narrow, wide in ((raw.lower_low, raw.lower), (raw.upper, raw.upper_low)):
+        assert (wide[found] <= narrow[found]).all()
+    disparity = (raw.disparity[found] - scene.minimum) * np.float64(64)
+    assert (raw.lower_low[found] <= disparity + 1e-3).all()  # the disparity is rounded to float32
+    assert (raw.upper_low[found] >= disparity - 1e-3).all()
+    assert (raw.upper[found] <= 64 * (scene.count - 1)).all()
 
 
 @few
@@ -296,7 +343,7 @@ def configs(draw):
         "method": draw(st.sampled_from(["fast", "accurate"])),
         "tolerance": draw(st.integers(0, 2)),
     }
-    return load_config(
+    config = load_config(
         {
             "disparity": {"minimum": minimum, "maximum": minimum + draw(st.integers(0, 9))},
             "cost": {"window": draw(st.sampled_from([3, 5]))},
@@ -310,6 +357,18 @@ def configs(draw):
             "products": {"keep_rejected": draw(st.booleans())},
         }
     )
+    return load_config(config, {"interval": draw(subpixel(config))} if interval and draw(st.booleans()) else {})
+
+
+@st.composite
+def subpixel(draw, config):
+    """Sub-pixel bounds for settings: with alpha, or with a coverage and some levels."""
+    if draw(st.booleans()):
+        return {"alpha": float(config.interval.alpha), "bounds": "subpixel"}
+    row = {"high": draw(st.integers(0, 99)) / 4, "low": draw(st.integers(0, 199)) / 4}
+    row |= {"quantile": draw(st.sampled_from([0.9, 0.6, None]))}
+    levels = [{"coverage": coverage} | row for coverage in COVERAGES]
+    return {"coverage": 0.9, "calibration": {"name": "drawn", "key": key_of(config), "levels": levels}}
 
 
 def image_pair(seed, disparity, holes=0):
@@ -340,13 +399,17 @@ def view(image, state, window):
     return View(window, np.pad(image, margin)[there], np.pad(state, margin, constant_values=NO_DATA)[there])
 
 
-def check(bands, validity, expected):
-    """Compare the bands disparity, lower, upper, confidence, and validity, with the reference's."""
+def check(bands, validity, expected, config):
+    """Compare the bands disparity, lower, upper, confidence, and validity, with the reference's.
+
+    A quantile close to a multiple of 1/64 px may be rounded outwards to the next one.
+    """
+    step = 1e-6 if config.bound_steps == 0 else 1 / BOUND_STEPS
     disparity, lower, upper, confidence = bands
     np.testing.assert_array_equal(validity, expected.validity)
     np.testing.assert_array_equal(disparity, expected.disparity)
-    np.testing.assert_allclose(lower, expected.lower, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(upper, expected.upper, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(lower, expected.lower, rtol=1e-6, atol=step)
+    np.testing.assert_allclose(upper, expected.upper, rtol=1e-6, atol=step)
     np.testing.assert_allclose(confidence, expected.confidence, rtol=1e-6, atol=1e-6)
 
 
@@ -365,7 +428,7 @@ def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
         scale = confidence_scale(config.ambiguity, histogram)
     final = postprocess_rows(rows, 0, whole.height, scale, config)
     expected = reference.match_arrays(left, right, left_state, right_state, config)
-    check(final[:4], final.validity, expected)
+    check(final[:4], final.validity, expected, config)
 
 
 @some
@@ -377,7 +440,7 @@ def test_match_arrays__equals_reference(seed, config, holes):
     found = match_arrays(left, right, config)
     expected = reference.match_arrays(left, right, left_state * 0, right_state * 0, config)
     bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
-    check(bands, found["validity"].values, expected)
+    check(bands, found["validity"].values, expected, config)
     hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
     shown = (found["validity"].values & hidden) == 0
     disparity, lower, upper, _ = bands
@@ -401,7 +464,7 @@ def test_match_arrays__equals_reference_where_texture_ends(seed, config, holes, 
     found = match_arrays(left, right, config)
     expected = reference.match_arrays(left, right, left_state * 0, right_state * 0, config)
     bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
-    check(bands, found["validity"].values, expected)
+    check(bands, found["validity"].values, expected, config)
 
 
 @pytest.mark.parametrize("more", [{}, {"sgm": None}, {"cross_check": {"method": "accurate"}}])
@@ -424,4 +487,4 @@ def test_match_arrays__of_nothing_is_nothing():
     expected = reference.match_arrays(empty, empty, state, state, config)
     assert np.isnan(expected.confidence).all()
     bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
-    check(bands, found["validity"].values, expected)
+    check(bands, found["validity"].values, expected, config)
