@@ -75,6 +75,8 @@ def calibrate(
     The table shows what to expect: figures of each pair with the levels found on the others, means over pairs. A single
     pair is judged in 16 blocks.
     """
+    if "interval" in given:
+        raise click.UsageError("--coverage and --calibration are options of match: leave them out.")
     from sat_intervals.cli.console import Console
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.calibrate import calibration_from, check_subjects, measure_subjects

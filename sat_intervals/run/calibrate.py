@@ -241,7 +241,8 @@ def calibration_from(
     levels, pool, rows, expected, notes = ladder(config), pooled(parts), [], [], []
     for coverage, groups in zip(COVERAGES, left_out(parts, levels, COVERAGES), strict=True):
         choice = choose(pool, levels, coverage)
-        rows.append({"coverage": coverage, "high": choice.high, "low": choice.low, "quantile": choice.quantile})
+        levels_of = {"high": round(choice.high, 4), "low": round(choice.low, 4), "quantile": choice.quantile}
+        rows.append({"coverage": coverage, **levels_of})
         notes += [f"coverage {coverage:g}: {note}" for note in choice.notes]
         expected.append({"coverage": coverage, **means(groups.values())})
     provenance = {
