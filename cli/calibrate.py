@@ -12,13 +12,10 @@ from sat_intervals.cli.pairs import finite
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
-    from sat_intervals.config import Calibration
     from sat_intervals.config.pairs import Pair
     from sat_intervals.run.calibrate import Subject
 
 _FILE = click.Path(path_type=Path)
-_FIGURES = ("all", "high", "low", "lowest", "mean_width", "median_width", "score")
-_HEADER = ("all", "high", "low", "lowest", "mean width", "median width", "score")
 _CALIBRATION = """\
 # Calibration: levels of the cost curve that reach a coverage, found by sat-intervals calibrate.
 # Use it with: sat-intervals match LEFT RIGHT OUT --coverage 0.9 --calibration FILE, with the settings of `key`.
@@ -78,6 +75,7 @@ def calibrate(
     if "interval" in given:
         raise click.UsageError("--coverage and --calibration are options of match: leave them out.")
     from sat_intervals.cli.console import Console
+    from sat_intervals.cli.tables import show_calibration
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.calibrate import calibration_from, check_subjects, measure_subjects
 
@@ -95,7 +93,7 @@ def calibrate(
     calibration, expected = calibration_from(parts, subjects, name or output.stem)
     _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
     if not quiet:
-        _show(calibration, expected)
+        show_calibration(calibration, expected)
         click.echo(str(output))
 
 
@@ -191,24 +189,9 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
 
 
-def _show(calibration: "Calibration", expected: list[dict[str, Any]]) -> None:
-    """Print what to expect of a calibration, and its levels."""
-    from sat_intervals.cli.tables import figure, show
-
-    rows = []
-    for row, levels in zip(expected, calibration.levels, strict=True):
-        quantile = "none" if levels.quantile is None else f"{levels.quantile:g}"
-        figures = [figure(row.get(name)) for name in _FIGURES]
-        rows.append([f"{levels.coverage:g}", *figures, f"{levels.high:.1f}", f"{levels.low:.1f}", quantile])
-    header = ["coverage", *_HEADER, "level high", "level low", "quantile"]
-    show(header, rows, "expected: coverage, widths and score (px) of pairs left out, and levels")
-    for note in calibration.provenance["notes"]:
-        click.echo(note)
-
-
 def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Console") -> None:
     """Compare settings, print their figures, and write the best."""
-    from sat_intervals.cli.tables import figure, show
+    from sat_intervals.cli.tables import show_tuned
     from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
@@ -218,11 +201,6 @@ def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Conso
         console.say(f"calibrating {name}")
         found.append(tuned(name, changes, subjects, folder, console.progress))
     best = best_of(found)
-    rows = [
-        [one.name + (" *" if one is best else ""), figure(one.kept), figure(one.good)]
-        + [figure(one.figures.get(key)) for key in _FIGURES]
-        for one in found
-    ]
-    show(["settings", "kept", "good", *_HEADER], rows, "coverage 0.9, pairs left out; * the best, which is written")
+    show_tuned(found, best)
     _write(output, _SETTINGS, settings_of(best))
     console.say(str(output))

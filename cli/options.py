@@ -67,6 +67,7 @@ _IMAGE_OPTIONS = (
 # Their parameters without the window.
 _OF_IMAGES = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
 _OF_IMAGES += ("left_mask", "right_mask")
+_OF_SETTINGS = ("preset", "cost", "coverage", "calibration", "tile_size", "overlap", "workers", "cluster", "store")
 _SETTINGS_OPTIONS = (
     click.option(
         "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
@@ -128,29 +129,19 @@ def settings_options(command: Command) -> Command:
     """Add options for settings; the command gets ``config_file`` and ``given``, the sections of the command line."""
 
     @wraps(command)
-    def with_settings(
-        *,
-        preset: str | None,
-        cost: str | None,
-        coverage: float | None,
-        calibration: str | None,
-        tile_size: int | None,
-        overlap: int | None,
-        workers: int | None,
-        cluster: str | None,
-        store: str | None,
-        **others: Any,
-    ) -> Any:
+    def with_settings(**others: Any) -> Any:
+        of = {name: others.pop(name) for name in _OF_SETTINGS}
+        cluster, preset = of["cluster"], of["preset"]
         is_address = cluster is not None and "://" in cluster
         sections: dict[str, dict[str, Any]] = {
-            "cost": {"method": cost},
-            "interval": {"coverage": coverage, "calibration": calibration},
-            "tiles": {"size": tile_size, "overlap": overlap},
+            "cost": {"method": of["cost"]},
+            "interval": {"coverage": of["coverage"], "calibration": of["calibration"]},
+            "tiles": {"size": of["tile_size"], "overlap": of["overlap"]},
             "cluster": {
-                "workers": workers,
+                "workers": of["workers"],
                 "kind": "address" if is_address else cluster,
                 "address": cluster if is_address else None,
-                "store": store,
+                "store": of["store"],
             },
         }
         set_keys = {

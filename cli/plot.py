@@ -16,6 +16,9 @@ _FILE = click.Path(path_type=Path)
 @click.option("--row", type=int, metavar="R", help="Draw the profile of this row.")
 @click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
 @click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
+@click.option(
+    "--beside", type=_FILE, multiple=True, metavar="OUT", help="Run of the same pair at another coverage, to draw too."
+)
 @click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots per inch.")
 @log_options
 def plot(
@@ -24,6 +27,7 @@ def plot(
     row: int | None,
     columns: tuple[int, int] | None,
     pixel: tuple[int, int] | None,
+    beside: tuple[Path, ...],
     dpi: int,
 ) -> None:
     """Draw pictures of the finished run in the folder OUT and write them there.
@@ -31,6 +35,7 @@ def plot(
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
+    OUT/coverage.png   likewise: nominal and measured coverage, width; --beside adds runs at other coverages
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
     OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence
@@ -39,8 +44,10 @@ def plot(
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
+    from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.marks import check_made_here
@@ -53,11 +60,16 @@ def plot(
         results.check_part(row, columns)
     if pixel is not None:
         results.check_pixel(*pixel)
-    pictures = [out / f"{name}.png" for name in ("overview", "errors", "profile", "curve", "dsm")]
+    pictures = [out / f"{name}.png" for name in ("overview", "errors", "coverage", "profile", "curve", "dsm")]
     results.check_kept(pictures, [truth, out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
     if results.truth is not None and results.config.interval is not None:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)
+        reports = [evaluate_run(folder, truth) for folder in (out, *beside)]
+        title = f"{out.name}: intervals and truth"
+        drawings["coverage"] = lambda path: draw_coverage(reports, path, title, dpi)
+    elif beside:
+        raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
     if row is not None:
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
     if pixel is not None:

@@ -29,6 +29,8 @@ class Criteria:
         Distance in pixels up to which a truth outside an interval counts as inside.
     bias
         Pixels added to the truth before any comparison.
+    nominal
+        Coverage that the intervals are to reach: that of the settings, or alpha. None: unknown, no interval scores.
     """
 
     minimum: int
@@ -38,6 +40,7 @@ class Criteria:
     depth: int
     tolerance: float = 0.0
     bias: float = 0.0
+    nominal: float | None = None
 
 
 class Evaluated(NamedTuple):
@@ -59,17 +62,23 @@ class Evaluated(NamedTuple):
 
 
 class _Intervals:
-    """Accuracy and size of the intervals of a group of pixels (paper eq. 14 and 15)."""
+    """Accuracy and size of the intervals of a group of pixels (paper eq. 14 and 15), and their score.
 
-    def __init__(self, search: int) -> None:
+    The interval score (Gneiting and Raftery 2007) is ``width + 2 / (1 - nominal) * distance of a missed truth``.
+    """
+
+    def __init__(self, search: int, nominal: float | None) -> None:
         self._search = search
+        self._of_misses = None if nominal is None or nominal >= 1 else 2 / (1 - nominal)
         self._count = self._inside = 0
-        self._width = 0.0
+        self._width = self._missed = 0.0
         self._widths = Histogram(0, search, _WIDTH)
 
-    def add(self, inside: np.ndarray, width: np.ndarray) -> None:
-        self._count += inside.size
-        self._inside += int(inside.sum())
+    def add(self, missed: np.ndarray, width: np.ndarray) -> None:
+        """Add pixels, with the distance of a missed truth from the interval; 0 if it is inside."""
+        self._count += missed.size
+        self._inside += int((missed == 0).sum())
+        self._missed += float(missed.sum())
         self._width += float(width.sum())
         self._widths.add(width)
 
@@ -80,6 +89,10 @@ class _Intervals:
             "accuracy": _share(self._inside, self._count),
             "relative_size": None if median is None else median / max(self._search, 1),
             "mean_width": _share(self._width, self._count),
+            "median_width": median,
+            "interval_score": None
+            if self._of_misses is None
+            else _share(self._width + self._of_misses * self._missed, self._count),
         }
 
 
@@ -118,7 +131,9 @@ class Metrics:
 
     def __init__(self, criteria: Criteria) -> None:
         self._criteria = criteria
-        self._areas = {name: _Intervals(criteria.maximum - criteria.minimum) for name in ("all", "high", "low")}
+        self._areas = {
+            name: _Intervals(criteria.maximum - criteria.minimum, criteria.nominal) for name in ("all", "high", "low")
+        }
         self._ratios = Histogram(0, _LARGEST_RATIO, _RATIO)
         self._deciles = _Deciles()
         self._wrong = {"bad1": 0, "bad3": 0, "truth_outside_range": 0}
@@ -128,9 +143,11 @@ class Metrics:
         disparity, lower, upper, confidence, _, truth, _ = pixels.bands
         low, criteria = pixels.low, self._criteria
         inside = (lower - criteria.tolerance <= truth) & (truth <= upper + criteria.tolerance)
+        outside = np.maximum(lower - criteria.tolerance - truth, truth - upper - criteria.tolerance)
+        missed = np.where(inside, 0.0, outside)
         width = upper - lower
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
-            self._areas[name].add(inside[chosen], width[chosen])
+            self._areas[name].add(missed[chosen], width[chosen])
         wide = low & (width > 0)
         self._ratios.add(pixels.area_error[wide] / width[wide])
         self._deciles.add(confidence, inside, width)

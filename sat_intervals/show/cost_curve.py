@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_subpixel_cut, read_winners
 from sat_intervals.kernels.matching import Settings, cost_volume
@@ -88,7 +87,7 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
         disparities=np.arange(settings.minimum, settings.minimum + settings.count),
         costs=costs,
         possibilities=np.maximum(1 - above / config.cost_span, 0),
-        level=None if largest is None else _possibility(largest, config),
+        level=None if largest is None else _possibility(largest, results),
         cut=above <= (-1 if largest is None else largest),
         disparity=float(disparity[0, 0]),
         lower=None if bounds is None else bounds[0],
@@ -111,10 +110,10 @@ def _bounds(curve: np.ndarray, largest: float, disparity: float, settings: Setti
     return int(lower[0, 0]), int(upper[0, 0])
 
 
-def _possibility(largest: float, config: Config) -> float:
+def _possibility(largest: float, results: Results) -> float:
     """Return the possibility at which a curve is cut: alpha, or that of a calibrated level."""
-    interval = config.interval
-    return float(interval.alpha) if interval and interval.alpha else max(0.0, 1 - largest / config.cost_span)
+    interval = results.config.interval
+    return float(interval.alpha) if interval and interval.alpha else max(0.0, 1 - largest / results.config.cost_span)
 
 
 def _explain(results: Results, row: int, column: int) -> str:

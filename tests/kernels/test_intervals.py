@@ -7,12 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import reference
-from helpers import matched
+from helpers import calibration, matched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.config import key_of, load_config
-from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.config import load_config
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Settings, match_costs
@@ -365,10 +364,8 @@ def subpixel(draw, config):
     """Sub-pixel bounds for settings: with alpha, or with a coverage and some levels."""
     if draw(st.booleans()):
         return {"alpha": float(config.interval.alpha), "bounds": "subpixel"}
-    row = {"high": draw(st.integers(0, 99)) / 4, "low": draw(st.integers(0, 199)) / 4}
-    row |= {"quantile": draw(st.sampled_from([0.9, 0.6, None]))}
-    levels = [{"coverage": coverage} | row for coverage in COVERAGES]
-    return {"coverage": 0.9, "calibration": {"name": "drawn", "key": key_of(config), "levels": levels}}
+    levels = draw(st.integers(0, 99)) / 4, draw(st.integers(0, 199)) / 4
+    return {"coverage": 0.9, "calibration": calibration(config, *levels, draw(st.sampled_from([0.9, 0.6, None])))}
 
 
 def image_pair(seed, disparity, holes=0):
