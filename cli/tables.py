@@ -8,11 +8,11 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up
+
 if TYPE_CHECKING:
     from sat_intervals.config import Calibration
     from sat_intervals.run.tune import Tuned
-
-from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up
 
 _EXPECTED = ("all", "high", "low", "lowest", "mean width", "median width", "score")
 
