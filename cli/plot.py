@@ -8,6 +8,7 @@ import click
 from sat_intervals.cli.options import log_options
 
 _FILE = click.Path(path_type=Path)
+_PICTURES = ("overview", "errors", "coverage", "profile", "curve", "dsm")
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
@@ -44,8 +45,6 @@ def plot(
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
@@ -53,33 +52,38 @@ def plot(
     from sat_intervals.show.marks import check_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
 
+    results = open_results(out, truth)
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
-    results = open_results(out, truth)
-    if row is not None:
-        results.check_part(row, columns)
-    if pixel is not None:
-        results.check_pixel(*pixel)
-    pictures = [out / f"{name}.png" for name in ("overview", "errors", "coverage", "profile", "curve", "dsm")]
-    results.check_kept(pictures, [truth, out / "dsm.tif"])
-    drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
-    if results.truth is not None and results.config.interval is not None:
-        drawings["errors"] = lambda path: draw_errors(results, path, dpi)
-        reports = [evaluate_run(folder, truth) for folder in (out, *beside)]
-        title = f"{out.name}: intervals and truth"
-        drawings["coverage"] = lambda path: draw_coverage(reports, path, title, dpi)
-    elif beside:
+    is_judged = None not in (results.truth, results.config.interval)
+    if beside and not is_judged:
         raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
     if row is not None:
+        results.check_part(row, columns)
+    if pixel:
+        results.check_pixel(*pixel)
+    results.check_kept([out / f"{name}.png" for name in _PICTURES], [truth, out / "dsm.tif"])
+    drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
+    if is_judged:
+        drawings["errors"] = lambda path: draw_errors(results, path, dpi)
+        drawings["coverage"] = lambda path: draw_coverage([out, *beside], truth, path, dpi)
+    if row is not None:
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
-    if pixel is not None:
+    if pixel:
         drawings["curve"] = lambda path: draw_curve(results, path, *pixel, dpi)
-    surface = out / "dsm.tif"
-    if surface.exists() and results.report["finished"] not in read_tags(surface).get("RUNS", ""):
-        click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
-    elif surface.exists():
+    if _is_current(surface := out / "dsm.tif", results.report["finished"]):
         drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
     check_made_here(out / f"{name}.png" for name in drawings)
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
+
+
+def _is_current(surface: Path, finished: str) -> bool:
+    """Return whether there is a surface model of the run; say so if it belongs to another one."""
+    from sat_intervals.raster import read_tags
+
+    if not surface.exists() or finished in read_tags(surface).get("RUNS", ""):
+        return surface.exists()
+    click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
+    return False

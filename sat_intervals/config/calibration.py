@@ -191,7 +191,8 @@ def _difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """Return the first difference of two keys in words."""
     one, other = _flat(there), _flat(here)
     name = next(name for name in {**other, **one} if one.get(name) != other.get(name))
-    return f"{name} is {one.get(name)} there and {other.get(name)} here"
+    words = ["null" if key.get(name) is None else key[name] for key in (one, other)]
+    return f"{name} is {words[0]} there and {words[1]} here"
 
 
 def _flat(key: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,25 +1,24 @@
 """Draw how often intervals contain the truth, and how wide they are, from figures of `evaluate_run`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from matplotlib.axes import Axes
 
+from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.show.canvas import DPI, INK, page
 from sat_intervals.show.legend import BLUE, ORANGE
 
 _CLASSES = (("all", "valid pixels", "black"), ("high", "high confidence", BLUE), ("low", "low confidence", ORANGE))
 
 
-def draw_coverage(reports: Sequence[Mapping[str, Any]], path: Path, title: str, dpi: int = DPI) -> None:
+def draw_coverage(runs: Sequence[Path], truth: Path | None, path: Path, dpi: int = DPI) -> None:
     """Draw nominal against measured coverage, and mean width against measured coverage.
 
-    ``reports`` are figures of runs of one pair at several coverages, or of one run. Small dots are deciles of
-    confidence.
+    ``runs`` are folders of runs of one pair at several coverages, or one. Small dots are deciles of confidence.
     """
-    reports = sorted(reports, key=lambda report: float(report["nominal"]))
-    with page(path, (9.0, 4.2), dpi, title) as figure:
+    reports = sorted((evaluate_run(run, truth) for run in runs), key=lambda report: float(report["nominal"]))
+    with page(path, (9.0, 4.2), dpi, f"{', '.join(run.name for run in runs)}: intervals and truth") as figure:
         left, right = figure.subplots(1, 2)
         deciles = [(report["nominal"], decile) for report in reports for decile in report["deciles"]]
         _draw_line(

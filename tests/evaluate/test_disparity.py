@@ -388,7 +388,9 @@ def test_command__prints_the_form_of_json(run):
     report = json.loads(text)
     assert status == 0
     assert report == json.loads(json.dumps(evaluate_run(run)))
-    assert set(report["all"]) == set(report["high"]) == {"count", "accuracy", "relative_size", "mean_width"}
+    assert set(report["all"]) == set(report["high"]) == {
+        "count", "accuracy", "relative_size", "mean_width", "median_width", "interval_score"
+    }  # fmt: skip
     assert set(report["low"]) == {*report["all"], "relative_overestimation"}
     assert {"bad1", "bad3", "deciles", "with_rejected", "tolerance", "bias"} < set(report)
 
