@@ -1,4 +1,4 @@
-"""Choose the levels of a calibration from intervals that were made at a ladder of levels (METHOD.md, section 16).
+"""Choose the levels of a calibration from intervals that were made at a ladder of levels (docs/coverage.md).
 
 Every pair is matched at each rung of the ladder, through the whole chain. So a coverage is known at the rungs, and
 interpolated between them. Confidence classes are `HIGH` and low. Low-confidence pixels are measured once for each
