@@ -162,7 +162,8 @@ def choose(pool: Pool, levels: np.ndarray, coverage: float) -> Choice:
             found[quantile] = level, interval_score(fields, coverage), fields[WIDTH]
     if not found:
         notes.append("low confidence does not reach it at any level")
-        return Choice(high, float(levels[-1]), None, tuple(notes))
+        most = int(np.argmax(table[-1, HIGH + 1 :, INSIDE]))
+        return Choice(high, float(levels[-1]), QUANTILES[most], tuple(notes))
     best = min(score for _, score, _ in found.values())
     good = {quantile: width for quantile, (_, score, width) in found.items() if score <= _SAME_SCORE * best}
     quantile = min(good, key=lambda quantile: good[quantile])

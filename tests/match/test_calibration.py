@@ -103,6 +103,11 @@ def test_choose__says_what_no_level_reaches():
     choice = choose(pool, LEVELS, 0.9)
     assert choice.high == LEVELS[-1]
     assert choice.notes == ("high confidence does not reach it at any level",)
+    low = part([1] * 1000, [1e9] * 500 + [1] * 500)
+    low.table[:, 1 + QUANTILES.index(0.8), INSIDE] += 1
+    choice = choose(pooled([low]), LEVELS, 0.9)
+    assert (choice.low, choice.quantile) == (LEVELS[-1], 0.8)  # it comes nearest
+    assert choice.notes == ("low confidence does not reach it at any level",)
 
 
 def test_choose__the_narrowest_of_nearly_the_best_scores():
