@@ -67,6 +67,17 @@ _IMAGE_OPTIONS = (
 # Their parameters without the window.
 _OF_IMAGES = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
 _OF_IMAGES += ("left_mask", "right_mask")
+
+
+class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """``exact`` or a number of pixels."""
+
+    name = "exact|PIXELS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        return "exact" if value == "exact" else int(click.INT.convert(value, param, ctx))
+
+
 _OF_SETTINGS = ("preset", "cost", "coverage", "calibration", "tile_size", "overlap", "workers", "cluster", "store")
 _SETTINGS_OPTIONS = (
     click.option(
@@ -84,7 +95,9 @@ _SETTINGS_OPTIONS = (
         "--calibration", callback=named, metavar="FILE", help="Calibration for --coverage; default the built-in one."
     ),
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
-    click.option("--overlap", type=int, help="Pixels read around a core."),
+    click.option(
+        "--overlap", type=_Overlap(), help="exact (default): no result depends on the tiles; or pixels around a core."
+    ),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     click.option(
         "--cluster",

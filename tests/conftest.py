@@ -60,10 +60,11 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with left.tif, right.tif, settings.yaml for 7 x 8 tiles, and an undisturbed run of them."""
+    """A folder with left.tif, right.tif, settings.yaml for 7 x 8 tiles, and an undisturbed run of one tile."""
     folder = tmp_path_factory.mktemp("pair")
-    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64})
+    whole = settings | {"tiles": {"size": 512}}
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", whole)
     return folder
 
 

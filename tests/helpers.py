@@ -73,7 +73,7 @@ def matched(scene, output=None, core=None, **options):
     """Raw products and right view of a scene of `reference`, of the whole patch by default."""
     left, right = codes_of(scene)
     output = output or Window(0, 0, *left.state.shape)
-    return match_costs(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
+    return match_costs(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)[:2]
 
 
 def bands(out):

@@ -87,12 +87,7 @@ class Config(Section):
             )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
-        if self.tiles.overlap == "exact":
-            if self.cross_check and self.cross_check.method == "accurate":
-                raise ValueError(
-                    "tiles.overlap is exact, which cross_check.method accurate does not know: give a number"
-                )
-        elif self.tiles.overlap < smallest:
+        if self.tiles.overlap != "exact" and self.tiles.overlap < smallest:
             raise ValueError(
                 f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with {self._cost_in_words}"
             )
@@ -125,6 +120,11 @@ class Config(Section):
     def in_steps(self, value: Decimal | float | Fraction) -> int:
         """Round a cost in units of the settings to the nearest integer cost."""
         return floor(Fraction(value) * self.cost.steps + Fraction(1, 2))
+
+    @property
+    def matches_right_view(self) -> bool:
+        """Return whether the right view is matched with its own cost volume, for accurate cross-checking."""
+        return self.cross_check is not None and self.cross_check.method == "accurate"
 
     @property
     def hands_states_on(self) -> bool:

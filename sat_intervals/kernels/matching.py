@@ -135,6 +135,24 @@ class RightView(NamedTuple):
     winner: np.ndarray
 
 
+class Matched(NamedTuple):
+    """What `match_costs` returns.
+
+    Attributes
+    ----------
+    raw
+        Products of the wanted pixels.
+    right
+        Winners of the right pixels that face the core.
+    leaving
+        States of the last of WAVEFRONTS where it leaves the patch, as `trace` returns them; empty without borders.
+    """
+
+    raw: Raw
+    right: RightView
+    leaving: Ring
+
+
 class _Buffers(NamedTuple):
     """Inputs of both sweeps, and buffers for the current row, paths and curve.
 
@@ -148,6 +166,8 @@ class _Buffers(NamedTuple):
         Pixels whose paths are computed; those of the pixels around them come from ``rings``.
     rings
         Rings of the two waves of the sweep.
+    leaving
+        States that leave the pixels ``inside``, to fill; empty if nobody takes them over.
     """
 
     candidates: Candidates
@@ -157,6 +177,7 @@ class _Buffers(NamedTuple):
     curve: np.ndarray
     inside: Rectangle
     rings: tuple[Ring, ...]
+    leaving: Ring
 
 
 def _rectangle(window: Window) -> Rectangle:
@@ -164,9 +185,11 @@ def _rectangle(window: Window) -> Rectangle:
 
 
 def _prepare(
-    costs: Costs, gradients: Gradients | None, settings: Settings, inside: Window, rings: tuple[Ring, ...]
+    costs: Costs, gradients: Gradients | None, settings: Settings, borders: Borders | None, down: bool = True
 ) -> _Buffers:
     columns, size = costs.left_state.shape[1], padded_to_lanes(settings.count)
+    left = borders.inside if borders else Window(0, 0, 0, 0)
+    inside, rings = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
     beyond = np.zeros(size, np.uint16)
     beyond[settings.count :] = WALL
     slots = 1 + 3 * columns
@@ -177,7 +200,8 @@ def _prepare(
         Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
         np.zeros(size, np.uint16),
         _rectangle(inside),
-        rings,
+        rings[:2] if down else rings[2:],
+        Ring(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
     )
 
 
@@ -187,7 +211,7 @@ def _enter_row(buffers, gradients, settings, r, down):
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    (costs, barrier, _), possible, penalties, paths, _, inside, rings = buffers
+    (costs, barrier, _), possible, penalties, paths, _, inside, rings, _ = buffers
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
     usable = 0
@@ -213,9 +237,9 @@ def _columns(inside, r, down):
 
 
 @cached
-def _trace(buffers, gradients, settings, wave, down, target):
-    """Advance the paths of one wave through a patch and copy the states that leave it to ``target``, a `Ring`."""
-    candidates, possible, penalties, paths, _, inside, _ = buffers
+def _trace(buffers, gradients, settings, wave, down):
+    """Advance the paths of one wave through a patch and copy the states that leave it."""
+    candidates, possible, penalties, paths, _, inside, _, leaving = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
@@ -227,13 +251,13 @@ def _trace(buffers, gradients, settings, wave, down, target):
             else:
                 advance_wave(candidates, penalties, paths, slots, wave, r, c)
         if inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, wave, down, target)
+            hand_on(paths, inside, r, falling, rising, wave, down, leaving)
 
 
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, possible, penalties, paths, curve, inside, _ = buffers
+    candidates, possible, penalties, paths, curve, inside, _, _ = buffers
     for r in range(output.row_stop):
         falling, rising = _enter_row(buffers, gradients, settings, r, True)
         for c in _columns(inside, r, True):
@@ -249,8 +273,8 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
-    """Finish and read the curves of the pixels of ``output``, and update the right view."""
-    candidates, possible, penalties, paths, curve, inside, _ = buffers
+    """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
+    candidates, possible, penalties, paths, curve, inside, _, leaving = buffers
     winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
@@ -286,13 +310,14 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
                 update_right(curve, right, r, c)
             if keep:
                 volume[i, j] = curve
+        if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
+            hand_on(paths, inside, r, falling, rising, 1, False, leaving)
 
 
 def _sweep(costs, gradients, settings, output, core, keep, borders):
-    """Run both sweeps; return the raw products, the right view and the volume (finished curves only with ``keep``)."""
+    """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    borders = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
-    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2])
+    buffers = _prepare(costs, gradients, settings, borders)
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
@@ -313,15 +338,14 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         _sweep_down(buffers, gradients, settings, wanted, volume)
-        for state in buffers.paths:
-            state[:] = 0
-    _sweep_up(buffers._replace(rings=borders.rings[2:]), gradients, settings, wanted, volume, raw, right, keep)
+        buffers = _prepare(costs, gradients, settings, borders, down=False)
+    _sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
     if settings.steps:  # the sweep only carries them as int16: compiled once for both kinds
         raw = raw._replace(**{name: getattr(raw, name).view(np.uint16) for name in BOUNDS})
-    return raw, RightView(cost, winner), volume
+    return Matched(raw, RightView(cost, winner), buffers.leaving), volume
 
 
 def trace(
@@ -333,11 +357,9 @@ def trace(
     Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]
-    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2] if down else borders.rings[2:])
-    inside, size = borders.inside, buffers.curve.size
-    target = Ring(np.empty((inside.height, 2, size), np.uint16), np.empty((inside.width, 2, size), np.uint16))
-    _trace(buffers, gradients, settings, wave, down, target)
-    return target
+    buffers = _prepare(costs, gradients, settings, borders, down)
+    _trace(buffers, gradients, settings, wave, down)
+    return buffers.leaving
 
 
 def match_costs(
@@ -347,7 +369,7 @@ def match_costs(
     core: Window | None = None,
     gradients: Gradients | None = None,
     borders: Borders | None = None,
-) -> tuple[Raw, RightView]:
+) -> Matched:
     """Match a patch: matching costs in, raw products and the right view's winners out.
 
     Parameters
@@ -367,13 +389,9 @@ def match_costs(
 
     Returns
     -------
-    Raw
-        Of the shape of ``output``.
-    RightView
-        Of ``core.height`` rows and ``core.width + count - 1`` columns.
+    ``raw`` of the shape of ``output``, ``right`` of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False, borders)
-    return raw, right_view
+    return _sweep(costs, gradients, settings, output, core or output, False, borders)[0]
 
 
 def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = None) -> np.ndarray:
@@ -382,4 +400,4 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True, None)[2][:, :, : settings.count]
+    return _sweep(costs, gradients, settings, whole, whole, True, None)[1][:, :, : settings.count]

@@ -139,14 +139,16 @@ def prepare(
     home, elsewhere = out / "tiles", None
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
     read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
+    run = digest(_manifest(config, inputs, region))
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
-        name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
+        name = "-".join(filter(None, (pair, run)))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
     # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
-    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, config.subpixel_levels, elsewhere)
+    levels = config.subpixel_levels
+    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, run, elsewhere)
     return Job(left, right, config, store, out, inputs, files)
 
 

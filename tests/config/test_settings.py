@@ -102,8 +102,7 @@ def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
 )
 def test_preset_text__changes_census_and_penalties(name: str, window: int, p1: int, p2: int) -> None:
     config = load_config(yaml.safe_load(preset_text(name)))
-    tiles = {"overlap": 128} if name == "satellite" else {}
-    assert config == settings(preset=name, cost={"window": window}, sgm={"p1": p1, "p2": p2}, tiles=tiles)
+    assert config == settings(preset=name, cost={"window": window}, sgm={"p1": p1, "p2": p2})
 
 
 def test_preset_text__satellite_mccnn_has_constant_penalties_with_their_span() -> None:

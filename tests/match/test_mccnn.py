@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 import reference
-from helpers import bands, hashes, invoke, shares_that_differ, write_pair
+from helpers import bands, hashes, invoke, write_pair
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
@@ -404,12 +404,3 @@ def test_match_arrays__is_as_accurate_as_asked_on_development_scenes(shared_data
             sizes.append((upper - lower)[judged] / (maximum - minimum))
         assert np.concatenate(inside).mean() >= accuracy
         assert np.median(np.concatenate(sizes)) <= size
-
-
-def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
-    left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
-    for name, size in (("whole", 1216), ("tiles", 256)):
-        match_pair(left, right, tmp_path / name, settings(-13, 33, tiles={"size": size, "overlap": 100}))
-    disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
-    assert disparity <= 0.003
-    assert interval <= 0.006

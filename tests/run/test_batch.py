@@ -302,7 +302,7 @@ def test_status__of_a_batch_goes_on_after_a_pair_without_a_run(images, tmp_path)
 
 
 def test_match_jobs__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(images, tmp_path):
-    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
+    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64, "overlap": 100}}
     jobs = [prepare(images / f"left{n}.tif", images / f"right{n}.tif", tmp_path / f"out{n}", settings) for n in (1, 2)]
     for job in jobs:
         job.begin()
@@ -314,7 +314,7 @@ def test_match_jobs__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(
                 match_tile(jobs[1], tile)
 
     with connected(Cluster(workers=1), tmp_path) as client:
-        for job, failures in match_jobs(client, jobs, progress):
+        for job, failures, _ in match_jobs(client, jobs, progress):
             assert not failures
             ended.append(job)
     assert ended == jobs
@@ -469,4 +469,5 @@ def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
     result = invoke("status", out)
     assert "10 of 12 tiles done, 1 failed, 1 left; no run is active" in result.stdout
+    assert "; 45 path states are handed on\n" in result.stdout  # 11 tiles in three wavefronts, 12 with their matching
     assert "tile 0_1: no more disk" in result.stdout

@@ -184,7 +184,7 @@ def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
     job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     job.begin()
     (folder / "left.tif").unlink()
-    monkeypatch.setattr("sat_intervals.run.tile.match_patch", None)
+    monkeypatch.setattr("sat_intervals.run.tile.cost_areas", None)
     with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed"):
         match_tile(job, next(iter(job.store.grid)))
 
