@@ -202,8 +202,9 @@ def _of_subject(
         for batch in batches:
             for job in batch:
                 measure_images(client, job, progress)
-            for job, failures in match_jobs(client, batch, progress):
-                check_failures(job, failures)
+            for matched in match_jobs(client, batch, progress):
+                job = matched.job
+                check_failures(job, matched.failures)
                 gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)
                 gauge.add(job, 2 * jobs.index(job))
                 job.store.remove()
