@@ -45,7 +45,7 @@ def _crossing(curve, inside, outside, limit, settings):
     """Steps from index ``inside`` to where the linear curve crosses ``limit`` before ``outside``, rounded up.
 
     0 at the end of the range and beside an impossible candidate. ``curve[outside]`` is above ``limit``. Both cuts of a
-    pixel take 26 ns more than `alpha_cut` with these selections, 110 ns with branches, which are hard to predict.
+    pixel take 26 ns more than `alpha_cut` with these selections, 125 ns with branches, which are hard to predict.
     """
     near = min(max(outside, 0), settings.count - 1)
     here, there = np.int64(curve[inside]), np.int64(curve[near])
@@ -63,7 +63,7 @@ def _limit(lowest, level):
 def _whole_cuts(curve, one, other):
     """First and last index of the cuts at two limits, in one pass over the curve: ``(first, last)`` of each.
 
-    Every vector is visited, so that no branch depends on the curve: 9 ns for both, 40 ns by two calls of `alpha_cut`.
+    Every vector is visited, so that no branch depends on the curve: 16 ns for 64 disparities, 23 ns for 128.
     """
     first_1 = first_2 = curve.size
     last_1 = last_2 = -1
