@@ -9,7 +9,7 @@ import yaml
 from helpers import PLACE, invoke, write_pair
 
 from sat_intervals import match_pair
-from sat_intervals.config import load_config
+from sat_intervals.config import PRESETS, calibration_of, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import write_layer
@@ -153,6 +153,15 @@ def test_calibrate__levels_out_of_order_are_refused(scene, tmp_path):
     line = one_line(invoke(*arguments, "--coverage", 0.9, "--calibration", tmp_path / "edited.yaml"))
     assert "edited.yaml" in line
     assert "high falls" in line
+
+
+MCCNN = [pytest.param(preset, marks=pytest.mark.peer("onnxruntime")) for preset in PRESETS if "mccnn" in preset]
+
+
+@pytest.mark.parametrize("preset", [preset for preset in PRESETS if "mccnn" not in preset] + MCCNN)
+def test_calibration_of__each_preset_has_a_built_in_one(preset):
+    config = load_config({"preset": preset, "disparity": {"minimum": 0, "maximum": 9}, "interval": {"coverage": 0.9}})
+    assert calibration_of(config).name == preset
 
 
 # ---- Tuning ------------------------------------------------------------------------------------------------
