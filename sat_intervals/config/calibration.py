@@ -60,7 +60,8 @@ class Calibration(_Model):
     key
         All settings that the levels belong to, see `key_of`.
     levels
-        One row for each coverage, in this order. Levels do not fall as the coverage rises.
+        One row for each coverage, in this order. Levels do not fall as the coverage rises, except ``low`` where the
+        quantile changes.
     provenance
         Scenes, date, version, figures to expect: for people.
     """
@@ -78,7 +79,8 @@ class Calibration(_Model):
             words = [", ".join(f"{coverage:g}" for coverage in order) for order in (found, COVERAGES)]
             raise ValueError(f"coverages are {words[0]}, needed in this order: {words[1]}")
         for one, next_one in pairwise(rows):
-            for name in ("high", "low"):
+            # low-confidence pixels may need a lower level with a higher quantile
+            for name in ("high", "low") if one.quantile == next_one.quantile else ("high",):
                 before, after = getattr(one, name), getattr(next_one, name)
                 if after < before:
                     raise ValueError(

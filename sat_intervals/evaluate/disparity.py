@@ -9,9 +9,10 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.metrics import Criteria, Evaluated, Metrics, bias_histogram
+from sat_intervals.evaluate.metrics import Criteria, Evaluated, Metrics
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
+from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.postprocess import cut_rows, with_halo
 from sat_intervals.products import Bands
 from sat_intervals.results import Layer, Run, open_run

@@ -1,7 +1,6 @@
 """Accumulate figures of merit of intervals (paper section 4.1; METHOD.md, section 10).
 
-Medians come from histograms with these steps: widths 0.01 px, overestimation 0.001 (at least -99), bias 0.001 px
-(within 1000 px), confidence 0.001.
+Medians come from histograms with these steps: widths 0.01 px, overestimation 0.001 (at least -99), confidence 0.001.
 """
 
 from dataclasses import dataclass
@@ -9,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import Bands
 
-_WIDTH, _RATIO, _BIAS, _CONFIDENCE = 100, 1000, 1000, 1000  # steps a unit
-_LARGEST_RATIO, _LARGEST_BIAS = 100, 1000
+_WIDTH, _RATIO, _CONFIDENCE = 100, 1000, 1000  # steps a unit
+_LARGEST_RATIO = 100
 
 
 @dataclass(frozen=True)
@@ -59,38 +59,6 @@ class Evaluated(NamedTuple):
     bands: Bands
     low: np.ndarray
     area_error: np.ndarray
-
-
-class Histogram:
-    """Counts of values from ``first`` to ``last``, ``steps`` per unit; values beyond are clipped."""
-
-    def __init__(self, first: int, last: int, steps: int) -> None:
-        self._first, self._steps = first, steps
-        self._counts = np.zeros((last - first) * steps + 1, np.int64)
-
-    def add(self, values: np.ndarray) -> None:
-        """Count values; none may be NaN."""
-        places = np.rint((values - self._first) * self._steps)
-        places = np.clip(places, 0, self._counts.size - 1).astype(np.int64)
-        self._counts += np.bincount(places, minlength=self._counts.size)
-
-    def median(self) -> float | None:
-        """Return the median (the mean of both middle values of an even number); None without values."""
-        upto = np.cumsum(self._counts)
-        if upto[-1] == 0:
-            return None
-        middle = np.searchsorted(upto, [(upto[-1] - 1) // 2, upto[-1] // 2], side="right")
-        return float(self._first + middle.sum() / (2 * self._steps))
-
-    def deviation(self) -> float | None:
-        """Return the median absolute deviation from the median; None without values."""
-        median = self.median()
-        if median is None:
-            return None
-        distance = np.abs(self._first + np.arange(self._counts.size) / self._steps - median)
-        nearest_first = np.argsort(distance, kind="stable")
-        upto = np.cumsum(self._counts[nearest_first])
-        return float(distance[nearest_first[np.searchsorted(upto, (upto[-1] - 1) // 2, side="right")]])
 
 
 class _Intervals:
@@ -196,11 +164,6 @@ class Metrics:
         for name, count in self._wrong.items():
             report[name] = _share(count, report["all"]["count"])
         return report | {"deciles": self._deciles.report()}
-
-
-def bias_histogram() -> Histogram:
-    """Return an empty histogram for differences of disparity and truth."""
-    return Histogram(-_LARGEST_BIAS, _LARGEST_BIAS, _BIAS)
 
 
 def _share(part: float, whole: float) -> float | None:

@@ -61,6 +61,18 @@ class RawRows(NamedTuple):
         )
 
 
+class Filtered(NamedTuple):
+    """Rows before regularisation: bands with their halo, low-confidence pixels (None without), pixels to write."""
+
+    disparity: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    confidence: np.ndarray
+    validity: np.ndarray
+    low: np.ndarray | None
+    written: np.ndarray
+
+
 class ConfidenceScale(NamedTuple):
     """Ambiguities that become confidence 1 and 0."""
 
@@ -103,6 +115,11 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
     scale
         See `confidence_scale`; the same for the whole image.
     """
+    return finish_rows(filter_rows(rows, scale, config), first, last, config)
+
+
+def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filtered:
+    """Cross-check, confidence and medians: all steps before regularisation; parameters as in `postprocess_rows`."""
     searched = rows.winner != NO_DISPARITY
     validity = rows.validity.copy()
     if config.cross_check:
@@ -118,21 +135,28 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
         disparity = median(disparity, kept, config.median.size)
         if config.interval:
             lower, upper = median(lower, kept, config.median.size), median(upper, kept, config.median.size)
+    written = searched if config.products.keep_rejected else kept
+    return Filtered(disparity, lower, upper, confidence, validity, low, written)
+
+
+def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
+    """Regularise, and complete the final bands of the rows ``[first, last)``; see `postprocess_rows`."""
+    disparity, lower, upper, confidence, validity, low, written = rows
     inner = slice(first, last)
+    validity = validity[inner].copy()
     if low is not None:
         lower, upper = _regularized(lower, upper, low, first, last, config)
-        validity[inner][low[inner]] |= REGULARIZED
+        validity[low[inner]] |= REGULARIZED
     else:
         lower, upper = lower[inner], upper[inner]
-    written = (searched if config.products.keep_rejected else kept)[inner]
-    disparity = np.where(written, disparity[inner], np.float32(np.nan))
+    disparity = np.where(written[inner], disparity[inner], np.float32(np.nan))
     # Widen the intervals that medians or quantiles moved off the disparity.
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
     if config.bound_steps:
         lower, upper = (
             round_(bound * BOUND_STEPS) / BOUND_STEPS for round_, bound in ((np.floor, lower), (np.ceil, upper))
         )
-    return Bands(disparity, lower, upper, confidence[inner], validity[inner])
+    return Bands(disparity, lower, upper, confidence[inner], validity)
 
 
 def _bounds(rows: RawRows, low: np.ndarray | None, config: Config) -> tuple[np.ndarray, np.ndarray]:

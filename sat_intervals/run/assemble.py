@@ -73,9 +73,9 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     """
     config, store, region = job.config, job.store, job.store.grid.region
     records, statistics = store.records(), job.statistics()
-    _check_done(job, records)
+    check_done(job, records)
     histogram, seams = store.histogram(records), store.seams(records)
-    _check_matched(job, records, int(histogram.sum()))
+    check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
@@ -127,7 +127,7 @@ def _prefetched(items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _check_done(job: Job, records: Records) -> None:
+def check_done(job: Job, records: Records) -> None:
     """Raise if tiles are missing; a retry restores them."""
     missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
@@ -136,7 +136,7 @@ def _check_done(job: Job, records: Records) -> None:
         )
 
 
-def _check_matched(job: Job, records: Records, searched: int) -> None:
+def check_matched(job: Job, records: Records, searched: int) -> None:
     """Raise if no pixel could be matched, with the likely reason."""
     if searched:
         return
