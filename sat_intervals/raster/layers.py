@@ -142,7 +142,8 @@ def read_shape(path: str | os.PathLike[str]) -> tuple[int, int, int]:
 def is_marked(path: str | os.PathLike[str]) -> bool:
     """Return whether a raster has the tag of all files of this tool, see `MARK`."""
     with suppress(SatIntervalsError):
-        return read_tags(path).get("SOFTWARE", "").startswith(MARK["SOFTWARE"])
+        tags = read_tags(path)
+        return tags.get("SOFTWARE", tags.get("Software", "")).startswith(MARK["SOFTWARE"])  # the latter in PNG
     return False
 
 

@@ -46,7 +46,7 @@ def _is_of_run(file: Path) -> bool:
     if file.name != "run.json":
         return is_marked(file)
     try:
-        return {"settings", "inputs", "tiles"} <= json.loads(file.read_text(encoding="utf-8")).keys()
+        return bool({"settings", "inputs", "tiles"} <= json.loads(file.read_text(encoding="utf-8")).keys())
     except (OSError, ValueError, AttributeError, RecursionError):
         return False
 
