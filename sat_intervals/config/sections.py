@@ -201,12 +201,6 @@ class Ambiguity(Section):
         return self
 
 
-class Interval(Section):
-    """Disparity interval: alpha-cut of a possibility distribution (paper, eq. 5 to 8)."""
-
-    alpha: Exact = Field(Decimal("0.9"), gt=0, le=1, description="level of possibility, not a calibrated probability")
-
-
 class Refinement(Section):
     """Sub-pixel refinement of the disparity."""
 
@@ -245,8 +239,8 @@ class Tiles(Section):
         1024, ge=64, le=16384, multiple_of=64, description="side of a tile's core, in pixels; determines the memory"
     )
     overlap: Annotated[int, Field(ge=1, le=4096)] | Literal["exact"] = Field(
-        100,
-        description="pixels read around the core and dropped; exact: none, tiles hand SGM's path states on",
+        "exact",
+        description="exact: tiles hand SGM's path states on, or pixels read around the core and dropped",
     )
 
     @property

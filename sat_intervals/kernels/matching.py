@@ -10,9 +10,8 @@ Letters: r row, c column, k disparity index (disparity = minimum + k).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.kernels.cost import Candidates, Costs, cost_curve, padded_to_lanes
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
 from sat_intervals.kernels.reading import (
@@ -33,6 +32,7 @@ from sat_intervals.kernels.sgm import (
     add_curve,
     advance_pixel,
     advance_wave,
+    copy_curve,
     enter_row,
     hand_on,
     no_borders,
@@ -60,7 +60,10 @@ class Settings(NamedTuple):
     p1, p2, regularized
         Constant SGM penalties, and whether SGM runs; without it the aggregated cost is the matching cost.
     cut_level
-        ``floor((1 - alpha) * span)``; -1: no interval.
+        ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
+    high, low, steps
+        Levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1: one level.
+        ``steps`` 0: bounds in whole pixels.
     weights
         uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine
@@ -76,6 +79,9 @@ class Settings(NamedTuple):
     cut_level: int
     weights: np.ndarray
     refine: bool
+    high: float = -1.0
+    low: float = -1.0
+    steps: int = 0
 
 
 class Raw(NamedTuple):
@@ -84,7 +90,8 @@ class Raw(NamedTuple):
     Attributes
     ----------
     winner, lower, upper
-        int16 disparities in pixels, NO_DISPARITY for none.
+        int16 disparities in pixels, NO_DISPARITY for none. Sub-pixel bounds are uint16, in steps above the first
+        disparity, without meaning where there is no winner.
     disparity
         float32 refined disparity in pixels, NaN for none.
     cost
@@ -93,6 +100,9 @@ class Raw(NamedTuple):
         uint32, 0 where there is no candidate.
     validity
         uint16 flags, without those of the left image's mask, cross-checking and regularisation.
+    lower_low, upper_low
+        Sub-pixel bounds at the level of low-confidence pixels; those at the other level are ``lower`` and ``upper``.
+        ``(0, 0)`` without a second level.
     """
 
     winner: np.ndarray
@@ -102,6 +112,12 @@ class Raw(NamedTuple):
     cost: np.ndarray
     ambiguity: np.ndarray
     validity: np.ndarray
+    lower_low: np.ndarray
+    upper_low: np.ndarray
+
+
+# Bounds of `Raw` and of the rows of postprocessing.
+BOUNDS = ("lower", "upper", "lower_low", "upper_low")
 
 
 class RightView(NamedTuple):
@@ -119,6 +135,24 @@ class RightView(NamedTuple):
     winner: np.ndarray
 
 
+class Matched(NamedTuple):
+    """What `match_costs` returns.
+
+    Attributes
+    ----------
+    raw
+        Products of the wanted pixels.
+    right
+        Winners of the right pixels that face the core.
+    leaving
+        States of the last of WAVEFRONTS where it leaves the patch, as `trace` returns them; empty without borders.
+    """
+
+    raw: Raw
+    right: RightView
+    leaving: Ring
+
+
 class _Buffers(NamedTuple):
     """Inputs of both sweeps, and buffers for the current row, paths and curve.
 
@@ -132,6 +166,8 @@ class _Buffers(NamedTuple):
         Pixels whose paths are computed; those of the pixels around them come from ``rings``.
     rings
         Rings of the two waves of the sweep.
+    leaving
+        States that leave the pixels ``inside``, to fill; empty if nobody takes them over.
     """
 
     candidates: Candidates
@@ -141,6 +177,7 @@ class _Buffers(NamedTuple):
     curve: np.ndarray
     inside: Rectangle
     rings: tuple[Ring, ...]
+    leaving: Ring
 
 
 def _rectangle(window: Window) -> Rectangle:
@@ -148,9 +185,11 @@ def _rectangle(window: Window) -> Rectangle:
 
 
 def _prepare(
-    costs: Costs, gradients: Gradients | None, settings: Settings, inside: Window, rings: tuple[Ring, ...]
+    costs: Costs, gradients: Gradients | None, settings: Settings, borders: Borders | None, down: bool = True
 ) -> _Buffers:
     columns, size = costs.left_state.shape[1], padded_to_lanes(settings.count)
+    left = borders.inside if borders else Window(0, 0, 0, 0)
+    inside, rings = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
     beyond = np.zeros(size, np.uint16)
     beyond[settings.count :] = WALL
     slots = 1 + 3 * columns
@@ -161,17 +200,18 @@ def _prepare(
         Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
         np.zeros(size, np.uint16),
         _rectangle(inside),
-        rings,
+        rings[:2] if down else rings[2:],
+        Ring(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
     )
 
 
-@njit(nogil=True)
+@part
 def _enter_row(buffers, gradients, settings, r, down):
     """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    (costs, barrier, _), possible, penalties, paths, _, inside, rings = buffers
+    (costs, barrier, _), possible, penalties, paths, _, inside, rings, _ = buffers
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
     usable = 0
@@ -188,7 +228,7 @@ def _enter_row(buffers, gradients, settings, r, down):
     return falling, rising
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _columns(inside, r, down):
     """Columns of row ``r`` that lie inside, in the order of the sweep."""
     if not inside.row <= r < inside.row_stop:
@@ -197,9 +237,9 @@ def _columns(inside, r, down):
 
 
 @cached
-def _trace(buffers, gradients, settings, wave, down, target):
-    """Advance the paths of one wave through a patch and copy the states that leave it to ``target``, a `Ring`."""
-    candidates, possible, penalties, paths, _, inside, _ = buffers
+def _trace(buffers, gradients, settings, wave, down):
+    """Advance the paths of one wave through a patch and copy the states that leave it."""
+    candidates, possible, penalties, paths, _, inside, _, leaving = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
@@ -211,13 +251,13 @@ def _trace(buffers, gradients, settings, wave, down, target):
             else:
                 advance_wave(candidates, penalties, paths, slots, wave, r, c)
         if inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, wave, down, target)
+            hand_on(paths, inside, r, falling, rising, wave, down, leaving)
 
 
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, possible, penalties, paths, curve, inside, _ = buffers
+    candidates, possible, penalties, paths, curve, inside, _, _ = buffers
     for r in range(output.row_stop):
         falling, rising = _enter_row(buffers, gradients, settings, r, True)
         for c in _columns(inside, r, True):
@@ -233,9 +273,9 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
-    """Finish and read the curves of the pixels of ``output``, and update the right view."""
-    candidates, possible, penalties, paths, curve, inside, _ = buffers
-    winner, lower, upper, disparity, cost, ambiguity, validity = raw
+    """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
+    candidates, possible, penalties, paths, curve, inside, _, leaving = buffers
+    winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
         falling, rising = _enter_row(buffers, gradients, settings, r, False)
@@ -259,26 +299,29 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             else:
                 cost_curve(candidates, r, c, curve)
             lowest = close_impossible(curve, candidates, c)
-            winner[i, j], shift, refined, lower[i, j], upper[i, j], ambiguity[i, j] = read_curve(
-                curve, lowest, settings
-            )
+            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, lowest, settings)
+            lower[i, j], upper[i, j] = high
+            if settings.low >= 0:
+                lower_low[i, j], upper_low[i, j] = low
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
                 validity[i, j] |= NOT_REFINED
             if contains(right.core, r, c):
                 update_right(curve, right, r, c)
             if keep:
-                volume[i, j] = curve
+                copy_curve(curve, volume[i, j])
+        if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
+            hand_on(paths, inside, r, falling, rising, 1, False, leaving)
 
 
 def _sweep(costs, gradients, settings, output, core, keep, borders):
-    """Run both sweeps; return the raw products, the right view and the volume (finished curves only with ``keep``)."""
+    """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    borders = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
-    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2])
+    buffers = _prepare(costs, gradients, settings, borders)
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
+    of_low = shape if settings.low >= 0 else (0, 0)
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -287,19 +330,22 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
         cost=np.full(shape, IMPOSSIBLE_COST, np.uint16),
         ambiguity=np.zeros(shape, np.uint32),
         validity=np.zeros(shape, np.uint16),
+        lower_low=np.full(of_low, NO_DISPARITY, np.int16),
+        upper_low=np.full(of_low, NO_DISPARITY, np.int16),
     )
     wanted, cores = _rectangle(output), _rectangle(core)
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         _sweep_down(buffers, gradients, settings, wanted, volume)
-        for state in buffers.paths:
-            state[:] = 0
-    _sweep_up(buffers._replace(rings=borders.rings[2:]), gradients, settings, wanted, volume, raw, right, keep)
+        buffers = _prepare(costs, gradients, settings, borders, down=False)
+    _sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
-    return raw, RightView(cost, winner), volume
+    if settings.steps:  # the sweep only carries them as int16: compiled once for both kinds
+        raw = raw._replace(**{name: getattr(raw, name).view(np.uint16) for name in BOUNDS})
+    return Matched(raw, RightView(cost, winner), buffers.leaving), volume
 
 
 def trace(
@@ -311,11 +357,9 @@ def trace(
     Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]
-    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2] if down else borders.rings[2:])
-    inside, size = borders.inside, buffers.curve.size
-    target = Ring(np.empty((inside.height, 2, size), np.uint16), np.empty((inside.width, 2, size), np.uint16))
-    _trace(buffers, gradients, settings, wave, down, target)
-    return target
+    buffers = _prepare(costs, gradients, settings, borders, down)
+    _trace(buffers, gradients, settings, wave, down)
+    return buffers.leaving
 
 
 def match_costs(
@@ -325,7 +369,7 @@ def match_costs(
     core: Window | None = None,
     gradients: Gradients | None = None,
     borders: Borders | None = None,
-) -> tuple[Raw, RightView]:
+) -> Matched:
     """Match a patch: matching costs in, raw products and the right view's winners out.
 
     Parameters
@@ -345,13 +389,9 @@ def match_costs(
 
     Returns
     -------
-    Raw
-        Of the shape of ``output``.
-    RightView
-        Of ``core.height`` rows and ``core.width + count - 1`` columns.
+    ``raw`` of the shape of ``output``, ``right`` of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False, borders)
-    return raw, right_view
+    return _sweep(costs, gradients, settings, output, core or output, False, borders)[0]
 
 
 def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = None) -> np.ndarray:
@@ -360,4 +400,4 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True, None)[2][:, :, : settings.count]
+    return _sweep(costs, gradients, settings, whole, whole, True, None)[1][:, :, : settings.count]

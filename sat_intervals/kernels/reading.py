@@ -6,11 +6,11 @@ Letters: r row, c column, k disparity index (disparity = minimum + k).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.disparity import vfit
-from sat_intervals.kernels.intervals import alpha_cut
+from sat_intervals.kernels.intervals import alpha_cut, subpixel_cuts
 from sat_intervals.kernels.vector import (
     LANES,
     choose_smaller,
@@ -44,13 +44,13 @@ class Rectangle(NamedTuple):
     column_stop: int
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def contains(rectangle, r, c):
     """Whether a rectangle contains the pixel ``(r, c)``."""
     return rectangle.row <= r < rectangle.row_stop and rectangle.column <= c < rectangle.column_stop
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def close_impossible(curve, candidates, c):
     """Set impossible candidates and lanes behind the range to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
@@ -62,7 +62,7 @@ def close_impossible(curve, candidates, c):
     return smallest(lowest)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _winner(curve, lowest):
     """First index with the lowest cost: 14 ns for 64 disparities by vectors, 36 ns by single costs."""
     k = 0
@@ -73,7 +73,7 @@ def _winner(curve, lowest):
     return k + first_lane(mask)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _interval(curve, lowest, count, cut_level, refine):
     """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
     first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
@@ -99,7 +99,7 @@ class RightPixels(NamedTuple):
     best: np.ndarray
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def update_right(curve, right, r, c):
     """Update the right pixels that a left pixel faces with its candidates.
 
@@ -114,7 +114,7 @@ def update_right(curve, right, r, c):
         store(right.cost, start + k, smaller(candidate, known))
 
 
-@njit(nogil=True)
+@part
 def search_flags(costs, r, c, count, possible):
     """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
     flags = 0
@@ -131,15 +131,20 @@ def search_flags(costs, r, c, count, possible):
     return flags
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def read_curve(curve, lowest, settings):
-    """Winner, sub-pixel shift, whether it was refined, both bounds and ambiguity of a finished curve."""
+    """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
+
+    Bounds are disparities, or steps with sub-pixel cuts; NO_DISPARITY for a level that is off.
+    """
     k = _winner(curve, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
-    lower = upper = NO_DISPARITY
-    if settings.cut_level >= 0:
+    high = low = NO_DISPARITY, NO_DISPARITY
+    if settings.steps > 0:
+        high, low = subpixel_cuts(curve, lowest, k + shift, settings)
+    elif settings.cut_level >= 0:
         first, last = _interval(curve, lowest, settings.count, settings.cut_level, settings.refine)
-        lower, upper = settings.minimum + first, settings.minimum + last
+        high = settings.minimum + first, settings.minimum + last
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
     count = settings.count if settings.weights.size else 0
-    return settings.minimum + k, shift, refined, lower, upper, ambiguity(curve, count, lowest, settings.weights)
+    return settings.minimum + k, shift, refined, high, low, ambiguity(curve, count, lowest, settings.weights)

@@ -13,10 +13,9 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.matching import trace
 from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
-from sat_intervals.match.matching_cost import Area, cost_areas
-from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import kernel_settings, patch_window, path_window
-from sat_intervals.tiling import Views, Window
+from sat_intervals.match.matching_cost import MatchingCost
+from sat_intervals.match.patch import Frame, frame_area, kernel_settings, mirrored_settings, path_window
+from sat_intervals.tiling import Window
 
 Place = tuple[int, int]
 """Row and column of a tile in its grid, or what to add to them."""
@@ -55,37 +54,28 @@ def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
     return Ring(borders[beside].ring.column if beside in borders else nothing, row)
 
 
-def borders_of(
-    core: Window, region: Window, whole: Window, config: Config, found: Sequence[Mapping[Place, Border]]
-) -> Borders:
+def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Border]]) -> Borders:
     """Borders of a tile for the kernels, from those of its neighbours by wavefront and place."""
-    patch, size = patch_window(core, region, whole, config), padded_to_lanes(config.disparity.count)
+    patch, size = frame_area(frame, config).base, padded_to_lanes(config.disparity.count)
     rings = tuple(ring_of(wavefront, patch, borders, size) for wavefront, borders in enumerate(found))
-    return Borders(path_window(core, region, whole, config).relative_to(patch), rings)
+    return Borders(path_window(frame, config).relative_to(patch), rings)
 
 
-def trace_patch(
-    views: Views,
-    patch: Window,
-    borders: Borders,
-    wavefront: int,
-    config: Config,
-    statistics: PairStatistics | None = None,
-) -> Ring:
+def trace_area(cost: MatchingCost, borders: Borders, wavefront: int, mirrored: bool, config: Config) -> Ring:
     """Path states that a tile hands on in a wavefront.
 
     Parameters
     ----------
-    views
-        Both images in the `patch_windows` of the tile.
-    patch
-        Its `patch_window`.
+    cost
+        Of the tile's `frame_area`.
     borders
         States that it takes over, see `borders_of`.
     wavefront
         Index of WAVEFRONTS.
-    config, statistics
-        As for `match_patch`.
+    mirrored
+        Whether this is the right view.
+    config
+        Settings.
     """
-    (cost,) = cost_areas(views, [Area.of(patch, config)], config, statistics)
-    return trace(cost.costs, kernel_settings(config), borders, wavefront, cost.gradients)
+    settings = kernel_settings(config)
+    return trace(cost.costs, mirrored_settings(settings) if mirrored else settings, borders, wavefront, cost.gradients)

@@ -25,7 +25,7 @@ from sat_intervals.run.cluster import connected
 from sat_intervals.run.inputs import changes_since
 from sat_intervals.run.job import Job, fitted_to_jobs, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
-from sat_intervals.run.pair import assemble_repaired, check_failures, match_jobs, measure_images
+from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, match_jobs, measure_images
 from sat_intervals.run.status import read_report
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
@@ -200,8 +200,8 @@ def _matched(
             except RunError as error:
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
-        for job, failures in match_jobs(client, list(measured.values()), progress):
-            assembling[thread.submit(_assembled, client, job, failures, keep_tiles, check)] = names[id(job)]
+        for matched in match_jobs(client, list(measured.values()), progress):
+            assembling[thread.submit(_assembled, client, matched, keep_tiles, check)] = names[id(matched.job)]
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()
         total = len(assembling)
@@ -234,18 +234,18 @@ def _kernels(config: Config) -> str:
     return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
-def _assembled(
-    client: Client, job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress
-) -> dict[str, Any]:
+def _assembled(client: Client, matched: Matched, keep_tiles: bool, progress: Progress) -> dict[str, Any]:
+    job, failures, seconds = matched
+
     def match() -> None:
         measure_images(client, job, progress)
-        for _, failures in match_jobs(client, [job], progress):
-            check_failures(job, failures)
+        for again in match_jobs(client, [job], progress):
+            check_failures(job, again.failures)
 
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assemble_repaired(job, match, {}, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others

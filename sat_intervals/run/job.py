@@ -6,11 +6,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, Mccnn, load_config
+from sat_intervals.config import Config, Mccnn, load_config, resolved
+from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
-from sat_intervals.match.mccnn import load_network, weights_file
+from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, restore, stamps
@@ -130,7 +131,7 @@ def prepare(
 
     ``pair`` distinguishes otherwise equal pairs of a batch in an external store.
     """
-    config, out = fitted_to_jobs(load_config(config)), Path(out)
+    config, out = resolved(fitted_to_jobs(load_config(config))), Path(out)
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
     check_tiles(config, region)
@@ -139,8 +140,9 @@ def prepare(
     home, elsewhere = out / "tiles", None
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
     read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
+    run = digest(_manifest(config, inputs, region))
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
-        name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region)))))
+        name = "-".join(filter(None, (pair, run)))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
     # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
@@ -148,7 +150,8 @@ def prepare(
     if overwrite:
         check_replaceable(out)
     grid = Grid(region, config.tiles.size)
-    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
+    levels = config.subpixel_levels
+    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, run, elsewhere)
     return Job(left, right, config, store, out, inputs, files)
 
 

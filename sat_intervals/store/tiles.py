@@ -21,11 +21,12 @@ import numpy as np
 
 from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
-from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
+from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
     BORDERS,
+    COSTS,
     FAILURES,
     NORMALIZATION,
     RECORDS,
@@ -41,7 +42,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 5
+LAYOUT = 7
 
 # Marker files in the folder of a run.
 # Present while a run replaces an earlier one.
@@ -71,6 +72,10 @@ class Store:
         Number of disparities of the search range.
     ambiguities
         Largest possible ambiguity of a pixel.
+    levels
+        Levels of sub-pixel bounds, see `TileArrays`.
+    run
+        Digest of the manifest: what belongs to another run is not taken for a part of this one.
     elsewhere
         Folder of the tiles in the store that the user names; by default ``home``.
     """
@@ -79,6 +84,8 @@ class Store:
     grid: Grid
     count: int
     ambiguities: int
+    levels: int
+    run: str
     elsewhere: str | None = None
 
     @property
@@ -88,7 +95,7 @@ class Store:
 
     @property
     def _arrays(self) -> TileArrays:
-        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities)
+        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels)
 
     def open(
         self, manifest: Mapping[str, Any], *, overwrite: bool = False, replaceable: Mapping[str, str] | None = None
@@ -131,7 +138,7 @@ class Store:
                 drop(folder)
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
-            for name in ("", RECORDS, FAILURES, BORDERS):
+            for name in ("", RECORDS, FAILURES, BORDERS, COSTS):
                 folder.make(name)
             home.make("")
             home.delete(_FINISHED)
@@ -212,17 +219,17 @@ class Store:
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write the record of a tile, with its checksums in ``files``; the tile is then done."""
         name = f"{RECORDS}/{tile.name}.json"
-        self.folder.write(name, sealed(record))
+        self.folder.write(name, sealed(record, f"{self.run}/{tile.name}"))
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
             self.folder.delete(name)
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Write the statistics of the whole images, so that all tiles use the same."""
-        self.folder.write(NORMALIZATION, sealed(normalization))
+        self.folder.write(NORMALIZATION, sealed(normalization, self.run))
 
     def normalization(self) -> dict[str, Any] | None:
         """Read the statistics of `write_normalization`; None if missing or damaged."""
-        return unsealed(self.folder.read(NORMALIZATION))
+        return unsealed(self.folder.read(NORMALIZATION), self.run)
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Write why a tile failed, for `failures`; a later record replaces it."""
@@ -247,7 +254,7 @@ class Store:
         texts, sizes = self.folder.read_all(RECORDS), self._arrays.folder.sizes()
         found = {}
         for tile in self.grid:
-            record = unsealed(texts.get(tile.name))
+            record = unsealed(texts.get(tile.name), f"{self.run}/{tile.name}")
             files = record.get("files", {}) if record else {}
             is_complete = files.keys() == self._arrays.files_of(tile)
             if record and is_complete and all(sizes.get(name) == size for name, (size, _) in files.items()):
@@ -378,4 +385,5 @@ def store_of(home: Path, store: str | None = None) -> Store:
     text = folder.read(MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} has no run: give the folder that match was given")
-    return Store(home, grid_of(parsed(text, folder), folder), 1, 0, str(folder))
+    manifest = parsed(text, folder)
+    return Store(home, grid_of(manifest, folder), 1, 0, 0, digest(manifest), str(folder))

@@ -789,8 +789,8 @@ def test_match__refuses_two_presets(folder, tmp_path):
 def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(tmp_path):
     out = tmp_path / "out"
     arguments = ("demo", out, "--size", 150, 180, "--seed", 4)
-    result = command(*arguments)
-    assert (result.returncode, result.stderr) == (0, "")
+    result = invoke(*arguments)
+    assert (result.exit_code, result.stderr) == (0, "")
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "left.tif", "right.tif", "truth.tif"])
     last = result.stdout.splitlines()[-1]
     found = re.fullmatch(
