@@ -19,12 +19,12 @@ from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
+from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter, stamps
 from sat_intervals.run.job import Job
-from sat_intervals.run.output import stamps
+from sat_intervals.run.output import OUTPUTS
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
-from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced
+from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced, replaceable_files
 
 Item = TypeVar("Item")
 
@@ -100,9 +100,10 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         _warn_of_ambiguity(job, report["counts"])
         if not keep_tiles:
             mark_finished(store.home, job.name)
-        writer.publish(report=("run.json", json.dumps(report, indent=1) + "\n"))
+        text = json.dumps(report, indent=1) + "\n"
+        writer.publish(("run.json", text), replaceable=replaceable_files(store.home))
         if not keep_tiles:
-            mark_finished(store.home, job.name, stamps(job.out))
+            mark_finished(store.home, job.name, list(stamps(job.out, OUTPUTS).values()))
         mark_replaced(store.home)
         progress("files", 1, 1)
     return report

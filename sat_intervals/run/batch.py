@@ -26,6 +26,7 @@ from sat_intervals.run.inputs import changes_since
 from sat_intervals.run.job import Job, fitted_to_jobs, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
 from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, match_jobs, measure_images
+from sat_intervals.run.status import read_report
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
@@ -78,6 +79,7 @@ def match_batch(
     _raise_file_limit()
     with ExitStack() as stack:
         stack.enter_context(LocalFolder(out).locked())
+        read_report(out)  # raises if it is not ours
 
         def note(states: Mapping[str, dict[str, Any]]) -> None:
             for name, how in states.items():

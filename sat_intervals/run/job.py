@@ -14,11 +14,11 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image
+from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, restore, stamps
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
-from sat_intervals.run.output import OUTPUTS, check_output, holds_run, is_complete
+from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run, inputs_before
@@ -79,7 +79,8 @@ class Job:
         if not overwrite and is_complete(self.out):  # another run may have ended before this one got the lock
             raise holds_run(self.out, OUTPUTS)
         check_output(self.out, overwrite)
-        self.store.open(self.manifest, overwrite=overwrite)
+        restore(self.out, RUN_FILES)
+        self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
 
     def check_inputs(self) -> None:
         """Raise if an input changed since the start of the run, or this process has other weights.
@@ -146,6 +147,8 @@ def prepare(
     # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
+    if overwrite:
+        check_replaceable(out)
     grid = Grid(region, config.tiles.size)
     levels = config.subpixel_levels
     store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, run, elsewhere)

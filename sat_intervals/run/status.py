@@ -68,4 +68,6 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
             str(name): {"error": "", **ended, "state": str(ended["state"])} for name, ended in json.loads(text).items()
         }
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: rerun the batch") from error
+        raise SatIntervalsError(
+            f"{out / REPORT} is not the report of a batch: move it away and rerun the batch"
+        ) from error

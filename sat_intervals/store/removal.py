@@ -70,14 +70,20 @@ def _names(folder: Folder) -> dict[str, int]:
         grid = grid_of(parsed(folder.read(MANIFEST) or "", folder), folder)
 
     def is_named(name: str) -> bool:
-        for unfinished in _UNFINISHED:
-            name = unfinished.sub(r"\1", name)
+        name = final_name(name)
         if _OF_RUN.fullmatch(name) or (found := _OF_TILE.fullmatch(name)) is None:
             return _OF_RUN.fullmatch(name) is not None
         row, column = (int(number) for number in found.groups() if number is not None)
         return grid is None or (row < grid.rows and column < grid.columns)
 
     return {name: size for name, size in folder.sizes().items() if is_named(name)}
+
+
+def final_name(name: str) -> str:
+    """Return the name that an unfinished file was to have; that of any other file is unchanged."""
+    for unfinished in _UNFINISHED:
+        name = unfinished.sub(r"\1", name)
+    return name
 
 
 def is_of_run(folder: Folder) -> bool:

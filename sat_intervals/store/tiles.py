@@ -32,6 +32,7 @@ from sat_intervals.store.removal import (
     RECORDS,
     check_not_foreign,
     drop,
+    final_name,
     is_of_run,
 )
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
@@ -96,7 +97,9 @@ class Store:
     def _arrays(self) -> TileArrays:
         return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels)
 
-    def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
+    def open(
+        self, manifest: Mapping[str, Any], *, overwrite: bool = False, replaceable: Mapping[str, str] | None = None
+    ) -> None:
         """Create the store or resume an existing one; call it while ``home`` is locked.
 
         Parameters
@@ -106,6 +109,8 @@ class Store:
         overwrite
             Whether to delete existing tiles and replace the files of an earlier run. Tiles in a store that the user
             does not name are kept.
+        replaceable
+            What `replaceable_files` returns afterwards, with ``overwrite``.
 
         Raises
         ------
@@ -138,7 +143,7 @@ class Store:
             home.make("")
             home.delete(_FINISHED)
             if overwrite:
-                home.write(_REPLACING, "")
+                home.write(_REPLACING, json.dumps(dict(replaceable or {})))
             if self.elsewhere:
                 home.write(PLACE, json.dumps(str(folder)))
             else:
@@ -302,8 +307,8 @@ class Store:
 def remove_tiles(home: Path, place: Folder) -> None:
     """Delete a run's tiles in ``place``, and its marker files in ``home``."""
     drop(place)
-    for name in (PLACE, _REPLACING, _FINISHED):
-        folder_at(home).delete(name)
+    names = PLACE, _REPLACING, _FINISHED
+    folder_at(home).delete_all([name for name in folder_at(home).sizes() if final_name(name) in names])
 
 
 def mark_finished(home: Path, run: str, stamps: Sequence[str] = ()) -> None:
@@ -328,6 +333,14 @@ def mark_replaced(home: Path) -> None:
 def is_replacing(home: Path) -> bool:
     """Return whether an unfinished run is to replace the files of an earlier one."""
     return folder_at(home).read(_REPLACING) is not None
+
+
+def replaceable_files(home: Path) -> dict[str, str]:
+    """Return the stamps of the files that an unfinished run is to replace, by name."""
+    try:
+        return dict(json.loads(folder_at(home).read(_REPLACING) or "{}"))
+    except (ValueError, TypeError, RecursionError):
+        return {}
 
 
 def has_begun(home: Path) -> bool:

@@ -708,7 +708,7 @@ def test_match__overwrites_when_asked(folder, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     for name in OUTPUTS:
-        (out / name).write_text("of another time")
+        (out / name).write_text('{"settings": {}, "inputs": {}, "tiles": {}}')  # a run whose bands are damaged
     (out / "notes.txt").write_text("mine")
     assert invoke(*matching(folder, out, "--overwrite")).exit_code == 0
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "notes.txt"])
