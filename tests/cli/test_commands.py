@@ -792,10 +792,11 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     result = invoke(*arguments)
     assert (result.exit_code, result.stderr) == (0, "")
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "left.tif", "right.tif", "truth.tif"])
-    last = result.stdout.splitlines()[-1]
+    held, *compared = result.stdout.splitlines()[-3:]
     found = re.fullmatch(
-        r"The interval contains the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", last
+        r"The interval contains the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", held
     )
+    assert [line.split()[:3] for line in compared] == [["alpha", "0.9", "coverage"], ["coverage", "0.9", "coverage"]]
     scene = make_scene(150, 180, seed=4)
     with rasterio.open(out / "truth.tif") as file:
         np.testing.assert_array_equal(file.read(1), scene.truth)
