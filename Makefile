@@ -13,7 +13,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lint bench bench-seams tune pictures clean
+.PHONY: demo test test-all lint bench bench-seams tune calibration coverage pictures clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite
@@ -46,6 +46,14 @@ bench-seams: $(VENV)/.has-bench
 # The tables of docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; about ten minutes.
 tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/tune.py
+
+# The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; about half an hour.
+calibration: $(VENV)/.has-mccnn
+	$(BIN)/python tests/benchmarks/calibrations.py
+
+# The tables of docs/coverage.md, on the same pairs; about half an hour.
+coverage: $(VENV)/.has-mccnn
+	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/coverage_tables.py
 
 # The pictures of README.md and docs; 256 colours keep them small.
 pictures: $(VENV)/.has-dsm,plot

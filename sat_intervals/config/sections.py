@@ -201,12 +201,6 @@ class Ambiguity(Section):
         return self
 
 
-class Interval(Section):
-    """Disparity interval: alpha-cut of a possibility distribution (paper, eq. 5 to 8)."""
-
-    alpha: Exact = Field(Decimal("0.9"), gt=0, le=1, description="level of possibility, not a calibrated probability")
-
-
 class Refinement(Section):
     """Sub-pixel refinement of the disparity."""
 

@@ -55,7 +55,9 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     SatIntervalsError
         The images are not a pair, the settings lack regularisation, or the volume does not fit in memory.
     """
-    config = load_config(config, {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}})
+    config = load_config(
+        config, {"interval": {"alpha": 0.9}, "disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
+    )
     if config.regularization is None:
         raise SatIntervalsError("regularization is null, but the ablation needs it: leave it on")
     left, right, truth = (open_image(path) for path in (pair.left, pair.right, pair.truth))

@@ -60,7 +60,10 @@ class Settings(NamedTuple):
     p1, p2, regularized
         Constant SGM penalties, and whether SGM runs; without it the aggregated cost is the matching cost.
     cut_level
-        ``floor((1 - alpha) * span)``; -1: no interval.
+        ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
+    high, low, steps
+        Levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1: one level.
+        ``steps`` 0: bounds in whole pixels.
     weights
         uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine
@@ -76,6 +79,9 @@ class Settings(NamedTuple):
     cut_level: int
     weights: np.ndarray
     refine: bool
+    high: float = -1.0
+    low: float = -1.0
+    steps: int = 0
 
 
 class Raw(NamedTuple):
@@ -84,7 +90,8 @@ class Raw(NamedTuple):
     Attributes
     ----------
     winner, lower, upper
-        int16 disparities in pixels, NO_DISPARITY for none.
+        int16 disparities in pixels, NO_DISPARITY for none. Sub-pixel bounds are uint16, in steps above the first
+        disparity, without meaning where there is no winner.
     disparity
         float32 refined disparity in pixels, NaN for none.
     cost
@@ -93,6 +100,9 @@ class Raw(NamedTuple):
         uint32, 0 where there is no candidate.
     validity
         uint16 flags, without those of the left image's mask, cross-checking and regularisation.
+    lower_low, upper_low
+        Sub-pixel bounds at the level of low-confidence pixels; those at the other level are ``lower`` and ``upper``.
+        ``(0, 0)`` without a second level.
     """
 
     winner: np.ndarray
@@ -102,6 +112,12 @@ class Raw(NamedTuple):
     cost: np.ndarray
     ambiguity: np.ndarray
     validity: np.ndarray
+    lower_low: np.ndarray
+    upper_low: np.ndarray
+
+
+# Bounds of `Raw` and of the rows of postprocessing.
+BOUNDS = ("lower", "upper", "lower_low", "upper_low")
 
 
 class RightView(NamedTuple):
@@ -263,7 +279,7 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
     """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
     candidates, possible, penalties, paths, curve, inside, _, leaving, _ = buffers
-    winner, lower, upper, disparity, cost, ambiguity, validity = raw
+    winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
         falling, rising = _enter_row(buffers, gradients, settings, r)
@@ -287,9 +303,10 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             else:
                 cost_curve(candidates, r, c, curve)
             lowest = close_impossible(curve, candidates, c)
-            winner[i, j], shift, refined, lower[i, j], upper[i, j], ambiguity[i, j] = read_curve(
-                curve, lowest, settings
-            )
+            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, lowest, settings)
+            lower[i, j], upper[i, j] = high
+            if settings.low >= 0:
+                lower_low[i, j], upper_low[i, j] = low
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
                 validity[i, j] |= NOT_REFINED
@@ -308,6 +325,7 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
+    of_low = shape if settings.low >= 0 else (0, 0)
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -316,6 +334,8 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
         cost=np.full(shape, IMPOSSIBLE_COST, np.uint16),
         ambiguity=np.zeros(shape, np.uint32),
         validity=np.zeros(shape, np.uint16),
+        lower_low=np.full(of_low, NO_DISPARITY, np.int16),
+        upper_low=np.full(of_low, NO_DISPARITY, np.int16),
     )
     wanted, cores = _rectangle(output), _rectangle(core)
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
@@ -327,6 +347,8 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
+    if settings.steps:  # the sweep only carries them as int16: compiled once for both kinds
+        raw = raw._replace(**{name: getattr(raw, name).view(np.uint16) for name in BOUNDS})
     return Matched(raw, RightView(cost, winner), buffers.leaving), volume
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.disparity import vfit
-from sat_intervals.kernels.intervals import alpha_cut
+from sat_intervals.kernels.intervals import alpha_cut, subpixel_cuts
 from sat_intervals.kernels.vector import (
     LANES,
     choose_smaller,
@@ -133,13 +133,18 @@ def search_flags(costs, r, c, count, possible):
 
 @inlined
 def read_curve(curve, lowest, settings):
-    """Winner, sub-pixel shift, whether it was refined, both bounds and ambiguity of a finished curve."""
+    """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
+
+    Bounds are disparities, or steps with sub-pixel cuts; NO_DISPARITY for a level that is off.
+    """
     k = _winner(curve, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
-    lower = upper = NO_DISPARITY
-    if settings.cut_level >= 0:
+    high = low = NO_DISPARITY, NO_DISPARITY
+    if settings.steps > 0:
+        high, low = subpixel_cuts(curve, lowest, k + shift, settings)
+    elif settings.cut_level >= 0:
         first, last = _interval(curve, lowest, settings.count, settings.cut_level, settings.refine)
-        lower, upper = settings.minimum + first, settings.minimum + last
+        high = settings.minimum + first, settings.minimum + last
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
     count = settings.count if settings.weights.size else 0
-    return settings.minimum + k, shift, refined, lower, upper, ambiguity(curve, count, lowest, settings.weights)
+    return settings.minimum + k, shift, refined, high, low, ambiguity(curve, count, lowest, settings.weights)

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, InverseSgm, Mccnn, MccnnSgm, NegativeSgm
+from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
-from sat_intervals.match.mccnn import RADIUS, Network, load_network, weights_file
+from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import View, Views, Window, facing
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, calibration_of
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
@@ -74,9 +74,9 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     """
     config, store, region = job.config, job.store, job.store.grid.region
     records, statistics = store.records(), job.statistics()
-    _check_done(job, records)
+    check_done(job, records)
     histogram, seams = store.histogram(records), store.seams(records)
-    _check_matched(job, records, int(histogram.sum()))
+    check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count)
     where = job.left.georeferencing.shifted(region)
@@ -128,7 +128,7 @@ def _prefetched(items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _check_done(job: Job, records: Records) -> None:
+def check_done(job: Job, records: Records) -> None:
     """Raise if tiles are missing; a retry restores them."""
     missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
@@ -137,7 +137,7 @@ def _check_done(job: Job, records: Records) -> None:
         )
 
 
-def _check_matched(job: Job, records: Records, searched: int) -> None:
+def check_matched(job: Job, records: Records, searched: int) -> None:
     """Raise if no pixel could be matched, with the likely reason."""
     if searched:
         return
@@ -174,8 +174,13 @@ def _tags(config: Config) -> dict[str, str]:
         "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
         "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
     }
-    if config.interval:
-        tags["ALPHA"] = f"{config.interval.alpha} (level of possibility, not a probability)"
+    interval = config.interval
+    if interval and interval.coverage is not None:
+        calibration = calibration_of(config)
+        tags["COVERAGE"] = f"{interval.coverage} (mean over pixels like those of the calibration, not of each pixel)"
+        tags["CALIBRATION"] = f"{calibration.name} {calibration.sha256}"
+    elif interval:
+        tags["ALPHA"] = f"{interval.alpha} (level of possibility, not a probability)"
     return tags
 
 
@@ -184,6 +189,14 @@ def _versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that results depend on, read once from their files."""
     packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def _calibration(config: Config) -> dict[str, Any] | None:
+    """Return what the run took from its calibration, whose content is in the settings."""
+    if config.interval is None or config.interval.coverage is None or config.cuts is None:
+        return None
+    calibration = calibration_of(config)
+    return {"name": calibration.name, "sha256": calibration.sha256, **config.cuts._asdict()}
 
 
 def _report(
@@ -208,6 +221,7 @@ def _report(
             "overlap": config.tiles.overlap,
         },
         "cost_span": config.cost_span,
+        "calibration": _calibration(config),
         "normalization": statistics and statistics.report(),
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),

@@ -6,11 +6,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, Mccnn, load_config
+from sat_intervals.config import Config, Mccnn, load_config, resolved
+from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
-from sat_intervals.match.mccnn import load_network, weights_file
+from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image
@@ -129,7 +130,7 @@ def prepare(
 
     ``pair`` distinguishes otherwise equal pairs of a batch in an external store.
     """
-    config, out = fitted_to_jobs(load_config(config)), Path(out)
+    config, out = resolved(fitted_to_jobs(load_config(config))), Path(out)
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
     check_tiles(config, region)
@@ -146,7 +147,8 @@ def prepare(
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     grid = Grid(region, config.tiles.size)
-    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, run, elsewhere)
+    levels = config.subpixel_levels
+    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, run, elsewhere)
     return Job(left, right, config, store, out, inputs, files)
 
 

@@ -24,7 +24,8 @@ from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image.
 SAMPLE = 512
-# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed), strips of the final bands, files.
+# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each sub-pixel level),
+# strips of the final bands, files.
 _STORE_BYTES, _STRIP_BYTES, _FILE_BYTES = 12, 18, 10
 
 
@@ -111,7 +112,8 @@ def plan(
         worker_bytes=PROCESS_BYTES + tile_bytes(config),
         together=together,
         together_bytes=PROCESS_BYTES + together * tile_bytes(config),
-        disk_bytes=pixels * (_STORE_BYTES + _STRIP_BYTES + _FILE_BYTES) + _handed_bytes(grid, config),
+        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels + _STRIP_BYTES + _FILE_BYTES)
+        + _handed_bytes(grid, config),
         seconds=seconds,
     )
 

@@ -183,6 +183,8 @@ def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     raw = patch.raw
     inner = tile.core.relative_to(patch.output).slices
     arrays = {name: getattr(raw, name)[inner] for name in ("winner", "lower", "upper", "disparity", "validity")}
+    if job.config.subpixel_levels == 2:
+        arrays |= {name: getattr(raw, name)[inner] for name in ("lower_low", "upper_low")}
     ambiguity = raw.ambiguity[inner]
     histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.store.ambiguities)
     if job.config.cross_check:

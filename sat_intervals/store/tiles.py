@@ -41,7 +41,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 6
+LAYOUT = 7
 
 # Marker files in the folder of a run.
 # Present while a run replaces an earlier one.
@@ -71,6 +71,8 @@ class Store:
         Number of disparities of the search range.
     ambiguities
         Largest possible ambiguity of a pixel.
+    levels
+        Levels of sub-pixel bounds, see `TileArrays`.
     run
         Digest of the manifest: what belongs to another run is not taken for a part of this one.
     elsewhere
@@ -81,6 +83,7 @@ class Store:
     grid: Grid
     count: int
     ambiguities: int
+    levels: int
     run: str
     elsewhere: str | None = None
 
@@ -91,7 +94,7 @@ class Store:
 
     @property
     def _arrays(self) -> TileArrays:
-        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities)
+        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels)
 
     def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
         """Create the store or resume an existing one; call it while ``home`` is locked.
@@ -370,4 +373,4 @@ def store_of(home: Path, store: str | None = None) -> Store:
     if text is None:
         raise StoreError(f"{home.parent} has no run: give the folder that match was given")
     manifest = parsed(text, folder)
-    return Store(home, grid_of(manifest, folder), 1, 0, digest(manifest), str(folder))
+    return Store(home, grid_of(manifest, folder), 1, 0, 0, digest(manifest), str(folder))

@@ -14,11 +14,12 @@ from networks import random_weights, slow_features, trained_network, write_netwo
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
 from sat_intervals.config.pairs import PairOfBatch
+from sat_intervals.config.weights import weights_file
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.in_memory import _view
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
-from sat_intervals.match.mccnn import Network, load_network, weights_file
+from sat_intervals.match.mccnn import Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
@@ -81,7 +82,7 @@ def test_weights_file__names_the_missing_extra(monkeypatch):
     def nowhere(name):
         raise metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr("sat_intervals.match.mccnn.files", nowhere)
+    monkeypatch.setattr("sat_intervals.config.weights.files", nowhere)
     with pytest.raises(SatIntervalsError, match=r"needs the package MCCNN: pip install sat-intervals\[mccnn\]"):
         weights_file(None)
 

@@ -11,10 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import rasterio
-from helpers import OUTPUTS, bands, hashes, shares_that_differ, write_pair
+from helpers import OUTPUTS, bands, calibration, hashes, shares_that_differ, write_pair
 
 from sat_intervals import match_arrays, match_pair
-from sat_intervals.config import Cluster, load_config
+from sat_intervals.config import Cluster, load_calibration, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.products import INVALID, NO_DATA
@@ -53,6 +53,51 @@ def test_match_pair__equals_match_arrays_in_one_tile(pair, tmp_path, more):
     intervals, validity = bands(tmp_path / "out")
     np.testing.assert_array_equal(intervals, [whole[name] for name in ("disparity", "lower", "upper", "confidence")])
     np.testing.assert_array_equal(validity, whole["validity"])
+
+
+@pytest.mark.parametrize("interval", [{"alpha": 0.9, "bounds": "subpixel"}, {"coverage": 0.8}])
+def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_path, interval):
+    left, right, settings = pair
+    if "coverage" in interval:
+        interval = interval | {"calibration": calibration(load_config(settings), 30.5, 9.25, 0.8)}
+    settings = in_tiles(settings, 128, "exact", interval=interval)
+    report = match_pair(left, right, tmp_path / "out", settings)
+    with rasterio.open(left) as first, rasterio.open(right) as second:
+        whole = match_arrays(*(np.ma.masked_equal(file.read(1), 0) for file in (first, second)), settings)
+    intervals, validity = bands(tmp_path / "out")
+    np.testing.assert_array_equal(intervals, [whole[name] for name in ("disparity", "lower", "upper", "confidence")])
+    np.testing.assert_array_equal(validity, whole["validity"])
+    disparity, lower, upper, _ = (band[np.isfinite(intervals[0])] for band in intervals)
+    assert ((lower <= disparity) & (disparity <= upper)).all()
+    assert (64 * lower % 1 == 0).all()
+    assert (lower % 0.5 != 0).mean() > 0.5
+    with rasterio.open(tmp_path / "out" / "intervals.tif") as file:
+        tags = file.tags()
+    if "coverage" in interval:
+        chosen = report["settings"]["interval"]["calibration"]
+        assert report["calibration"] == {
+            "name": "flat", "sha256": load_calibration(chosen).sha256, "high": 30.5, "low": 9.25, "quantile": 0.8
+        }  # fmt: skip
+        assert tags["CALIBRATION"] == f"flat {report['calibration']['sha256']}"
+        assert tags["COVERAGE"].startswith("0.8 (")
+        assert "ALPHA" not in tags
+    else:
+        assert report["calibration"] is None
+        assert "ALPHA" in tags
+
+
+def test_match_pair__another_calibration_does_not_resume_tiles(pair, tmp_path):
+    left, right, settings = pair
+    key = load_config(settings)
+
+    def job(low):
+        interval = {"coverage": 0.9, "calibration": calibration(key, 36, low, 0.9)}
+        return prepare(left, right, tmp_path / "out", in_tiles(settings, 128, interval=interval))
+
+    job(12).begin()
+    with pytest.raises(SatIntervalsError, match="--overwrite"):
+        job(13).begin()
+    job(12).begin()
 
 
 def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):

@@ -69,7 +69,7 @@ def test_plot__makes_every_picture_and_names_it(run):
     arguments = ["plot", str(run), "--row", "60", "--columns", "20", "150", "--pixel", "60", "90", "--dpi", "50"]
     done = invoke(*arguments)
     assert done.exit_code == 0, done.output
-    names = ["overview.png", "errors.png", "profile.png", "curve.png"]
+    names = ["overview.png", "errors.png", "coverage.png", "profile.png", "curve.png"]
     assert done.output.split() == [str(run / name) for name in names]
     for name in names:
         picture = pixels_of(run / name)
