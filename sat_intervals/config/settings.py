@@ -217,7 +217,8 @@ class Config(Section):
             return None
         step = Fraction(self.ambiguity.eta_step)
         count = ceil(Fraction(self.ambiguity.eta_max) / step)
-        return tuple(floor(i * step * self.cost_span) for i in range(count))
+        levels = step * self.cost_span  # integers from here on: fractions would take longer than matching a small tile
+        return tuple(i * levels.numerator // levels.denominator for i in range(count))
 
     @property
     def largest_ambiguity(self) -> int:

@@ -168,6 +168,8 @@ class _Buffers(NamedTuple):
         Rings of the two waves of the sweep.
     leaving
         States that leave the pixels ``inside``, to fill; empty if nobody takes them over.
+    down
+        Direction of the sweep. As a constant argument of `_enter_row` it would be compiled for each direction.
     """
 
     candidates: Candidates
@@ -178,6 +180,7 @@ class _Buffers(NamedTuple):
     inside: Rectangle
     rings: tuple[Ring, ...]
     leaving: Ring
+    down: bool
 
 
 def _rectangle(window: Window) -> Rectangle:
@@ -202,16 +205,17 @@ def _prepare(
         _rectangle(inside),
         rings[:2] if down else rings[2:],
         Ring(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
+        down,
     )
 
 
 @part
-def _enter_row(buffers, gradients, settings, r, down):
+def _enter_row(buffers, gradients, settings, r):
     """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    (costs, barrier, _), possible, penalties, paths, _, inside, rings, _ = buffers
+    (costs, barrier, _), possible, penalties, paths, _, inside, rings, _, down = buffers
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
     usable = 0
@@ -237,13 +241,13 @@ def _columns(inside, r, down):
 
 
 @cached
-def _trace(buffers, gradients, settings, wave, down):
+def _trace(buffers, gradients, settings, wave):
     """Advance the paths of one wave through a patch and copy the states that leave it."""
-    candidates, possible, penalties, paths, _, inside, _, leaving = buffers
+    candidates, possible, penalties, paths, _, inside, _, leaving, down = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
-        falling, rising = _enter_row(buffers, gradients, settings, r, down)
+        falling, rising = _enter_row(buffers, gradients, settings, r)
         for c in _columns(inside, r, down):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
@@ -257,9 +261,9 @@ def _trace(buffers, gradients, settings, wave, down):
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, possible, penalties, paths, curve, inside, _, _ = buffers
+    candidates, possible, penalties, paths, curve, inside, _, _, _ = buffers
     for r in range(output.row_stop):
-        falling, rising = _enter_row(buffers, gradients, settings, r, True)
+        falling, rising = _enter_row(buffers, gradients, settings, r)
         for c in _columns(inside, r, True):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
@@ -274,11 +278,11 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
     """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
-    candidates, possible, penalties, paths, curve, inside, _, leaving = buffers
+    candidates, possible, penalties, paths, curve, inside, _, leaving, _ = buffers
     winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
-        falling, rising = _enter_row(buffers, gradients, settings, r, False)
+        falling, rising = _enter_row(buffers, gradients, settings, r)
         for c in _columns(inside, r, False):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
@@ -358,7 +362,7 @@ def trace(
     """
     down, wave = WAVEFRONTS[wavefront]
     buffers = _prepare(costs, gradients, settings, borders, down)
-    _trace(buffers, gradients, settings, wave, down)
+    _trace(buffers, gradients, settings, wave)
     return buffers.leaving
 
 

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from typing import Any, TypeVar
 
@@ -184,6 +185,13 @@ def _tags(config: Config) -> dict[str, str]:
     return tags
 
 
+@cache
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on, read once from their files."""
+    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
 def _calibration(config: Config) -> dict[str, Any] | None:
     """Return what the run took from its calibration, whose content is in the settings."""
     if config.interval is None or config.interval.coverage is None or config.cuts is None:
@@ -202,7 +210,6 @@ def _report(
 ) -> dict[str, Any]:
     """Return the content of run.json."""
     grid, config = job.store.grid, job.config
-    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
     return {
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "settings": config.model_dump(mode="json"),
@@ -225,5 +232,5 @@ def _report(
         },
         "overlap_left": None if config.tiles.overlap == "exact" else seam_report(seams, grid),
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
+        "versions": dict(_versions()),
     }

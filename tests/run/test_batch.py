@@ -468,7 +468,7 @@ def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_w
 
 def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     out = tmp_path / "out"
-    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64, "overlap": 20}}
+    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
     assert invoke("status", out).exit_code == 2
     match_pair(images / "left1.tif", images / "right1.tif", out, settings, keep_tiles=True)
     assert invoke("status", out).stdout == f"{out}: complete\n"

@@ -300,7 +300,7 @@ def write_surface(out, height, agreement=np.nan, runs=FINISHED):
 
 @pytest.mark.parametrize(
     ("shape", "agreement", "last"),
-    [((40, 60), np.nan, "Confidence"), ((700, 30), 1.0, "Agreement of runs"), ((1, 5), 1.0, "Agreement of runs")],
+    [((40, 60), np.nan, "Confidence"), ((1, 5), 1.0, "Agreement of runs")],
 )
 def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, last):
     out = write_run(tmp_path, *random_bands(20, 20)[:2])
