@@ -10,12 +10,14 @@ READY := $(VENV)/.has-$(EXTRAS)
 PYTEST := $(BIN)/python -m pytest $(OPTIONS)
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 
-.PHONY: demo test test-all lint bench tune pictures clean
+# Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: demo test test-all lint bench bench-seams tune calibration coverage pictures clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite
-	$(BIN)/sat-intervals plot demo-out
-	$(BIN)/sat-intervals report demo-out
+	$(BIN)/sat-intervals plot demo-out & $(BIN)/sat-intervals report demo-out && wait $$!
 	@echo 'Open demo-out/overview.png and demo-out/report.html'
 
 # Tests that need no services, no other extras and no real pairs; three minutes on two cores.
@@ -37,9 +39,21 @@ lint: $(READY)
 bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
 
+# The tables of docs/speed.md on exact seams; about five minutes.
+bench-seams: $(VENV)/.has-bench
+	$(BIN)/python tests/benchmarks/seams.py
+
 # The tables of docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; about ten minutes.
 tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/tune.py
+
+# The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; about half an hour.
+calibration: $(VENV)/.has-mccnn
+	$(BIN)/python tests/benchmarks/calibrations.py
+
+# The tables of docs/coverage.md, on the same pairs; about half an hour.
+coverage: $(VENV)/.has-mccnn
+	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/coverage_tables.py
 
 # The pictures of README.md and docs; 256 colours keep them small.
 pictures: $(VENV)/.has-dsm,plot
@@ -49,7 +63,8 @@ pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/sat-intervals dsm demo-out --resolution 1 --quiet
 	$(BIN)/sat-intervals plot demo-out --row 640 --columns 300 700 --dpi 72
 	mkdir -p .github/pictures
-	for name in overview profile dsm; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
+	$(BIN)/python docs/pictures/wavefronts.py demo-out/wavefronts.png
+	for name in overview profile dsm wavefronts; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
 # --no-compile saves time: Python compiles a module when it is first imported, and most never are.
 $(VENV)/.has-%: pyproject.toml $(VENV)/.made

@@ -20,6 +20,7 @@ def ablate(
     accurate: bool,
     tolerance: float,
     as_json: bool,
+    quiet: bool,
 ) -> None:
     """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS (the paper's table 2).
 
@@ -42,7 +43,8 @@ def ablate(
     ]
     scenes = []
     for pair, config in zip(found, configs, strict=True):
-        click.echo(f"matching {pair.name}", err=True)
+        if not quiet:
+            click.echo(f"matching {pair.name}", err=True)
         scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, config, tolerance=tolerance)))
     if as_json:
         say_json(scenes)

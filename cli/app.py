@@ -15,6 +15,7 @@ import click
 
 from sat_intervals.cli.ablate import ablate
 from sat_intervals.cli.batch import batch
+from sat_intervals.cli.calibrate import calibrate
 from sat_intervals.cli.demo import demo
 from sat_intervals.cli.dsm import dsm
 from sat_intervals.cli.evaluate import evaluate
@@ -153,6 +154,7 @@ main.add_command(plot)
 main.add_command(report)
 main.add_command(evaluate)
 main.add_command(ablate)
+main.add_command(calibrate)
 main.add_command(triangulate)
 main.add_command(dsm)
 main.add_command(export)

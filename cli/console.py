@@ -15,6 +15,7 @@ STAGES = {
     "scene": "making a scene",
     "pairs": "checking pairs",
     "pairs.files": "writing files of pairs",
+    "subjects": "measuring pairs",
     "kernels": "preparing kernels (compiled once per machine, then about a second)",
     "range": "finding the search range",
     "images": "measuring images",

@@ -1,11 +1,16 @@
 """``sat-intervals demo``: match a procedural scene with exact truth."""
 
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sat_intervals.cli.options import check_strict, path, run_options, settings_options, with_range
+
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
+    from sat_intervals.config import Config
 
 
 @click.command(short_help="Make a scene with exact truth, match it and compare.")
@@ -64,4 +69,30 @@ def demo(
             f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
             f"at a mean width of {figures['mean_width']:.2f} px."
         )
+        _compare(config, out, figures, console)
     check_strict(strict, report["warnings"])
+
+
+def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Console") -> None:
+    """Match again with a coverage, or with alpha if the run has a coverage, and print widths and scores of both."""
+    from sat_intervals.config import ConfigError, load_config, resolved
+    from sat_intervals.evaluate.disparity import evaluate_run
+    from sat_intervals.run.pair import match_pair
+
+    names = ["alpha 0.9", "coverage 0.9"]
+    interval = {"coverage": 0.9}
+    if config.interval is None or config.interval.coverage is not None:
+        names.reverse()
+        interval = {"alpha": 0.9}
+    try:
+        other = resolved(load_config(config, {"interval": interval, "cluster": {"store": None}}))
+    except ConfigError:  # no built-in calibration
+        return
+    with TemporaryDirectory(prefix="sat-intervals-") as folder:
+        match_pair(out / "left.tif", out / "right.tif", folder, other)
+        beside = evaluate_run(folder, out / "truth.tif")["all"]
+    for name, of in zip(names, (figures, beside), strict=True):
+        console.say(
+            f"{name:<13} coverage {of['accuracy']:.3f}, median width {of['median_width']:.2f} px, mean "
+            f"{of['mean_width']:.2f} px, interval score {of['interval_score']:.2f} px"
+        )

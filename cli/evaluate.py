@@ -59,6 +59,7 @@ def evaluate(
     accurate: bool,
     tolerance: float,
     as_json: bool,
+    quiet: bool,
 ) -> None:
     """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
 
@@ -86,8 +87,6 @@ def evaluate(
                 raise click.UsageError(f"{name} applies to runs and pairs, not to --dsm: leave it out.")
         _evaluate_surface(folders, dsm, reference, as_json)
         return
-    if not folders:
-        raise click.UsageError("Missing argument 'OUT...'.")
     from sat_intervals.cli.tables import show_groups, show_missed, show_scene
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.evaluate.paper import SceneMetrics, table_1
@@ -96,10 +95,11 @@ def evaluate(
     configs = _configs(sources, config_file, preset, accurate, cost)
     judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
     scenes = [
-        SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config))
+        SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config, quiet))
         for source, config in zip(sources, configs, strict=True)
     ]
-    _warn_of_whole_truth(scenes, tolerance)
+    if not quiet:
+        _warn_of_whole_truth(scenes, tolerance)
     if as_json:
         say_json(scenes)
     elif len(scenes) == 1:
@@ -135,6 +135,8 @@ def _sources(
     folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...], costs: tuple[str, ...]
 ) -> list[_Source]:
     """Return the sources named by the arguments, in their order; pairs once per cost."""
+    if not folders:
+        raise click.UsageError("Missing argument 'OUT...'.")
     from sat_intervals.config.pairs import check_names, find_pairs, is_pair
     from sat_intervals.errors import SatIntervalsError
 
@@ -192,13 +194,16 @@ def _configs(
     return configs
 
 
-def _evaluated(judge: Callable[..., dict[str, Any]], source: _Source, config: "Config | None") -> dict[str, Any]:
+def _evaluated(
+    judge: Callable[..., dict[str, Any]], source: _Source, config: "Config | None", quiet: bool
+) -> dict[str, Any]:
     """Evaluate a run; match a pair to files first."""
     if source.pair is None or config is None:
         return judge(source.name, source.truth, source.mask)
     from sat_intervals.run.pair import match_pair
 
-    click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
+    if not quiet:
+        click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
     with TemporaryDirectory(prefix="sat-intervals-") as out:
         match_pair(source.pair.left, source.pair.right, out, config)
         return judge(out, source.truth or source.pair.truth, source.mask)

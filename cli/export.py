@@ -24,7 +24,7 @@ def export(out: Path, target: Path, form: str) -> None:
            rectified_disp_confidence.tif
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
 
-    All have the size of the left image. Existing files of these names are replaced.
+    All have the size of the left image. Earlier exports of these names are replaced, other files are not.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.interop.export import export
 

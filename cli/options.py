@@ -77,14 +77,37 @@ _IMAGE_OPTIONS = (
 # Their parameters without the window.
 _OF_IMAGES = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
 _OF_IMAGES += ("left_mask", "right_mask")
+
+
+class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """``exact`` or a number of pixels."""
+
+    name = "exact|PIXELS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        return "exact" if value == "exact" else int(click.INT.convert(value, param, ctx))
+
+
+_OF_SETTINGS = ("preset", "cost", "coverage", "calibration", "tile_size", "overlap", "workers", "cluster", "store")
 _SETTINGS_OPTIONS = (
     click.option(
         "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
     ),
     preset_option,
     cost_option,
+    click.option(
+        "--coverage",
+        type=float,
+        metavar="C",
+        help="Share of true disparities to be inside, .5 to .99, instead of alpha.",
+    ),
+    click.option(
+        "--calibration", callback=named, metavar="FILE", help="Calibration for --coverage; default the built-in one."
+    ),
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
-    click.option("--overlap", type=int, help="Pixels read around a core."),
+    click.option(
+        "--overlap", type=_Overlap(), help="exact (default): no result depends on the tiles; or pixels around a core."
+    ),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     click.option(
         "--cluster",
@@ -129,26 +152,19 @@ def settings_options(command: Command) -> Command:
     """Add options for settings; the command gets ``config_file`` and ``given``, the sections of the command line."""
 
     @wraps(command)
-    def with_settings(
-        *,
-        preset: str | None,
-        cost: str | None,
-        tile_size: int | None,
-        overlap: int | None,
-        workers: int | None,
-        cluster: str | None,
-        store: str | None,
-        **others: Any,
-    ) -> Any:
+    def with_settings(**others: Any) -> Any:
+        of = {name: others.pop(name) for name in _OF_SETTINGS}
+        cluster, preset = of["cluster"], of["preset"]
         is_address = cluster is not None and "://" in cluster
         sections: dict[str, dict[str, Any]] = {
-            "cost": {"method": cost},
-            "tiles": {"size": tile_size, "overlap": overlap},
+            "cost": {"method": of["cost"]},
+            "interval": {"coverage": of["coverage"], "calibration": of["calibration"]},
+            "tiles": {"size": of["tile_size"], "overlap": of["overlap"]},
             "cluster": {
-                "workers": workers,
+                "workers": of["workers"],
                 "kind": "address" if is_address else cluster,
                 "address": cluster if is_address else None,
-                "store": store,
+                "store": of["store"],
             },
         }
         set_keys = {

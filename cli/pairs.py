@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from sat_intervals.evaluate.paper import SceneMetrics
 
 
-def _finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
+def finite(context: click.Context, parameter: click.Parameter, value: float) -> float:
+    """Raise if a number of pixels is infinite or NaN."""
     if not math.isfinite(value):
         raise click.BadParameter(f"{value} is not a number of pixels")
     return value
@@ -36,11 +37,12 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--tolerance",
             type=click.FloatRange(min=0),
             default=0.0,
-            callback=_finite,
+            callback=finite,
             metavar="PX",
             help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
         ),
         click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
+        click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
     ]
     for option in reversed(options):

@@ -63,10 +63,12 @@ def plan(
         made = make_plan(*open_images(left, right), config, window=window, memory=limit, progress=console.progress)
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     one, together = _verdicts(made, limit, config.cluster.kind)
+    is_exact = config.tiles.overlap == "exact"
+    seams = "exact seams" if is_exact else f"overlap {config.tiles.overlap} px"
     at_once = "1 tile" if made.workers == 1 else f"{made.workers} tiles"
     lines = {
-        "tiles": f"{made.tiles} of {made.tile_size} px{smaller}, overlap {config.tiles.overlap} px",
-        "extra work of the overlap": f"{100 * made.extra_work:.0f} %",
+        "tiles": f"{made.tiles} of {made.tile_size} px{smaller}, {seams}",
+        f"extra work of the {'seams' if is_exact else 'overlap'}": f"{100 * made.extra_work:.0f} %",
         "memory of a worker": f"{made.worker_bytes / 1e6:.0f} MB{one}",
         f"  with {made.together} tiles at once": f"{made.together_bytes / 1e6:.0f} MB{together}",
         "disk in the folder of the run": f"{made.disk_bytes / 1e9:.1f} GB at most",

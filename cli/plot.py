@@ -8,6 +8,7 @@ import click
 from sat_intervals.cli.options import log_options
 
 _FILE = click.Path(path_type=Path)
+_PICTURES = ("overview", "errors", "coverage", "profile", "curve", "dsm")
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
@@ -16,6 +17,9 @@ _FILE = click.Path(path_type=Path)
 @click.option("--row", type=int, metavar="R", help="Draw the profile of this row.")
 @click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
 @click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
+@click.option(
+    "--beside", type=_FILE, multiple=True, metavar="OUT", help="Run of the same pair at another coverage, to draw too."
+)
 @click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots per inch.")
 @log_options
 def plot(
@@ -24,6 +28,7 @@ def plot(
     row: int | None,
     columns: tuple[int, int] | None,
     pixel: tuple[int, int] | None,
+    beside: tuple[Path, ...],
     dpi: int,
 ) -> None:
     """Draw pictures of the finished run in the folder OUT and write them there.
@@ -31,6 +36,7 @@ def plot(
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
+    OUT/coverage.png   likewise: nominal and measured coverage, width; --beside adds runs at other coverages
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
     OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence
@@ -39,35 +45,45 @@ def plot(
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.raster import read_tags
     from sat_intervals.results import open_results
+    from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.marks import check_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
 
+    results = open_results(out, truth)
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
-    results = open_results(out, truth)
+    is_judged = None not in (results.truth, results.config.interval)
+    if beside and not is_judged:
+        raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
     if row is not None:
         results.check_part(row, columns)
-    if pixel is not None:
+    if pixel:
         results.check_pixel(*pixel)
-    pictures = [out / f"{name}.png" for name in ("overview", "errors", "profile", "curve", "dsm")]
-    results.check_kept(pictures, [truth, out / "dsm.tif"])
+    results.check_kept([out / f"{name}.png" for name in _PICTURES], [truth, out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
-    if results.truth is not None and results.config.interval is not None:
+    if is_judged:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)
+        drawings["coverage"] = lambda path: draw_coverage([out, *beside], truth, path, dpi)
     if row is not None:
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
-    if pixel is not None:
+    if pixel:
         drawings["curve"] = lambda path: draw_curve(results, path, *pixel, dpi)
-    surface = out / "dsm.tif"
-    if surface.exists() and results.report["finished"] not in read_tags(surface).get("RUNS", ""):
-        click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
-    elif surface.exists():
+    if _is_current(surface := out / "dsm.tif", results.report["finished"]):
         drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
     check_made_here(out / f"{name}.png" for name in drawings)
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
+
+
+def _is_current(surface: Path, finished: str) -> bool:
+    """Return whether there is a surface model of the run; say so if it belongs to another one."""
+    from sat_intervals.raster import read_tags
+
+    if not surface.exists() or finished in read_tags(surface).get("RUNS", ""):
+        return surface.exists()
+    click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
+    return False

@@ -49,6 +49,8 @@ def _show(out: Path, store: str | None) -> None:
     now = read_status(out / "tiles", store)
     left = now.total - now.done - len(now.failed)
     state = "a run is active" if now.running else "no run is active, the same command resumes it"
+    if now.handed_on:
+        state += f"; {now.handed_on} path states are handed on"
     click.echo(f"{out}: {now.done} of {now.total} tiles done, {len(now.failed)} failed, {left} left; {state}")
     for name, reason in now.failed.items():
         click.echo(f"  tile {name}: {reason}")

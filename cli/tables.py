@@ -1,13 +1,20 @@
 """Print tables: formatted on a terminal, plain aligned text elsewhere."""
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
 from rich.table import Table
 
 from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up
+
+if TYPE_CHECKING:
+    from sat_intervals.config import Calibration
+    from sat_intervals.run.tune import Tuned
+
+_EXPECTED = ("all", "high", "low", "lowest", "mean width", "median width", "score")
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
@@ -63,9 +70,23 @@ def show_scene(scene: SceneMetrics) -> None:
     rows = _areas(report, "")
     if report["with_rejected"]:
         rows += _areas(report["with_rejected"], ", with rejected")
-    show(["", "pixels", "accuracy", "relative size", "mean width (px)", "overestimation"], rows, scene.name)
+    header = [
+        "",
+        "pixels",
+        "accuracy",
+        "relative size",
+        "mean width (px)",
+        "overestimation",
+        "median width (px)",
+        "interval score (px)",
+    ]
+    show(header, rows, scene.name)
     if not report["all"]["count"]:
         click.echo("no valid pixel has a known truth: check truth and mask")
+    if report["nominal"] is not None:
+        click.echo(
+            f"nominal coverage, or alpha: {report['nominal']:g}; the interval score judges for it, less is better"
+        )
     bad = [_figure(report[name]) for name in ("bad1", "bad3")]
     click.echo(f"disparity wrong by more than 1 px: {bad[0]}, by more than 3 px: {bad[1]}")
     if report["tolerance"]:
@@ -94,9 +115,38 @@ def show_surface(name: str, report: dict[str, Any]) -> None:
     show(["", "cells", "accuracy", "median width (m)", "bias (m)", "NMAD (m)"], rows, name)
 
 
+def show_calibration(calibration: "Calibration", expected: Sequence[dict[str, float]]) -> None:
+    """Print what to expect of a calibration, its levels and its notes."""
+    rows = []
+    for row, levels in zip(expected, calibration.levels, strict=True):
+        quantile = "none" if levels.quantile is None else f"{levels.quantile:g}"
+        rows.append([f"{levels.coverage:g}", *_expected(row), f"{levels.high:.1f}", f"{levels.low:.1f}", quantile])
+    header = ["coverage", *_EXPECTED, "level high", "level low", "quantile"]
+    show(header, rows, "expected: coverage, widths and score (px) of pairs left out, and levels")
+    for note in calibration.provenance["notes"]:
+        click.echo(note)
+
+
+def show_tuned(found: "Sequence[Tuned]", best: "Tuned") -> None:
+    """Print the figures of settings that were compared."""
+    rows = [
+        [one.name + (" *" if one is best else ""), _figure(one.kept), _figure(one.good), *_expected(one.figures)]
+        for one in found
+    ]
+    show(["settings", "kept", "good", *_EXPECTED], rows, "coverage 0.9, pairs left out; * the best, which is written")
+
+
+def _expected(figures: Mapping[str, float]) -> list[str]:
+    """Format the figures of pairs left out, under the headings _EXPECTED."""
+    keys = "all", "high", "low", "lowest", "mean_width", "median_width", "score"
+    return [_figure(figures.get(key)) for key in keys]
+
+
 def _areas(report: dict[str, Any], where: str) -> list[list[str]]:
     """Return rows for all pixels counted and for those of high and low confidence."""
-    columns = ("accuracy", "relative_size", "mean_width", "relative_overestimation")
+    columns = (
+        "accuracy", "relative_size", "mean_width", "relative_overestimation", "median_width", "interval_score",
+    )  # fmt: skip
     names = {"all": "all pixels" if where else "valid pixels", "high": "high confidence", "low": "low confidence"}
     return [[name + where, *_measures(report[key], *columns)] for key, name in names.items()]
 
@@ -106,5 +156,5 @@ def _measures(area: dict[str, float | None], *columns: str) -> list[str]:
 
 
 def _figure(value: float | None) -> str:
-    """Format a figure with three decimals, or a dash for None."""
-    return "-" if value is None else f"{value:.3f}"
+    """Format a figure with three decimals, or a dash for None and NaN."""
+    return "-" if value is None or math.isnan(value) else f"{value:.3f}"

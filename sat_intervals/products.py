@@ -14,6 +14,9 @@ NO_DISPARITY = -32768
 # The aggregated cost of an impossible candidate, above every declared span.
 IMPOSSIBLE_COST = 65535
 
+# Sub-pixel bounds are multiples of 1 / 64 px, in files and, above the first disparity, in tiles.
+BOUND_STEPS = 64
+
 # MC-CNN's matching cost is 1 - cosine in steps of 1 / 125 = 0.008. Its codes, 0 to 250, fit in a byte.
 COSINE_STEPS = 125
 

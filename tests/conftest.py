@@ -8,10 +8,11 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-from helpers import write_pair
+from helpers import wait_until, write_pair
 
-from sat_intervals import match_pair
+from sat_intervals import load_config, match_pair
 from sat_intervals.demo import make_scene
+from sat_intervals.match.warm_up import compile_kernels
 
 pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
 
@@ -49,6 +50,29 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
     return report
 
 
+# Settings that need different machine code: a worker compiles for the first, another one for the next two.
+LEAST = {"cross_check": None, "median": None, "regularization": None}
+VARIANTS = ({}, {"sgm": {"penalty": "negative", "alpha": 1, "gamma": 40}} | LEAST, {"preset": "satellite"} | LEAST)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Parallel workers share the compilation of kernels before their first test, so that none is compiled twice."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    shared = tmp_path_factory.getbasetemp().parent
+    for number, settings in enumerate(VARIANTS):
+        try:
+            (shared / f"kernels{number}").mkdir()
+        except FileExistsError:  # another worker compiles these
+            continue
+        try:
+            compile_kernels(load_config({"disparity": {"minimum": 0, "maximum": 9}} | settings))
+        finally:
+            (shared / f"kernels{number}" / "done").touch()
+    wait_until(lambda: len(list(shared.glob("kernels*/done"))) == len(VARIANTS), "kernels", seconds=600)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real pairs."""
@@ -60,10 +84,11 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with left.tif, right.tif, settings.yaml for 7 x 8 tiles, and an undisturbed run of them."""
+    """A folder with left.tif, right.tif, settings.yaml for 7 x 8 tiles, and an undisturbed run of one tile."""
     folder = tmp_path_factory.mktemp("pair")
-    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64, "overlap": 20})
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", settings)
+    settings = write_pair(folder, make_scene(400, 500, seed=3), tiles={"size": 64})
+    whole = settings | {"tiles": {"size": 512}}
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", whole)
     return folder
 
 

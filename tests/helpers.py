@@ -15,6 +15,8 @@ import yaml
 from click.testing import CliRunner, Result
 
 from sat_intervals.cli import main
+from sat_intervals.config import Config, key_of
+from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import Scene
 from sat_intervals.kernels.cost import between, census
 from sat_intervals.kernels.matching import Settings, match_costs
@@ -36,6 +38,12 @@ def write_pair(folder: Path, scene: Scene, *, group: str = "all", **sections: An
     settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}} | sections
     (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
     return settings
+
+
+def calibration(config: Config, high: float, low: float, quantile: float | None) -> dict[str, Any]:
+    """A calibration of some settings with the same levels for every coverage."""
+    row = {"high": high, "low": low, "quantile": quantile}
+    return {"name": "flat", "key": key_of(config), "levels": [{"coverage": c} | row for c in COVERAGES]}
 
 
 def invoke(*arguments: object) -> Result:
@@ -65,7 +73,7 @@ def matched(scene, output=None, core=None, **options):
     """Raw products and right view of a scene of `reference`, of the whole patch by default."""
     left, right = codes_of(scene)
     output = output or Window(0, 0, *left.state.shape)
-    return match_costs(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)
+    return match_costs(between(left, right), Settings(**reference.settings_of(scene, **options)), output, core)[:2]
 
 
 def bands(out):

@@ -262,6 +262,26 @@ def alpha_cut(volume, alpha, cost_span, extend):
     return lower, upper
 
 
+def subpixel_cut(volume, level, steps, refine):
+    """Section 16: where the linear curve leaves ``min S + level`` (a Fraction), in steps, widened to hold the V-fit."""
+    lower, upper = (np.full(volume.shape[:2], NONE) for _ in range(2))
+    for r, c in np.ndindex(lower.shape):
+        costs = {k: int(s) for k, s in enumerate(volume[r, c]) if s != IMPOSSIBLE_COST}
+        if not costs:
+            continue
+        limit = min(costs.values()) + level
+        cut = [k for k, s in costs.items() if s <= limit]
+        ends = []
+        for k, step in ((min(cut), -1), (max(cut), 1)):
+            beside = costs.get(k + step)
+            ends.append(k + (0 if beside is None else step * (limit - costs[k]) / Fraction(beside - costs[k])))
+        winner = min(costs, key=lambda k: (costs[k], k))
+        winner += vfit_shift(volume[r, c], winner)[0] if refine else 0
+        lower[r, c] = math.floor(steps * min(ends[0], winner))
+        upper[r, c] = math.ceil(steps * max(ends[1], winner))
+    return lower, upper
+
+
 def cut_level(alpha, cost_span):
     """Section 5: the largest ``S - min S`` that belongs to the cut."""
     return int((1 - Decimal(str(alpha))) * cost_span)
@@ -278,15 +298,18 @@ def vfit(volume, winner, minimum):
     disparity = np.full(winner.shape, np.nan, np.float32)
     refined = np.zeros(winner.shape, bool)
     for r, c in np.argwhere(winner != NONE):
-        k = int(winner[r, c])
-        shift = Fraction(0)
-        if 0 < k < volume.shape[2] - 1:
-            before, here, after = (int(s) for s in volume[r, c, k - 1 : k + 2])
-            if before != IMPOSSIBLE_COST and after != IMPOSSIBLE_COST and max(before, after) > here:
-                shift = Fraction(before - after, 2 * (max(before, after) - here))
-                refined[r, c] = True
-        disparity[r, c] = float(minimum + k + shift)
+        shift, refined[r, c] = vfit_shift(volume[r, c], int(winner[r, c]))
+        disparity[r, c] = float(minimum + int(winner[r, c]) + shift)
     return disparity, refined
+
+
+def vfit_shift(curve, k):
+    """The shift of the winner k, a Fraction, and whether it was refined."""
+    if 0 < k < curve.size - 1:
+        before, here, after = (int(s) for s in curve[k - 1 : k + 2])
+        if before != IMPOSSIBLE_COST and after != IMPOSSIBLE_COST and max(before, after) > here:
+            return Fraction(before - after, 2 * (max(before, after) - here)), True
+    return Fraction(0), False
 
 
 def right_winners(volume):
@@ -473,6 +496,19 @@ def percentiles_of(amounts, searched, config):
     return (p1, p99) if p1 < p99 else (0.0, largest)
 
 
+def cuts_of(volume, cost_span, config):
+    """Sections 5 and 16: bounds of each pixel as indices, at one level or at those of both classes."""
+    refine = config.refinement is not None
+    if config.interval.bounds == "whole":
+        yield alpha_cut(volume, config.interval.alpha, cost_span, extend=refine)
+        return
+    levels = [Fraction((1 - Decimal(str(config.interval.alpha or 1))) * cost_span)]
+    if config.interval.coverage is not None:
+        levels = [Fraction(config.cuts.high), Fraction(config.cuts.low)][: 2 if config.regularization else 1]
+    for level in levels:
+        yield tuple(bound / 64 for bound in subpixel_cut(volume, level, 64, refine))
+
+
 def match_arrays(left, right, left_state, right_state, config):
     """All sections on one small pair; ``config`` has the YAML's sections as attributes, None = switched off.
 
@@ -486,6 +522,8 @@ def match_arrays(left, right, left_state, right_state, config):
     volume, left_windows, right_windows = match_view(view, minimum, maximum, config)
     cost_span = span(config.cost.window, config.sgm and config.sgm.p2)
 
+    is_subpixel = config.interval is not None and config.interval.bounds == "subpixel"
+
     winner = winner_takes_all(volume)
     searched = winner != NONE
     disparity, refined = vfit(volume, winner, minimum)
@@ -495,10 +533,13 @@ def match_arrays(left, right, left_state, right_state, config):
     flags = validity(left_state, left_windows, right_windows, refined)
     lower, upper = (np.full(winner.shape, np.nan, np.float32) for _ in range(2))
     untextured = searched & textureless(view, minimum, config.disparity.count, config.cost.window)
+    of_levels = []
     if config.interval is not None:
-        bounds = alpha_cut(volume, config.interval.alpha, cost_span, extend=config.refinement is not None)
-        lower, upper = (np.where(searched, b + minimum, np.nan).astype(np.float32) for b in bounds)
-        lower[untextured], upper[untextured] = minimum, maximum
+        for bounds in cuts_of(volume, cost_span, config):
+            lower, upper = (np.where(searched, b + minimum, np.nan).astype(np.float32) for b in bounds)
+            lower[untextured], upper[untextured] = minimum, maximum
+            of_levels.append((lower, upper))
+        lower, upper = of_levels[0]
     count = maximum - minimum + 1
     below, above = (searched & ~untextured & end for end in (winner <= 1, winner >= count - 2))
     if count > 8:
@@ -516,22 +557,35 @@ def match_arrays(left, right, left_state, right_state, config):
         amounts = ambiguity(volume, config.ambiguity.eta_max, config.ambiguity.eta_step, cost_span)
         amounts[untextured] = len(etas(config.ambiguity.eta_max, config.ambiguity.eta_step)) * config.disparity.count
         confidence = normalize(amounts, searched, *percentiles_of(amounts, searched, config))
-    if config.disparity.open_ends and count > 8:
+    has_coverage = config.interval is not None and config.interval.coverage is not None
+    if (config.disparity.open_ends or has_coverage) and count > 8:
         confidence[below | above] = 0
         flags[below] |= OPEN_BELOW
         flags[above] |= OPEN_ABOVE
 
+    if config.regularization is not None:
+        low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
+        if len(of_levels) == 2:
+            lower, upper = (np.where(low, *bounds) for bounds in zip(*of_levels[::-1], strict=True))
     if config.median is not None:
         disparity = median(disparity, kept, config.median.size)
         if config.interval is not None:
             lower, upper = (median(bound, kept, config.median.size) for bound in (lower, upper))
     if config.regularization is not None:
         settings = config.regularization
-        low = low_confidence(confidence, settings.threshold, settings.kernel)
-        lower, upper = regularize(lower, upper, low, settings.depth, settings.quantile)
+        quantile = settings.quantile
+        if is_subpixel:
+            quantile = config.cuts.quantile
+            lower, upper = (
+                np.where(low, rounded(8 * bound) / 8, bound) for rounded, bound in ((np.floor, lower), (np.ceil, upper))
+            )
+        if quantile is not None:
+            lower, upper = regularize(lower, upper, low, settings.depth, quantile)
         flags |= np.where(low, REGULARIZED, 0).astype(np.uint16)
     if config.interval is not None:
         lower, upper = widen(lower, upper, disparity)
+    if is_subpixel:
+        lower, upper = np.floor(64 * lower) / 64, np.ceil(64 * upper) / 64
 
     hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
     shown = (flags & hidden) == 0
@@ -635,7 +689,7 @@ def span_of(scene):
     return span(scene.window, scene.p2 if scene.regularized else None)
 
 
-def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True):
+def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True, cuts=(-1, -1), steps=0):
     """The fields of ``sat_intervals.kernels.matching.Settings`` for a scene; None = the step is off."""
     cost_span = span_of(scene)
     weights = np.zeros(0, np.uint16)
@@ -652,6 +706,9 @@ def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True)
         "cut_level": NONE if alpha is None else cut_level(alpha, cost_span),
         "weights": weights,
         "refine": refine,
+        "high": float(cuts[0]),
+        "low": float(cuts[1]),
+        "steps": steps,
     }
 
 

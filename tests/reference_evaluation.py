@@ -19,7 +19,7 @@ def evaluate(scene, rules, remove_bias=False, with_rejected=False):
         bias = middle([float(scene.disparity[p]) - float(scene.truth[p]) for p in pixels(known & scene.valid)]) or 0.0
     report = figures(scene, rules, pixels(known & scene.valid), bias)
     report["bias"] = bias if remove_bias else None
-    report["tolerance"] = rules.tolerance
+    report["tolerance"], report["nominal"] = rules.tolerance, rules.nominal
     truths = [float(scene.truth[p]) for p in pixels(known & scene.valid)]
     report["truth_is_whole"] = bool(truths) and all(truth.is_integer() for truth in truths)
     report["with_rejected"] = figures(scene, rules, pixels(known), bias) if with_rejected else None
@@ -37,10 +37,22 @@ def figures(scene, rules, judged, bias):
         for p in judged
     }
 
+    def score(p):
+        """Gneiting and Raftery (2007), eq. 43, of the interval widened by the tolerance but for its width."""
+        lower, upper = float(scene.lower[p]) - rules.tolerance, float(scene.upper[p]) + rules.tolerance
+        return width[p] + 2 / (1 - rules.nominal) * max(lower - truth[p], truth[p] - upper, 0)
+
     def intervals(chosen):
         size = middle([width[p] / max(rules.maximum - rules.minimum, 1) for p in chosen])
         accuracy, mean_width = share([inside[p] for p in chosen]), mean(width[p] for p in chosen) if chosen else None
-        return {"count": len(chosen), "accuracy": accuracy, "relative_size": size, "mean_width": mean_width}
+        return {
+            "count": len(chosen),
+            "accuracy": accuracy,
+            "relative_size": size,
+            "mean_width": mean_width,
+            "median_width": middle([width[p] for p in chosen]),
+            "interval_score": None if rules.nominal is None or not chosen else mean(map(score, chosen)),
+        }
 
     worst = area_errors(low, error, rules.depth)
     report = {

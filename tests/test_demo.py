@@ -83,15 +83,11 @@ def test_make_scene__arrays_are_as_declared(scene):
     assert (scene.truth.shape, scene.visible.shape) == ((ROWS, COLUMNS), (ROWS, COLUMNS))
 
 
-def test_make_scene__range_encloses_the_truth_with_3_px_to_spare(scene):
+def test_make_scene__range_is_that_of_a_city_with_3_px_to_spare(scene):
     assert scene.minimum + 3 == np.floor(np.nanmin(scene.truth))
     assert scene.maximum - 3 == np.ceil(np.nanmax(scene.truth))
     assert scene.minimum < 0 < scene.maximum
-
-
-def test_make_scene__default_range_is_that_of_a_city():
-    default = make_scene(snr=np.inf, psf=0)
-    assert 40 <= default.maximum - default.minimum <= 60
+    assert 40 <= scene.maximum - scene.minimum <= 60
 
 
 def test_make_scene__the_empty_corner_has_no_truth(scene):

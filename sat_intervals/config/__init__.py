@@ -1,5 +1,7 @@
 """Settings: defaults, ranges, one-line descriptions and derived thresholds."""
 
+from sat_intervals.config.calibration import Calibration, calibration_of, key_of, load_calibration, resolved
+from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
 from sat_intervals.config.reading import load_config
@@ -9,7 +11,6 @@ from sat_intervals.config.sections import (
     Cluster,
     ConfigError,
     Disparity,
-    Interval,
     Mccnn,
     Regularization,
 )
@@ -19,6 +20,7 @@ from sat_intervals.config.wording import allowed
 __all__ = [
     "PRESETS",
     "Ambiguity",
+    "Calibration",
     "Census",
     "Cluster",
     "Config",
@@ -33,6 +35,10 @@ __all__ = [
     "Regularization",
     "Sgm",
     "allowed",
+    "calibration_of",
+    "key_of",
+    "load_calibration",
     "load_config",
     "preset_text",
+    "resolved",
 ]

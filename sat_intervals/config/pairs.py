@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from sat_intervals.config.reading import LARGEST_TABLE, load_yaml, read_small
+from sat_intervals.config.files import LARGEST_TABLE, load_yaml, read_small
 from sat_intervals.errors import SatIntervalsError
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
@@ -32,7 +33,10 @@ _NODES = 200_000
 
 @dataclass(frozen=True)
 class Pair:
-    """Two epipolar images, their true disparity and the search range, both ends included."""
+    """Two epipolar images, their true disparity and the search range, both ends included.
+
+    ``tolerance`` and ``remove_bias`` tell how `calibrate` compares with the truth; None: as its options say.
+    """
 
     name: str
     group: str
@@ -41,6 +45,8 @@ class Pair:
     truth: Path
     minimum: int
     maximum: int
+    tolerance: float | None = None
+    remove_bias: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
 
     A folder holds ``left.tif``, ``right.tif``, ``truth.tif`` and ``meta.json`` with ``disparity``, the search range
     ``[minimum, maximum]``, and optionally ``group``. A CSV file has a header with the columns left, right, truth,
-    minimum, maximum and optionally name and group; its paths are relative to the file.
+    minimum, maximum and optionally name, group, tolerance and remove_bias; its paths are relative to the file.
 
     Raises
     ------
@@ -163,8 +169,21 @@ def _of_table(file: Path) -> list[Pair]:
         except ValueError as error:
             raise SatIntervalsError(f"{place}: minimum {minimum!r}, maximum {maximum!r}, needed: integers") from error
         left, right, truth = (file.parent / row[image] for image in ("left", "right", "truth"))
-        pairs.append(Pair(row.get("name", row["left"]), row.get("group", NO_GROUP), left, right, truth, *search))
+        named = row.get("name", row["left"]), row.get("group", NO_GROUP)
+        pairs.append(Pair(*named, left, right, truth, *search, *_of_truth(place, row)))
     return pairs
+
+
+def _of_truth(place: str, row: Mapping[str, Any]) -> tuple[float | None, bool | None]:
+    """Return tolerance and remove_bias of a row, None where it has none."""
+    tolerance, remove_bias = (load_yaml(row.get(key, "null")) for key in ("tolerance", "remove_bias"))
+    if not isinstance(remove_bias, bool | None):
+        raise SatIntervalsError(f"{place}: remove_bias is {remove_bias!r}, allowed: true or false")
+    if tolerance is None:
+        return None, remove_bias
+    if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < math.inf:
+        raise SatIntervalsError(f"{place}: tolerance is {tolerance!r}, allowed: a number >= 0")
+    return float(tolerance), remove_bias
 
 
 def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:

@@ -32,7 +32,7 @@ def with_preset(values: Mapping[str, Any]) -> dict[str, Any]:
             preset["sgm"] = {key: own[key] for key in ("p1", "p2")}
         elif sgm.keys() - {"penalty", "span"} and "span" not in sgm:
             own.pop("span", None)
-    return merged(without_other_cost(preset, values), values)
+    return merged(without_other_interval(without_other_cost(preset, values), values), values)
 
 
 def _settings(name: Any) -> dict[str, Any]:
@@ -55,6 +55,18 @@ def without_other_cost(values: Mapping[str, Any], overrides: Mapping[str, Any]) 
     if chosen == (method(values) or method(_settings(preset)) or "census"):
         return values
     return {key: value for key, value in values.items() if key != "cost" and (key != "sgm" or value is None)}
+
+
+def without_other_interval(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the settings without the level of their intervals if the overrides give one: alpha or coverage."""
+    given, interval = overrides.get("interval"), values.get("interval")
+    levels = ("alpha", "coverage")
+    if not isinstance(interval, Mapping) or not isinstance(given, Mapping):
+        return values
+    if all(given.get(level) is None for level in levels):
+        return values
+    dropped = levels if given.get("coverage") is not None else (*levels, "calibration")
+    return {**values, "interval": {key: value for key, value in interval.items() if key not in (*dropped, "bounds")}}
 
 
 def merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:

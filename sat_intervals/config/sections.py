@@ -71,7 +71,8 @@ class Disparity(Section):
     maximum: Pixels = Field(AUTO, description="largest disparity searched, in pixels; auto: found from the images")
 
     open_ends: bool = Field(
-        False, description="confidence 0 and an open interval at the ends of the range; true where it was found"
+        False,
+        description="confidence 0 and open intervals at the ends of the range, as where it is found or with a coverage",
     )
 
     local: bool = Field(False, description="search a range of its own in each cell of the image, found from the images")
@@ -232,12 +233,6 @@ class Ambiguity(Section):
         return self
 
 
-class Interval(Section):
-    """Disparity interval: alpha-cut of a possibility distribution (paper, eq. 5 to 8)."""
-
-    alpha: Exact = Field(Decimal("0.9"), gt=0, le=1, description="level of possibility, not a calibrated probability")
-
-
 class Refinement(Section):
     """Sub-pixel refinement of the disparity."""
 
@@ -276,8 +271,8 @@ class Tiles(Section):
         1024, ge=64, le=16384, multiple_of=64, description="side of a tile's core, in pixels; determines the memory"
     )
     overlap: Annotated[int, Field(ge=1, le=4096)] | Literal["exact"] = Field(
-        100,
-        description="pixels read around the core and dropped; exact: none, tiles hand SGM's path states on",
+        "exact",
+        description="exact: tiles hand SGM's path states on, or pixels read around the core and dropped",
     )
 
     @property

@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from sat_intervals.config.calibration import Calibration, Cuts, at, calibration_of
+from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import AnySgm, CosineSgm, MccnnSgm, Sgm
 from sat_intervals.config.presets import PRESETS, with_preset
 from sat_intervals.config.sections import (
@@ -18,7 +20,6 @@ from sat_intervals.config.sections import (
     Cluster,
     CrossCheck,
     Disparity,
-    Interval,
     Mccnn,
     Median,
     Products,
@@ -27,7 +28,7 @@ from sat_intervals.config.sections import (
     Section,
     Tiles,
 )
-from sat_intervals.products import IMPOSSIBLE_COST
+from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST
 
 SGM_PATHS = 8
 
@@ -90,12 +91,7 @@ class Config(Section):
             )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
-        if self.tiles.overlap == "exact":
-            if self.cross_check and self.cross_check.method == "accurate":
-                raise ValueError(
-                    "tiles.overlap is exact, which cross_check.method accurate does not know: give a number"
-                )
-        elif self.tiles.overlap < smallest:
+        if self.tiles.overlap != "exact" and self.tiles.overlap < smallest:
             raise ValueError(
                 f"tiles.overlap is {self.tiles.overlap}, allowed: >= {smallest} with {self._cost_in_words}"
             )
@@ -130,6 +126,11 @@ class Config(Section):
         return floor(Fraction(value) * self.cost.steps + Fraction(1, 2))
 
     @property
+    def matches_right_view(self) -> bool:
+        """Return whether the right view is matched with its own cost volume, for accurate cross-checking."""
+        return self.cross_check is not None and self.cross_check.method == "accurate"
+
+    @property
     def hands_states_on(self) -> bool:
         """Return whether tiles hand path states of SGM to their neighbours."""
         return self.tiles.overlap == "exact" and self.sgm is not None
@@ -137,7 +138,7 @@ class Config(Section):
     @property
     def opens_ends(self) -> bool:
         """Return whether intervals at the ends of the search range are open, with confidence 0."""
-        return self.disparity.open_ends
+        return self.disparity.open_ends or (self.interval is not None and self.interval.coverage is not None)
 
     @property
     def largest_p2(self) -> int:
@@ -166,10 +167,57 @@ class Config(Section):
 
     @property
     def cut_level(self) -> int | None:
-        """Return the largest ``S(d) - min S`` of the alpha-cut, ``floor((1 - alpha) * cost_span)``; None if off."""
-        if self.interval is None:
+        """Return the largest whole ``S(d) - min S`` of the alpha-cut, ``floor((1 - alpha) * cost_span)``.
+
+        None without intervals or with a coverage.
+        """
+        if self.interval is None or self.interval.alpha is None:
             return None
         return floor((1 - Fraction(self.interval.alpha)) * self.cost_span)
+
+    @property
+    def cuts(self) -> Cuts | None:
+        """Return the levels of sub-pixel cuts in integer costs, and the quantile of the regularisation.
+
+        With alpha both levels are the same. None without intervals, and with bounds in whole pixels. Whether a
+        calibration that is given belongs to the settings is checked by `resolved`, once a run.
+
+        Raises
+        ------
+        ConfigError
+            No calibration belongs to the settings.
+        """
+        if self.interval is None or not self.subpixel_levels:
+            return None
+        if self.interval.coverage is not None:
+            given = self.interval.calibration
+            calibration = given if isinstance(given, Calibration) else calibration_of(self)
+            return at(calibration, float(self.interval.coverage))
+        level = float((1 - Fraction(self.interval.alpha or 1)) * self.cost_span)
+        return Cuts(level, level, self.regularization.quantile if self.regularization else None)
+
+    @property
+    def subpixel_levels(self) -> int:
+        """Return the number of levels of sub-pixel bounds: 2 with a coverage, 1 with alpha, 0 for whole pixels.
+
+        With a coverage and no regularisation there are no classes of confidence, and so 1 level.
+        """
+        if self.interval is None or self.interval.bounds == "whole":
+            return 0
+        return 2 if self.interval.coverage is not None and self.regularization is not None else 1
+
+    @property
+    def bound_steps(self) -> int:
+        """Return the steps per pixel of sub-pixel bounds in the tiles, a power of two; 0 for bounds in whole pixels.
+
+        It is 64 up to 1024 disparities; beyond, the largest with which the range fits in 16 bits.
+        """
+        if not self.subpixel_levels:
+            return 0
+        steps = BOUND_STEPS
+        while (self.disparity.count - 1) * steps >= np.iinfo(np.uint16).max:
+            steps //= 2
+        return steps
 
     @property
     def ambiguity_levels(self) -> tuple[int, ...] | None:
@@ -178,7 +226,8 @@ class Config(Section):
             return None
         step = Fraction(self.ambiguity.eta_step)
         count = ceil(Fraction(self.ambiguity.eta_max) / step)
-        return tuple(floor(i * step * self.cost_span) for i in range(count))
+        levels = step * self.cost_span  # integers from here on: fractions would take longer than matching a small tile
+        return tuple(i * levels.numerator // levels.denominator for i in range(count))
 
     @property
     def largest_ambiguity(self) -> int:

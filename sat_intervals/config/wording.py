@@ -23,7 +23,7 @@ def allowed(field: FieldInfo) -> str:
     signs = {"ge": ">=", "gt": ">", "le": "<=", "multiple_of": "multiple of"}
     kinds = get_args(field.annotation) or (field.annotation,)
     constraints = [*field.metadata, *(of_kind for kind in kinds for info in _bounds(kind) for of_kind in info.metadata)]
-    kinds = tuple(get_args(kind)[0] if _bounds(kind) else kind for kind in kinds)
+    kinds = tuple(get_args(kind)[0] if hasattr(kind, "__metadata__") else kind for kind in kinds)
     words = [str(word) for kind in kinds[1:] if get_origin(kind) is Literal for word in get_args(kind)]
     sections = _sections(field.annotation)
     kind = (

@@ -22,7 +22,7 @@ from sat_intervals.match.patch import kernel_settings, match_right, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, cut_rows, postprocess_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY, Bands
 from sat_intervals.raster import Image, check_pair, open_image, read_views, read_window
-from sat_intervals.tiling import Views, Window
+from sat_intervals.tiling import Views, Window, facing
 
 # The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).
 _BASELINE = 1, 10
@@ -55,7 +55,9 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     SatIntervalsError
         The images are not a pair, the settings lack regularisation, or the volume does not fit in memory.
     """
-    config = load_config(config, {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}})
+    config = load_config(
+        config, {"interval": {"alpha": 0.9}, "disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
+    )
     if config.regularization is None:
         raise SatIntervalsError("regularization is null, but the ablation needs it: leave it on")
     left, right, truth = (open_image(path) for path in (pair.left, pair.right, pair.truth))
@@ -93,7 +95,7 @@ def _statistics(images: Sequence[Image], config: Config) -> PairStatistics | Non
 def _check_memory(whole: Window, config: Config) -> None:
     """Raise if the cost volume and the bands do not fit in memory."""
     pixels, count = whole.height * whole.width, config.disparity.count
-    beyond = count - 1 if config.cross_check and config.cross_check.method == "accurate" else 0
+    beyond = count - 1 if config.matches_right_view else 0
     needed = PROCESS_BYTES + volume_bytes(whole.height, whole.width + beyond, config) + _PIXEL_BYTES * pixels
     what = f"{whole.height} x {whole.width} pixels x {count} disparities"
     check_memory(needed, what, "cut the pair")
@@ -118,7 +120,8 @@ def _all_methods(
     del volume, cost  # free memory before the right view's volume
     if of_right:
         (cost,) = cost_areas(views, of_right, config, statistics)
-        seen = match_right(cost, of_right[0], whole, settings).winner
+        reach = facing(whole, search.minimum, search.maximum)
+        seen = match_right(cost, of_right[0], reach, settings)[0].winner
     histogram = ambiguity_histogram(ambiguity, winner != NO_DISPARITY, config.largest_ambiguity)
     assert config.ambiguity is not None  # regularisation needs it
     validity = np.where(winner == NO_DISPARITY, NO_CANDIDATE, 0).astype(np.uint16)

@@ -9,9 +9,10 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.metrics import Criteria, Evaluated, Metrics, bias_histogram
+from sat_intervals.evaluate.metrics import Criteria, Evaluated, Metrics
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
+from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.postprocess import cut_rows, with_halo
 from sat_intervals.products import Bands
 from sat_intervals.results import Layer, Run, open_run
@@ -45,13 +46,14 @@ def evaluate_run(
 
     Returns
     -------
-    Figures over valid pixels: for ``all``, ``high`` and ``low`` confidence ``count``, ``accuracy``, ``relative_size``
-    and ``mean_width`` (pixels), for ``low`` also ``relative_overestimation``; ``bad1`` and ``bad3``, the shares of
-    disparities wrong by more than 1 and 3 px; ``truth_outside_range``, the share of truths outside the search range;
-    ``deciles`` of confidence with their coverage. ``with_rejected`` contains the same over all pixels with an interval,
-    None unless the run kept rejected pixels. ``bias`` is the bias removed (pixels), None without ``remove_bias``.
-    ``truth_is_whole`` is true if all truths of valid pixels are whole numbers. ``cost`` and ``tolerance`` are the
-    settings used.
+    Figures over valid pixels: for ``all``, ``high`` and ``low`` confidence ``count``, ``accuracy``, ``relative_size``,
+    ``mean_width``, ``median_width`` and ``interval_score`` (pixels), for ``low`` also ``relative_overestimation``;
+    ``bad1`` and ``bad3``, the shares of disparities wrong by more than 1 and 3 px; ``truth_outside_range``, the share
+    of truths outside the search range; ``deciles`` of confidence with their coverage. ``with_rejected`` contains the
+    same over all pixels with an interval, None unless the run kept rejected pixels. ``bias`` is the bias removed
+    (pixels), None without ``remove_bias``. ``truth_is_whole`` is true if all truths of valid pixels are whole numbers.
+    ``nominal`` is the coverage or the alpha of the run, for which ``interval_score`` judges. ``cost`` and
+    ``tolerance`` are the settings used.
 
     Raises
     ------
@@ -81,7 +83,10 @@ def evaluate_run(
 def criteria_of(config: Config, tolerance: float = 0.0) -> Criteria:
     """Return the criteria for a run; without regularisation, low confidence follows the default settings."""
     low, search = config.regularization or Regularization(), config.disparity
-    return Criteria(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance)
+    interval = config.interval
+    level = None if interval is None else interval.coverage or interval.alpha
+    nominal = None if level is None else float(level)
+    return Criteria(search.minimum, search.maximum, low.threshold, low.kernel, low.depth, tolerance, nominal=nominal)
 
 
 def evaluate(
@@ -110,6 +115,7 @@ def evaluate(
         **report,
         "truth_is_whole": is_whole and report["all"]["count"] > 0,
         "tolerance": criteria.tolerance,
+        "nominal": criteria.nominal,
         "bias": bias,
         "with_rejected": written.report() if with_rejected else None,
     }

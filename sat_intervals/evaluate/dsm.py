@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.metrics import Histogram
+from sat_intervals.match.histogram import Histogram
 from sat_intervals.raster import (
     Georeferencing,
     check_reference,

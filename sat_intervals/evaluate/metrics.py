@@ -1,7 +1,6 @@
 """Accumulate figures of merit of intervals (paper section 4.1; METHOD.md, section 10).
 
-Medians come from histograms with these steps: widths 0.01 px, overestimation 0.001 (at least -99), bias 0.001 px
-(within 1000 px), confidence 0.001.
+Medians come from histograms with these steps: widths 0.01 px, overestimation 0.001 (at least -99), confidence 0.001.
 """
 
 from dataclasses import dataclass
@@ -9,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import Bands
 
-_WIDTH, _RATIO, _BIAS, _CONFIDENCE = 100, 1000, 1000, 1000  # steps a unit
-_LARGEST_RATIO, _LARGEST_BIAS = 100, 1000
+_WIDTH, _RATIO, _CONFIDENCE = 100, 1000, 1000  # steps a unit
+_LARGEST_RATIO = 100
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class Criteria:
         Distance in pixels up to which a truth outside an interval counts as inside.
     bias
         Pixels added to the truth before any comparison.
+    nominal
+        Coverage that the intervals are to reach: that of the settings, or alpha. None: unknown, no interval scores.
     """
 
     minimum: int
@@ -38,6 +40,7 @@ class Criteria:
     depth: int
     tolerance: float = 0.0
     bias: float = 0.0
+    nominal: float | None = None
 
 
 class Evaluated(NamedTuple):
@@ -58,50 +61,24 @@ class Evaluated(NamedTuple):
     area_error: np.ndarray
 
 
-class Histogram:
-    """Counts of values from ``first`` to ``last``, ``steps`` per unit; values beyond are clipped."""
-
-    def __init__(self, first: int, last: int, steps: int) -> None:
-        self._first, self._steps = first, steps
-        self._counts = np.zeros((last - first) * steps + 1, np.int64)
-
-    def add(self, values: np.ndarray) -> None:
-        """Count values; none may be NaN."""
-        places = np.rint((values - self._first) * self._steps)
-        places = np.clip(places, 0, self._counts.size - 1).astype(np.int64)
-        self._counts += np.bincount(places, minlength=self._counts.size)
-
-    def median(self) -> float | None:
-        """Return the median (the mean of both middle values of an even number); None without values."""
-        upto = np.cumsum(self._counts)
-        if upto[-1] == 0:
-            return None
-        middle = np.searchsorted(upto, [(upto[-1] - 1) // 2, upto[-1] // 2], side="right")
-        return float(self._first + middle.sum() / (2 * self._steps))
-
-    def deviation(self) -> float | None:
-        """Return the median absolute deviation from the median; None without values."""
-        median = self.median()
-        if median is None:
-            return None
-        distance = np.abs(self._first + np.arange(self._counts.size) / self._steps - median)
-        nearest_first = np.argsort(distance, kind="stable")
-        upto = np.cumsum(self._counts[nearest_first])
-        return float(distance[nearest_first[np.searchsorted(upto, (upto[-1] - 1) // 2, side="right")]])
-
-
 class _Intervals:
-    """Accuracy and size of the intervals of a group of pixels (paper eq. 14 and 15)."""
+    """Accuracy and size of the intervals of a group of pixels (paper eq. 14 and 15), and their score.
 
-    def __init__(self, search: int) -> None:
+    The interval score (Gneiting and Raftery 2007) is ``width + 2 / (1 - nominal) * distance of a missed truth``.
+    """
+
+    def __init__(self, search: int, nominal: float | None) -> None:
         self._search = search
+        self._of_misses = None if nominal is None or nominal >= 1 else 2 / (1 - nominal)
         self._count = self._inside = 0
-        self._width = 0.0
+        self._width = self._missed = 0.0
         self._widths = Histogram(0, search, _WIDTH)
 
-    def add(self, inside: np.ndarray, width: np.ndarray) -> None:
-        self._count += inside.size
-        self._inside += int(inside.sum())
+    def add(self, missed: np.ndarray, width: np.ndarray) -> None:
+        """Add pixels, with the distance of a missed truth from the interval; 0 if it is inside."""
+        self._count += missed.size
+        self._inside += int((missed == 0).sum())
+        self._missed += float(missed.sum())
         self._width += float(width.sum())
         self._widths.add(width)
 
@@ -112,6 +89,10 @@ class _Intervals:
             "accuracy": _share(self._inside, self._count),
             "relative_size": None if median is None else median / max(self._search, 1),
             "mean_width": _share(self._width, self._count),
+            "median_width": median,
+            "interval_score": None
+            if self._of_misses is None
+            else _share(self._width + self._of_misses * self._missed, self._count),
         }
 
 
@@ -150,7 +131,9 @@ class Metrics:
 
     def __init__(self, criteria: Criteria) -> None:
         self._criteria = criteria
-        self._areas = {name: _Intervals(criteria.maximum - criteria.minimum) for name in ("all", "high", "low")}
+        self._areas = {
+            name: _Intervals(criteria.maximum - criteria.minimum, criteria.nominal) for name in ("all", "high", "low")
+        }
         self._ratios = Histogram(0, _LARGEST_RATIO, _RATIO)
         self._deciles = _Deciles()
         self._wrong = {"bad1": 0, "bad3": 0, "truth_outside_range": 0}
@@ -160,9 +143,11 @@ class Metrics:
         disparity, lower, upper, confidence, _, truth, _ = pixels.bands
         low, criteria = pixels.low, self._criteria
         inside = (lower - criteria.tolerance <= truth) & (truth <= upper + criteria.tolerance)
+        outside = np.maximum(lower - criteria.tolerance - truth, truth - upper - criteria.tolerance)
+        missed = np.where(inside, 0.0, outside)
         width = upper - lower
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
-            self._areas[name].add(inside[chosen], width[chosen])
+            self._areas[name].add(missed[chosen], width[chosen])
         wide = low & (width > 0)
         self._ratios.add(pixels.area_error[wide] / width[wide])
         self._deciles.add(confidence, inside, width)
@@ -179,11 +164,6 @@ class Metrics:
         for name, count in self._wrong.items():
             report[name] = _share(count, report["all"]["count"])
         return report | {"deciles": self._deciles.report()}
-
-
-def bias_histogram() -> Histogram:
-    """Return an empty histogram for differences of disparity and truth."""
-    return Histogram(-_LARGEST_BIAS, _LARGEST_BIAS, _BIAS)
 
 
 def _share(part: float, whole: float) -> float | None:

@@ -5,6 +5,7 @@ enough. Rows are read, computed and written strip by strip, so memory does not d
 """
 
 import json
+import os
 from collections.abc import Iterable, Iterator
 from operator import index
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.progress import Progress
-from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image
+from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image, read_tags
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -67,7 +68,7 @@ def triangulate(
     from sat_intervals.heights.sensors import Lattice, Sensors  # needs the extra `dsm`
 
     run = open_run(out)
-    _published(run.out)  # a foreign points.json is not replaced
+    _check_own(run.out)
     run.check_kept([run.out / name for name in (_POINTS, _REPORT)], [left_model, right_model, left_grid, right_grid])
     search = run.config.disparity
     sensors = Sensors.load(*map(Path, (left_model, right_model, left_grid, right_grid)))
@@ -85,6 +86,18 @@ def triangulate(
         writer.publish((_REPORT, json.dumps({"files": writer.build()}, indent=1) + "\n"))
         progress("files", 1, 1)
     return tally.report() | {"median_residual": lattice.residual}
+
+
+def _check_own(out: Path) -> None:
+    """Raise if ``points.tif`` or ``points.json`` exists and was not made by this tool."""
+    path = out / _POINTS
+    if _published(out) is None and os.path.lexists(path):
+        try:
+            is_own = "RUN" in read_tags(path)
+        except SatIntervalsError:
+            is_own = False
+        if not is_own:
+            raise SatIntervalsError(f"{path} exists and was not made by triangulate, or is damaged: move it away")
 
 
 def check_points(out: Path) -> None:

@@ -16,7 +16,7 @@ from cars.data_structures import cars_dataset
 from json_checker import Or
 from pandora.margins import Margins
 
-from sat_intervals.config import Config, load_config
+from sat_intervals.config import Config, load_config, resolved
 from sat_intervals.errors import SatIntervalsError
 
 # Bands of `match_arrays` -> names in CARS' triangulation. CARS computes its ambiguity, 1 - confidence, from the first.
@@ -69,7 +69,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         self.method = "sat_intervals"
         self.corr_config: dict[str, Any] = {}
         self.loader = _NoLoader()
-        overlap = self._config(0, 0).tiles.support
+        overlap = resolved(self._config(0, 0)).tiles.support
         self.margins = Margins(overlap, overlap, overlap, overlap)
 
     def _config(self, minimum: int, maximum: int) -> Config:
@@ -83,7 +83,10 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
                 "intervals and ambiguity"
             )
         ambiguity = settings.get("ambiguity", {})
-        if isinstance(ambiguity, Mapping):
+        # CARS' tiles are matched alone, so confidence is scaled without percentiles. But calibrations belong to these.
+        interval = settings.get("interval", {})
+        has_coverage = isinstance(interval, Mapping) and interval.get("coverage") is not None
+        if isinstance(ambiguity, Mapping) and not has_coverage:
             ambiguity = {"normalization": "range", **ambiguity}
         return load_config({**settings, "ambiguity": ambiguity, "disparity": {"minimum": minimum, "maximum": maximum}})
 

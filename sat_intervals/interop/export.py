@@ -12,7 +12,7 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import LEFT_WINDOW, Band, Bands
-from sat_intervals.raster import File, Georeferencing, OutputWriter
+from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_marked
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window, strips
 
@@ -94,13 +94,13 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
 
     Returns
     -------
-    The files written. Existing files of these names are replaced. A band that the run lacks, such as bounds without
+    The files written. Existing exports of these names are replaced. A band that the run lacks, such as bounds without
     intervals, has no file.
 
     Raises
     ------
     SatIntervalsError
-        The folder is not a run, or a file cannot be written or would replace an input or a file of the run.
+        The folder is not a run, or a file cannot be written or would replace one that is not an export.
     """
     run, target = open_run(out), Path(target)
     left = run.report["inputs"]["left"]
@@ -111,7 +111,9 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     rasters = FORMATS[form](prefix, run.config)
     files = [file for file, _ in rasters]
     run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
-    with OutputWriter(folder, files, *shape, Georeferencing(), {}) as writer:
+    for file in files:
+        check_marked(folder / file.name)
+    with OutputWriter(folder, files, *shape, Georeferencing(), MARK) as writer:
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))

@@ -21,6 +21,12 @@ def fingerprint(package: Path) -> str:
     return digest.hexdigest()[:16]
 
 
+# Decorators of functions that only kernels call: without wrappers for callers in Python they compile faster.
+_PART = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+part = njit(**_PART)
+inlined = njit(forceinline=True, **_PART)
+inlined_unchecked = njit(forceinline=True, error_model="numpy", **_PART)  # divisions by zero do not raise
+
 FINGERPRINT = fingerprint(Path(__file__).parents[1])
 _LOCK = threading.Lock()
 

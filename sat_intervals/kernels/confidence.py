@@ -4,13 +4,12 @@ Letters: r row, c column, k disparity index.
 """
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined
 from sat_intervals.products import IMPOSSIBLE_COST
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def ambiguity(curve, first, stop, lowest, weights):
     """Ambiguity of one pixel: the number of disparities that cost at most ``lowest + eta * span``, summed over etas.
 

@@ -4,14 +4,13 @@ Letters: r row, c column, k disparity index, x = c + k column of the right featu
 """
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.kernels.vector import LANES, load_floats, multiply_add, splat_float, store_rounded
 from sat_intervals.products import COSINE_STEPS
 
 
-@njit(nogil=True)
+@part
 def _copy_row(features, r, factor, row):
     """Copy the features of a row, times a factor, to contiguous memory.
 
@@ -22,7 +21,7 @@ def _copy_row(features, r, factor, row):
             row[f, x] = factor * features[f, r, x]
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _correlate_four(here, there, c, start, curves):
     """Costs of the pixels ``c .. c + 3``: ``curves[i, x]`` is that of pixel ``c + i`` and right pixel ``c + x``.
 

@@ -6,9 +6,8 @@ Letters: r row, c column, k disparity index (disparity = minimum + k), w word of
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, load_bytes, store
 
 
@@ -140,7 +139,7 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     return Codes(words, window_state(state, radius))
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _matching_costs(left, right, r, c, k):
     """Costs of the candidates ``k .. k + 31`` of the left pixel ``(r, c)``; arrays as in `Costs`."""
     if right is None:
@@ -206,14 +205,25 @@ class Ranges(NamedTuple):
     last: np.ndarray
 
 
-@njit(nogil=True, forceinline=True)
+@part
+def enter_cells(candidates, cells, ranges, r):
+    """Set the search ranges of the pixels of a row, and where their walls are."""
+    i, number = (r + cells.row) // cells.height, cells.first.shape[1]
+    for j in range(number):
+        start, stop = max(0, j * cells.width - cells.column), (j + 1) * cells.width - cells.column
+        ranges.first[start:stop] = cells.first[i, j]
+        ranges.last[start:stop] = cells.last[i, j]
+        candidates.walls[start:stop] = (i * number + j) * candidates.beyond.shape[1]
+
+
+@inlined
 def candidate_costs(candidates, r, c, k):
     """Costs of the candidates ``k .. k + 31`` of a pixel, raised where they are impossible or not searched."""
     costs = _matching_costs(candidates.costs.left, candidates.costs.right, r, c, k)
     return larger(larger(costs, load(candidates.barrier, c + k)), load(candidates.beyond, candidates.walls[c] + k))
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def cost_curve(candidates, r, c, curve):
     """Write the costs of all candidates of a pixel to ``curve``."""
     for k in range(0, curve.size, LANES):

@@ -93,6 +93,26 @@ def read_alpha_cuts(volume: np.ndarray, minimum: int, cut_level: int, refine: bo
     return _read_bounds(volume, minimum, lambda curves, lowest: lowest + cut_level, refine)
 
 
+def read_subpixel_cut(
+    curve: np.ndarray, minimum: int, level: float, steps: int, disparity: float
+) -> tuple[float, float]:
+    """Bounds in pixels of the cut of one curve at a level above its lowest cost (METHOD.md, section 16).
+
+    ``curve`` is ``(count,)``; bounds are rounded outwards to ``1 / steps`` px and contain ``disparity``.
+    """
+    costs = np.where(curve == IMPOSSIBLE_COST, np.inf, curve.astype(np.float64))
+    limit = costs.min() + level
+    inside = np.flatnonzero(costs <= limit)
+    ends = []
+    for k, step in ((inside[0], -1), (inside[-1], 1)):
+        is_cut = 0 <= k + step < costs.size and np.isfinite(costs[k + step])
+        share = (limit - costs[k]) / (costs[k + step] - costs[k]) if is_cut else 0.0
+        ends.append(k * steps + step * np.ceil(steps * share))
+    winner = steps * (disparity - minimum)
+    lower, upper = min(ends[0], np.floor(winner)), max(ends[1], np.ceil(winner))
+    return float(minimum + lower / steps), float(minimum + upper / steps)
+
+
 def read_baseline(volume: np.ndarray, minimum: int, part: int, whole: int) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the paper's baseline (its section 4.1): each curve is normalised by its own minimum and maximum.
 

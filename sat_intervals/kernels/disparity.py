@@ -5,13 +5,12 @@ from the one that faces the first left column at the minimum (``x = c + k``).
 """
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
+from sat_intervals.kernels.compiled import cached, inlined, inlined_unchecked, part
 from sat_intervals.products import IMPOSSIBLE_COST, MISMATCH, NO_DISPARITY, OCCLUSION
 
 
-@njit(nogil=True, forceinline=True, error_model="numpy")
+@inlined_unchecked
 def vfit(curve, k, count):
     """Sub-pixel shift of the winner ``k`` by V-fit (Haller and Nedevschi 2012), at most half a pixel.
 
@@ -66,7 +65,7 @@ def cross_check(winner, right_winner, minimum, tolerance):
     return flags
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _insert(values, count, value):
     """Insert a value into the first ``count`` values, which are sorted."""
     i = count
@@ -76,7 +75,7 @@ def _insert(values, count, value):
     values[i] = value
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _median_around(values, kept, r, c, radius, window):
     """Median of the kept pixels in the window around the kept pixel ``(r, c)``."""
     rows, columns = values.shape
@@ -92,7 +91,7 @@ def _median_around(values, kept, r, c, radius, window):
     return middle
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _ordered(a, b, c):
     """Sort three values by comparisons and selections, which vectorise."""
     a, b = (a, b) if a < b else (b, a)
@@ -101,7 +100,7 @@ def _ordered(a, b, c):
     return a, b, c
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _column(values, kept, c, infinity):
     """Sort the three values of a window's column, with infinities of alternating sign in place of rejected ones.
 
@@ -113,7 +112,7 @@ def _column(values, kept, c, infinity):
     return _ordered(a, b, d), infinity
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _middle_of_nine(values, kept, c, infinity):
     """Middle of the 3 x 3 window from column c on (Devillard 1998), with infinities in place of rejected values.
 
@@ -129,7 +128,7 @@ def _middle_of_nine(values, kept, c, infinity):
     return _ordered(low, middle, high)[1]
 
 
-@njit(nogil=True)
+@part
 def _medians_of_nine(values, kept, result):
     """Medians of the 3 x 3 windows along a row, from three rows with one more pixel at both ends."""
     infinity = np.float32(np.inf)
@@ -138,7 +137,7 @@ def _medians_of_nine(values, kept, result):
         result[c] = (lower + upper) / np.float32(2) if kept[1][c + 1] else values[1][c + 1]
 
 
-@njit(nogil=True)
+@part
 def _median_3(values, kept):
     """Medians of 3 x 3 windows: the same operations on every pixel, kept or not, so that they vectorise.
 
@@ -151,8 +150,8 @@ def _median_3(values, kept):
     for r in range(-1, rows):
         entering = (r + 1) % 3
         if r + 1 < rows:
-            near[entering, 1:-1] = values[r + 1]
-            near_kept[entering, 1:-1] = kept[r + 1]
+            for c in range(columns):  # a copy of slices would take seconds longer to compile
+                near[entering, c + 1], near_kept[entering, c + 1] = values[r + 1, c], kept[r + 1, c]
         else:
             near_kept[entering] = False
         if r >= 0:

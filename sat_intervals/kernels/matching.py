@@ -10,17 +10,27 @@ Letters: r row, c column, k disparity index (disparity = minimum + k).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from sat_intervals.kernels.compiled import cached
-from sat_intervals.kernels.cost import Candidates, Cells, Costs, Ranges, cost_curve, one_cell, padded_to_lanes
+from sat_intervals.kernels.compiled import cached, part
+from sat_intervals.kernels.cost import (
+    Candidates,
+    Cells,
+    Costs,
+    Ranges,
+    cost_curve,
+    enter_cells,
+    one_cell,
+    padded_to_lanes,
+)
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
 from sat_intervals.kernels.reading import (
     Rectangle,
     RightPixels,
     close_impossible,
+    columns_of,
     contains,
     read_curve,
+    rectangle_of,
     search_flags,
     update_right,
 )
@@ -33,6 +43,7 @@ from sat_intervals.kernels.sgm import (
     add_curve,
     advance_pixel,
     advance_wave,
+    copy_curve,
     enter_row,
     hand_on,
     no_borders,
@@ -40,11 +51,7 @@ from sat_intervals.kernels.sgm import (
     restart,
     take_over,
 )
-from sat_intervals.products import (
-    IMPOSSIBLE_COST,
-    NO_DISPARITY,
-    NOT_REFINED,
-)
+from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY, NOT_REFINED
 from sat_intervals.tiling import Window
 
 
@@ -60,7 +67,10 @@ class Settings(NamedTuple):
     p1, p2, regularized
         Constant SGM penalties, and whether SGM runs; without it the aggregated cost is the matching cost.
     cut_level
-        ``floor((1 - alpha) * span)``; -1: no interval.
+        ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
+    high, low, steps
+        Levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1: one level.
+        ``steps`` 0: bounds in whole pixels.
     weights
         uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine
@@ -79,6 +89,9 @@ class Settings(NamedTuple):
     cut_level: int
     weights: np.ndarray
     refine: bool
+    high: float = -1.0
+    low: float = -1.0
+    steps: int = 0
     offset: int = 0
     total: int = 0
 
@@ -89,7 +102,8 @@ class Raw(NamedTuple):
     Attributes
     ----------
     winner, lower, upper
-        int16 disparities in pixels, NO_DISPARITY for none.
+        int16 disparities in pixels, NO_DISPARITY for none. Sub-pixel bounds are uint16, in steps above the first
+        disparity of the whole search range, without meaning where there is no winner.
     disparity
         float32 refined disparity in pixels, NaN for none.
     cost
@@ -98,6 +112,9 @@ class Raw(NamedTuple):
         uint32, 0 where there is no candidate.
     validity
         uint16 flags, without those of the left image's mask, cross-checking and regularisation.
+    lower_low, upper_low
+        Sub-pixel bounds at the level of low-confidence pixels; those at the other level are ``lower`` and ``upper``.
+        ``(0, 0)`` without a second level.
     """
 
     winner: np.ndarray
@@ -107,6 +124,12 @@ class Raw(NamedTuple):
     cost: np.ndarray
     ambiguity: np.ndarray
     validity: np.ndarray
+    lower_low: np.ndarray
+    upper_low: np.ndarray
+
+
+# Bounds of `Raw` and of the rows of postprocessing.
+BOUNDS = ("lower", "upper", "lower_low", "upper_low")
 
 
 class RightView(NamedTuple):
@@ -122,6 +145,24 @@ class RightView(NamedTuple):
 
     cost: np.ndarray
     winner: np.ndarray
+
+
+class Matched(NamedTuple):
+    """What `match_costs` returns.
+
+    Attributes
+    ----------
+    raw
+        Products of the wanted pixels.
+    right
+        Winners of the right pixels that face the core.
+    leaving
+        States of the last of WAVEFRONTS where it leaves the patch, as `trace` returns them; empty without borders.
+    """
+
+    raw: Raw
+    right: RightView
+    leaving: Ring
 
 
 class _Buffers(NamedTuple):
@@ -141,6 +182,10 @@ class _Buffers(NamedTuple):
         Pixels whose paths are computed; those of the pixels around them come from ``rings``.
     rings
         Rings of the two waves of the sweep.
+    leaving
+        States that leave the pixels ``inside``, to fill; empty if nobody takes them over.
+    down
+        Direction of the sweep. As a constant argument of `_enter_row` it would be compiled for each direction.
     """
 
     candidates: Candidates
@@ -153,26 +198,25 @@ class _Buffers(NamedTuple):
     curve: np.ndarray
     inside: Rectangle
     rings: tuple[Ring, ...]
-
-
-def _rectangle(window: Window) -> Rectangle:
-    return Rectangle(window.row, window.column, window.row_stop, window.column_stop)
+    leaving: Ring
+    down: bool
 
 
 def _prepare(
     costs: Costs,
     gradients: Gradients | None,
     settings: Settings,
-    inside: Window,
-    rings: tuple[Ring, ...],
+    borders: Borders | None,
     cells: Cells | None,
+    down: bool = True,
 ) -> _Buffers:
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
+    left = borders.inside if borders else Window(0, 0, 0, 0)
+    inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
     cells = cells or one_cell(rows, columns, settings.count)
-    k = np.arange(size)
+    k, slots = np.arange(size), 1 + 3 * columns
     beyond = (k < cells.first[..., np.newaxis]) | (k > cells.last[..., np.newaxis])
     walls = np.where(beyond.reshape(-1, size), np.uint16(WALL), np.uint16(0))
-    slots = 1 + 3 * columns
     return _Buffers(
         Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
         cells,
@@ -182,23 +226,25 @@ def _prepare(
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
         Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
         np.zeros(size, np.uint16),
-        _rectangle(inside),
-        rings,
+        rectangle_of(inside),
+        rings[:2] if down else rings[2:],
+        Ring(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
+        down,
     )
 
 
-@njit(nogil=True)
-def _enter_row(buffers, gradients, settings, r, down):
+@part
+def _enter_row(buffers, gradients, settings, r):
     """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    candidates, cells, ranges, usable, possible, penalties, paths, _, inside, rings = buffers
+    candidates, cells, ranges, usable, possible, penalties, paths, _, inside, rings, _, down = buffers
     costs, barrier = candidates.costs, candidates.barrier
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
         usable[x + 1] = usable[x] + (costs.right_state[r, x] == 0)
-    _enter_cells(candidates, cells, ranges, r)
+    enter_cells(candidates, cells, ranges, r)
     for c in range(possible.size):
         inner = usable[c + ranges.last[c] + 1] - usable[c + ranges.first[c]]
         possible[c] = inner if costs.left_state[r, c] == 0 else 0
@@ -209,50 +255,31 @@ def _enter_row(buffers, gradients, settings, r, down):
     return falling, rising
 
 
-@njit(nogil=True)
-def _enter_cells(candidates, cells, ranges, r):
-    """Set the search ranges of the pixels of a row, and where their walls are."""
-    i, number = (r + cells.row) // cells.height, cells.first.shape[1]
-    for j in range(number):
-        start, stop = max(0, j * cells.width - cells.column), (j + 1) * cells.width - cells.column
-        ranges.first[start:stop] = cells.first[i, j]
-        ranges.last[start:stop] = cells.last[i, j]
-        candidates.walls[start:stop] = (i * number + j) * candidates.beyond.shape[1]
-
-
-@njit(nogil=True, forceinline=True)
-def _columns(inside, r, down):
-    """Columns of row ``r`` that lie inside, in the order of the sweep."""
-    if not inside.row <= r < inside.row_stop:
-        return range(0, 0, 1)
-    return range(inside.column, inside.column_stop, 1) if down else range(inside.column_stop - 1, inside.column - 1, -1)
-
-
 @cached
-def _trace(buffers, gradients, settings, wave, down, target):
-    """Advance the paths of one wave through a patch and copy the states that leave it to ``target``, a `Ring`."""
-    candidates, _, _, _, possible, penalties, paths, _, inside, _ = buffers
+def _trace(buffers, gradients, settings, wave):
+    """Advance the paths of one wave through a patch and copy the states that leave it."""
+    candidates, _, _, _, possible, penalties, paths, _, inside, _, leaving, down = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
-        falling, rising = _enter_row(buffers, gradients, settings, r, down)
-        for c in _columns(inside, r, down):
+        falling, rising = _enter_row(buffers, gradients, settings, r)
+        for c in columns_of(inside, r, down):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
             else:
                 advance_wave(candidates, penalties, paths, slots, wave, r, c)
         if inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, wave, down, target)
+            hand_on(paths, inside, r, falling, rising, wave, down, leaving)
 
 
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, _, _, _, possible, penalties, paths, curve, inside, _ = buffers
+    candidates, _, _, _, possible, penalties, paths, curve, inside, _, _, _ = buffers
     for r in range(output.row_stop):
-        falling, rising = _enter_row(buffers, gradients, settings, r, True)
-        for c in _columns(inside, r, True):
+        falling, rising = _enter_row(buffers, gradients, settings, r)
+        for c in columns_of(inside, r, True):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
@@ -265,13 +292,13 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
-    """Finish and read the curves of the pixels of ``output``, and update the right view."""
-    candidates, _, ranges, _, possible, penalties, paths, curve, inside, _ = buffers
-    winner, lower, upper, disparity, cost, ambiguity, validity = raw
+    """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
+    candidates, _, ranges, _, possible, penalties, paths, curve, inside, _, leaving, _ = buffers
+    winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
-        falling, rising = _enter_row(buffers, gradients, settings, r, False)
-        for c in _columns(inside, r, False):
+        falling, rising = _enter_row(buffers, gradients, settings, r)
+        for c in columns_of(inside, r, False):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
@@ -292,26 +319,29 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             else:
                 cost_curve(candidates, r, c, curve)
             lowest = close_impossible(curve, candidates, c)
-            winner[i, j], shift, refined, lower[i, j], upper[i, j], ambiguity[i, j] = read_curve(
-                curve, lowest, settings, least, most
-            )
+            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, lowest, settings, least, most)
+            lower[i, j], upper[i, j] = high
+            if settings.low >= 0:
+                lower_low[i, j], upper_low[i, j] = low
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:
                 validity[i, j] |= NOT_REFINED
             if contains(right.core, r, c):
                 update_right(curve, right, r, c)
             if keep:
-                volume[i, j] = curve
+                copy_curve(curve, volume[i, j])
+        if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
+            hand_on(paths, inside, r, falling, rising, 1, False, leaving)
 
 
 def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
-    """Run both sweeps; return the raw products, the right view and the volume (finished curves only with ``keep``)."""
+    """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    borders = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
-    buffers = _prepare(costs, gradients, settings, borders.inside, borders.rings[:2], cells)
+    buffers = _prepare(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
+    of_low = shape if settings.low >= 0 else (0, 0)
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -320,19 +350,22 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
         cost=np.full(shape, IMPOSSIBLE_COST, np.uint16),
         ambiguity=np.zeros(shape, np.uint32),
         validity=np.zeros(shape, np.uint16),
+        lower_low=np.full(of_low, NO_DISPARITY, np.int16),
+        upper_low=np.full(of_low, NO_DISPARITY, np.int16),
     )
-    wanted, cores = _rectangle(output), _rectangle(core)
+    wanted, cores = rectangle_of(output), rectangle_of(core)
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         _sweep_down(buffers, gradients, settings, wanted, volume)
-        for state in buffers.paths:
-            state[:] = 0
-    _sweep_up(buffers._replace(rings=borders.rings[2:]), gradients, settings, wanted, volume, raw, right, keep)
+        buffers = _prepare(costs, gradients, settings, borders, cells, down=False)
+    _sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
-    return raw, RightView(cost, winner), volume
+    if settings.steps:  # the sweep only carries them as int16: compiled once for both kinds
+        raw = raw._replace(**{name: getattr(raw, name).view(np.uint16) for name in BOUNDS})
+    return Matched(raw, RightView(cost, winner), buffers.leaving), volume
 
 
 def trace(
@@ -349,12 +382,9 @@ def trace(
     Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]
-    rings = borders.rings[:2] if down else borders.rings[2:]
-    buffers = _prepare(costs, gradients, settings, borders.inside, rings, cells)
-    inside, size = borders.inside, buffers.curve.size
-    target = Ring(np.empty((inside.height, 2, size), np.uint16), np.empty((inside.width, 2, size), np.uint16))
-    _trace(buffers, gradients, settings, wave, down, target)
-    return target
+    buffers = _prepare(costs, gradients, settings, borders, cells, down)
+    _trace(buffers, gradients, settings, wave)
+    return buffers.leaving
 
 
 def match_costs(
@@ -365,7 +395,7 @@ def match_costs(
     gradients: Gradients | None = None,
     borders: Borders | None = None,
     cells: Cells | None = None,
-) -> tuple[Raw, RightView]:
+) -> Matched:
     """Match a patch: matching costs in, raw products and the right view's winners out.
 
     Parameters
@@ -387,13 +417,9 @@ def match_costs(
 
     Returns
     -------
-    Raw
-        Of the shape of ``output``.
-    RightView
-        Of ``core.height`` rows and ``core.width + count - 1`` columns.
+    ``raw`` of the shape of ``output``, ``right`` of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    raw, right_view, _ = _sweep(costs, gradients, settings, output, core or output, False, borders, cells)
-    return raw, right_view
+    return _sweep(costs, gradients, settings, output, core or output, False, borders, cells)[0]
 
 
 def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = None) -> np.ndarray:
@@ -402,4 +428,4 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True, None, None)[2][:, :, : settings.count]
+    return _sweep(costs, gradients, settings, whole, whole, True, None, None)[1][:, :, : settings.count]

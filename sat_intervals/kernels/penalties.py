@@ -11,8 +11,8 @@ diagonal, 2 along the rising one, 3 along the column.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.vector import load, mix, splat
 
 EDGES, NEGATIVE, INVERSE = range(3)
@@ -100,7 +100,7 @@ def make_penalties(gradients: Gradients | None, p1: int, p2: int, columns: int, 
     return Penalties(p1, p2, RowPenalties(first, second, np.zeros((4, columns + size), np.uint16)))
 
 
-@njit(nogil=True)
+@part
 def _step_back(i, down):
     """Offset to the previous pixel of a path: rows and columns to add."""
     row = 0 if i == 0 else 1
@@ -108,7 +108,7 @@ def _step_back(i, down):
     return (-row, -column) if down else (row, column)
 
 
-@njit(nogil=True)
+@part
 def _differences(image, r, row, column, differences):
     """Absolute differences of a row to the pixels at an offset; 0 where these are outside: paths start there."""
     columns = image.shape[1]
@@ -119,7 +119,7 @@ def _differences(image, r, row, column, differences):
             differences[c] = abs(here[c] - there[c + column])
 
 
-@njit(nogil=True)
+@part
 def _fill_edges(gradients, r, down, row_penalties):
     """Fill the penalties of a row from the edges of both images."""
     (left, right, rule), (p1, p2, edges) = gradients, row_penalties
@@ -140,7 +140,7 @@ def _fill_edges(gradients, r, down, row_penalties):
             p2[0, i, c], p2[1, i, c] = rule.p2[i, level], rule.p2[i, other]
 
 
-@njit(nogil=True)
+@part
 def _fill_banz(gradients, r, down, row_penalties):
     """Fill the penalties of a row from the gradient of the left image."""
     (left, _, rule), (p1, p2, _) = gradients, row_penalties
@@ -157,7 +157,7 @@ def _fill_banz(gradients, r, down, row_penalties):
             p2[:, i, c] = max(np.int64(rule.p2[i, 0]), np.int64(np.floor(penalty + 0.5)))
 
 
-@njit(nogil=True)
+@part
 def fill_row(gradients, r, down, row):
     """Fill the penalties of a row for a sweep down or up; do nothing without gradients."""
     if gradients is not None:
@@ -167,7 +167,7 @@ def fill_row(gradients, r, down, row):
             _fill_banz(gradients, r, down, row)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def penalties_of(p1, p2, row, i, c, k):
     """P1 and P2 of the candidates ``k .. k + 31`` of a pixel on a path."""
     if row is None:

@@ -6,11 +6,11 @@ Letters: r row, c column, k disparity index (disparity = minimum + k).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.confidence import ambiguity
 from sat_intervals.kernels.disparity import vfit
-from sat_intervals.kernels.intervals import alpha_cut
+from sat_intervals.kernels.intervals import alpha_cut, subpixel_cuts
 from sat_intervals.kernels.vector import (
     LANES,
     choose_smaller,
@@ -33,6 +33,7 @@ from sat_intervals.products import (
     RANGE_INCOMPLETE,
     RIGHT_MASKED,
 )
+from sat_intervals.tiling import Window
 
 
 class Rectangle(NamedTuple):
@@ -44,13 +45,26 @@ class Rectangle(NamedTuple):
     column_stop: int
 
 
-@njit(nogil=True, forceinline=True)
+def rectangle_of(window: Window) -> Rectangle:
+    """Convert a window."""
+    return Rectangle(window.row, window.column, window.row_stop, window.column_stop)
+
+
+@inlined
 def contains(rectangle, r, c):
     """Whether a rectangle contains the pixel ``(r, c)``."""
     return rectangle.row <= r < rectangle.row_stop and rectangle.column <= c < rectangle.column_stop
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
+def columns_of(inside, r, down):
+    """Columns of row ``r`` that lie inside, in the order of the sweep."""
+    if not inside.row <= r < inside.row_stop:
+        return range(0, 0, 1)
+    return range(inside.column, inside.column_stop, 1) if down else range(inside.column_stop - 1, inside.column - 1, -1)
+
+
+@inlined
 def close_impossible(curve, candidates, c):
     """Set impossible candidates and those that are not searched to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
@@ -63,7 +77,7 @@ def close_impossible(curve, candidates, c):
     return smallest(lowest)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _winner(curve, lowest):
     """First index with the lowest cost: 14 ns for 64 disparities by vectors, 36 ns by single costs."""
     k = 0
@@ -74,7 +88,7 @@ def _winner(curve, lowest):
     return k + first_lane(mask)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _interval(curve, lowest, least, most, cut_level, refine):
     """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
     first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
@@ -100,7 +114,7 @@ class RightPixels(NamedTuple):
     best: np.ndarray
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def update_right(curve, right, r, c):
     """Update the right pixels that a left pixel faces with its candidates.
 
@@ -115,7 +129,7 @@ def update_right(curve, right, r, c):
         store(right.cost, start + k, smaller(candidate, known))
 
 
-@njit(nogil=True)
+@part
 def search_flags(costs, r, c, first, last, possible):
     """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
     flags = 0
@@ -132,18 +146,21 @@ def search_flags(costs, r, c, first, last, possible):
     return flags
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def read_curve(curve, lowest, settings, least, most):
-    """Winner, sub-pixel shift, whether it was refined, both bounds and ambiguity of a finished curve.
+    """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
 
-    ``least`` and ``most`` are the first and the last candidate searched.
+    ``least`` and ``most`` are the first and the last candidate searched. Bounds are disparities, or steps with
+    sub-pixel cuts; NO_DISPARITY for a level that is off.
     """
     k = _winner(curve, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
-    lower = upper = NO_DISPARITY
-    if settings.cut_level >= 0:
+    high = low = NO_DISPARITY, NO_DISPARITY
+    if settings.steps > 0:
+        high, low = subpixel_cuts(curve, lowest, k + shift, settings)
+    elif settings.cut_level >= 0:
         first, last = _interval(curve, lowest, least, most, settings.cut_level, settings.refine)
-        lower, upper = settings.minimum + first, settings.minimum + last
+        high = settings.minimum + first, settings.minimum + last
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
     stop = most + 1 if settings.weights.size else least
     amount = ambiguity(curve, least, stop, lowest, settings.weights)
@@ -153,10 +170,10 @@ def read_curve(curve, lowest, settings, least, most):
             amount += settings.weights[0] * (settings.total - count)
         else:
             amount += amount * (settings.total - count) // count
-    return settings.minimum + k, shift, refined, lower, upper, amount
+    return settings.minimum + k, shift, refined, high, low, amount
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _distrusts(k, least, most, settings):
     """Whether a winner stands at an end of its cell's range that is no end of the whole range, or next to it.
 

@@ -12,8 +12,8 @@ Letters: r row, c column, k disparity index (disparity d = minimum + k), in bloc
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sat_intervals.kernels.compiled import inlined, part
 from sat_intervals.kernels.cost import candidate_costs
 from sat_intervals.kernels.penalties import penalties_of
 from sat_intervals.kernels.vector import (
@@ -49,7 +49,7 @@ class Paths(NamedTuple):
     lowest: np.ndarray
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _begin(paths, slot):
     """State of a path at a pixel: start of its curve, ``min L(q)``, L(q) of two blocks, and the least L so far."""
     start = slot * paths.curves.shape[1]
@@ -57,7 +57,7 @@ def _begin(paths, slot):
     return start, splat(paths.lowest[slot]), wall, load(paths.curves, start), nothing_yet
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _advance(path, curves, k, costs, penalties):
     """Apply the recurrence to the candidates ``k .. k + 31`` of a path; return its next state and their L."""
     start, lowest, before, here, minimum = path
@@ -68,7 +68,7 @@ def _advance(path, curves, k, costs, penalties):
     return (start, lowest, here, after, smaller(minimum, best)), best
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
     """Advance the four paths in ``slots`` by the pixel ``(r, c)``; write their sum of L to ``target`` from ``offset``.
 
@@ -98,7 +98,7 @@ def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
     lowest[slots[2]], lowest[slots[3]] = smallest(path_3[4]), smallest(path_4[4])
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _advance_pair(candidates, penalties, paths, slots, i, r, c):
     """Advance the paths ``i`` and ``i + 1``, which have ``slots``, by the pixel ``(r, c)``."""
     curves, lowest = paths
@@ -113,7 +113,7 @@ def _advance_pair(candidates, penalties, paths, slots, i, r, c):
     lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def advance_wave(candidates, penalties, paths, slots, wave, r, c):
     """Advance the two paths of a wave by the pixel ``(r, c)``."""
     if wave == 0:
@@ -122,7 +122,7 @@ def advance_wave(candidates, penalties, paths, slots, wave, r, c):
         _advance_pair(candidates, penalties, paths, (slots[2], slots[3]), 2, r, c)
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def path_slots(c, columns, falling, rising):
     """Slots of the paths through ``(r, c)``: along the row, the falling and the rising diagonal, the column.
 
@@ -139,7 +139,7 @@ def path_slots(c, columns, falling, rising):
     return 0, 1 + falling, 1 + columns + rising, 1 + 2 * columns + c
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def restart(paths, slots):
     """Reset paths, so that they start at their next pixels."""
     for slot in slots:
@@ -147,14 +147,21 @@ def restart(paths, slots):
         paths.lowest[slot] = 0
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def add_curve(curve, volume, offset):
     """Add ``volume.ravel()[offset : offset + curve.size]`` to a curve."""
     for k in range(0, curve.size, LANES):
         store(curve, k, add(load(curve, k), load(volume, offset + k)))
 
 
-@njit(nogil=True)
+@inlined
+def copy_curve(curve, target):
+    """Copy a curve. An assignment between slices would take seconds longer to compile."""
+    for k in range(curve.size):
+        target[k] = curve[k]
+
+
+@part
 def enter_row(paths, columns, falling, rising, down):
     """Restart the paths that enter the patch in this row: along it, and the diagonals at its two ends.
 
@@ -209,7 +216,7 @@ def no_borders(inside: Window, size: int) -> Borders:
     return Borders(inside, (Ring(nothing, nothing),) * len(WAVEFRONTS))
 
 
-@njit(nogil=True)
+@part
 def take_over(paths, rings, inside, r, falling, rising, down):
     """Set the paths that enter row ``r``, or the next row where ``r`` lies outside, to the states of the rings."""
     columns = paths.lowest.size // 3
@@ -223,24 +230,27 @@ def take_over(paths, rings, inside, r, falling, rising, down):
             _set_wave(paths, path_slots(c, columns, falling, rising), wave, column[r - inside.row])
 
 
-@njit(nogil=True, forceinline=True)
+@inlined
 def _set_wave(paths, slots, wave, states):
     for n in range(2):
         slot = slots[2 * wave + n]
-        paths.curves[slot] = states[n]
-        paths.lowest[slot] = states[n].min()
+        copy_curve(states[n], paths.curves[slot])
+        lowest = states[n, 0]
+        for k in range(1, states.shape[1]):
+            lowest = min(lowest, states[n, k])
+        paths.lowest[slot] = lowest
 
 
-@njit(nogil=True)
+@part
 def hand_on(paths, inside, r, falling, rising, wave, down, target):
     """Copy the states of a wave that leave the patch in row ``r`` to ``target``, the ring of a neighbour."""
     columns = paths.lowest.size // 3
     c = inside.column_stop - 1 if down == (wave == 0) else inside.column
     slots = path_slots(c, columns, falling, rising)
     for n in range(2):
-        target.column[r - inside.row, n] = paths.curves[slots[2 * wave + n]]
+        copy_curve(paths.curves[slots[2 * wave + n]], target.column[r - inside.row, n])
     if r == (inside.row_stop - 1 if down else inside.row):
         for c in range(inside.column, inside.column_stop):
             slots = path_slots(c, columns, falling, rising)
             for n in range(2):
-                target.row[c - inside.column, n] = paths.curves[slots[2 * wave + n]]
+                copy_curve(paths.curves[slots[2 * wave + n]], target.row[c - inside.column, n])

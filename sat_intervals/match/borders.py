@@ -13,11 +13,10 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.matching import trace
 from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Ring
-from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.matching_cost import Area, cost_areas
-from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import patch_settings, patch_window, path_window
-from sat_intervals.tiling import Views, Window
+from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.matching_cost import MatchingCost
+from sat_intervals.match.patch import Frame, frame_area, mirrored_settings, patch_settings, path_window
+from sat_intervals.tiling import Window
 
 Place = tuple[int, int]
 """Row and column of a tile in its grid, or what to add to them."""
@@ -72,40 +71,38 @@ def rehulled(ring: Ring, minimum: int, config: Config) -> Ring:
     return Ring(*found)
 
 
-def borders_of(
-    core: Window, region: Window, whole: Window, config: Config, found: Sequence[Mapping[Place, Border]]
-) -> Borders:
+def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Border]]) -> Borders:
     """Borders of a tile for the kernels, from those of its neighbours by wavefront and place."""
-    patch, size = patch_window(core, region, whole, config), padded_to_lanes(config.disparity.count)
+    patch, size = frame_area(frame, config).base, padded_to_lanes(config.disparity.count)
     rings = tuple(ring_of(wavefront, patch, borders, size) for wavefront, borders in enumerate(found))
-    return Borders(path_window(core, region, whole, config).relative_to(patch), rings)
+    return Borders(path_window(frame, config).relative_to(patch), rings)
 
 
-def trace_patch(
-    views: Views,
-    patch: Window,
+def trace_area(
+    cost: MatchingCost,
+    frame: Frame,
     borders: Borders,
     wavefront: int,
     config: Config,
-    statistics: PairStatistics | None = None,
     ranges: LocalRanges | None = None,
 ) -> Ring:
     """Path states that a tile hands on in a wavefront.
 
     Parameters
     ----------
-    views
-        Both images in the `patch_windows` of the tile.
-    patch
-        Its `patch_window`.
+    cost
+        Of the `frame_area`.
+    frame
+        Of the tile in its view.
     borders
         States that it takes over, see `borders_of`.
     wavefront
         Index of WAVEFRONTS.
-    config, statistics, ranges
-        As for `match_patch`.
+    config
+        Settings.
+    ranges
+        Local search ranges; by default all pixels search the whole range.
     """
-    settings, cells = patch_settings(patch, config, ranges)
-    area = Area.of(patch, narrowed(ranges, patch, config))
-    (cost,) = cost_areas(views, [area], config, statistics, cells)
+    settings, cells = patch_settings(frame_area(frame, config).base, config, ranges)
+    settings = mirrored_settings(settings) if frame.mirrored else settings
     return trace(cost.costs, settings, borders, wavefront, cost.gradients, cells)

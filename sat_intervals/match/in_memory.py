@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sat_intervals.config import Config, load_config
+from sat_intervals.config import Config, load_config, resolved
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
@@ -40,7 +40,7 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     SatIntervalsError
         If the arrays do not fit each other or the search range, or the volume does not fit in memory.
     """
-    config = load_config(config)
+    config = resolved(load_config(config))
     pixels = _pixels(left, "left"), _pixels(right, "right")
     _check_rows(*pixels)
     ranges = None

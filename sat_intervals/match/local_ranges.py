@@ -1,4 +1,4 @@
-"""Search ranges of the cells of an image: within them pixels are matched as over the whole range (METHOD.md, 16)."""
+"""Search ranges of the cells of an image: within them pixels are matched as over the whole range (METHOD.md, 17)."""
 
 import base64
 import zlib

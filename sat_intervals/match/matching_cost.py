@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.config import Config, InverseSgm, Mccnn, MccnnSgm, NegativeSgm
+from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
-from sat_intervals.match.mccnn import RADIUS, Network, load_network, weights_file
+from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import View, Views, Window, facing
 
@@ -49,6 +50,11 @@ class Area(NamedTuple):
         return cls(base, facing(base, -search.maximum, -search.minimum), -search.maximum, mirrored=True)
 
     @property
+    def disparities(self) -> int:
+        """Number of disparities."""
+        return self.facing.width - self.base.width + 1
+
+    @property
     def left(self) -> Window:
         """Window in the left image."""
         return self.facing if self.mirrored else self.base
@@ -60,12 +66,11 @@ class Area(NamedTuple):
 
 
 class MatchingCost(NamedTuple):
-    """Costs and gradients of an area, with the states of its base's pixels and those that are `_textureless`."""
+    """Costs and gradients of an area, with the states of its base's pixels."""
 
     costs: Costs
     gradients: Gradients | None
     state: np.ndarray
-    textureless: np.ndarray
 
 
 def view_windows(areas: Sequence[Area], config: Config) -> tuple[Window, Window]:
@@ -87,7 +92,7 @@ def cost_areas(
     areas: Sequence[Area],
     config: Config,
     statistics: PairStatistics | None = None,
-    cells: Cells | None = None,
+    made: Sequence[np.ndarray] | None = None,
 ) -> list[MatchingCost]:
     """Costs and gradients of areas of two views.
 
@@ -101,22 +106,25 @@ def cost_areas(
         Settings.
     statistics
         Mean and standard deviation of the whole images; None if the matching cost needs none.
-    cells
-        Local search ranges of the first area, the only one then; by default all pixels search all of it.
+    made
+        Precomputed costs of the areas from an earlier call, ``Costs.left``, so that they are not computed again.
     """
-    radius = config.cost.window // 2
     if isinstance(config.cost, Mccnn):
         assert statistics is not None  # MC-CNN always comes with statistics
-        costs = _correlations(views, areas, statistics, load_network(weights_file(config.cost.weights)))
+        if made is None:
+            made = _correlations(views, areas, statistics, load_network(weights_file(config.cost.weights)))
+        states = [window_state(view.state, RADIUS) for view in views]
+        costs = [
+            Costs(of_area, None, *_of_area(area, views, states, RADIUS))
+            for area, of_area in zip(areas, made, strict=True)
+        ]
     else:
-        costs = _hamming(views, areas, radius)
-    varying = [_varies(view, radius) for view in views]
+        costs = _hamming(views, areas, config.cost.window // 2)
     return [
         MatchingCost(
             found,
             _gradients(area, views, config, statistics),
             views[area.mirrored].inner(views[area.mirrored].state, area.base),
-            _textureless(found, *_of_area(area, views, varying, radius), cells),
         )
         for area, found in zip(areas, costs, strict=True)
     ]
@@ -146,11 +154,14 @@ def _varies(view: View, radius: int) -> np.ndarray:
     return varies
 
 
-def _textureless(costs: Costs, base_varies: np.ndarray, there_varies: np.ndarray, cells: Cells | None) -> np.ndarray:
+def textureless(views: Views, area: Area, costs: Costs, config: Config, cells: Cells | None = None) -> np.ndarray:
     """Pixels of the base whose window, and all usable windows that face it, do not vary along any row.
 
     All their candidates cost the same. SGM would still choose among them, by costs carried in from the image borders.
+    ``cells`` are the local search ranges of the area; by default all pixels search all of it.
     """
+    radius = config.cost.window // 2
+    base_varies, there_varies = _of_area(area, views, [_varies(view, radius) for view in views], radius)
     flat: np.ndarray = ~base_varies & (costs.left_state == 0)
     rows = flat.any(axis=1)  # usually few: skip the others
     textured = there_varies[rows] & (costs.right_state[rows] == 0)
@@ -176,14 +187,13 @@ def _hamming(views: Views, areas: Sequence[Area], radius: int) -> list[Costs]:
 
 
 # ---- MC-CNN ------------------------------------------------------------------------------------------------
-def _correlations(views: Views, areas: Sequence[Area], statistics: PairStatistics, network: Network) -> list[Costs]:
+def _correlations(
+    views: Views, areas: Sequence[Area], statistics: PairStatistics, network: Network
+) -> list[np.ndarray]:
     """Costs of all areas, strip by strip: all areas share the features of a strip, which are then discarded."""
     states = [window_state(view.state, RADIUS) for view in views]
     made = [
-        np.empty(
-            (area.base.height, area.base.width, padded_to_lanes(area.facing.width - area.base.width + 1)), np.uint8
-        )
-        for area in areas
+        np.empty((area.base.height, area.base.width, padded_to_lanes(area.disparities)), np.uint8) for area in areas
     ]
     height = areas[0].base.height
     for row in range(0, height, STRIP):
@@ -194,7 +204,7 @@ def _correlations(views: Views, areas: Sequence[Area], statistics: PairStatistic
         ]
         for area, costs in zip(areas, made, strict=True):
             correlate(*_of_area(area, views, strips, RADIUS), costs[rows])
-    return [Costs(costs, None, *_of_area(area, views, states, RADIUS)) for area, costs in zip(areas, made, strict=True)]
+    return made
 
 
 def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStatistics, network: Network) -> np.ndarray:

@@ -5,51 +5,18 @@ inside: ``(features, rows - 10, columns - 10)``, a convolution without padding.
 """
 
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.config.weights import INSTALL_MCCNN
+from sat_intervals.errors import SatIntervalsError
 
 # Radius of the window of a feature, in pixels.
 RADIUS = 5
-# The distribution of the official weights, and the file in it that Pandora uses.
-_DISTRIBUTION, _OFFICIAL = "MCCNN", "mc_cnn_fast_int8_excl_01.onnx"
-_INSTALL = "pip install sat-intervals[mccnn]"
-# Largest file of weights in bytes; the official one has 0.4 MB.
-_LARGEST = 256 * 10**6
 # Largest deviation of a feature's length from 1.
 _UNIT = 1e-3
-
-
-def weights_file(weights: str | None) -> Path:
-    """Find the file of a network: the given one, or the official one without an import of its package.
-
-    Raises
-    ------
-    SatIntervalsError
-        If there is no such file, or it is too large.
-    """
-    if weights is not None:
-        check_regular(weights)
-        if not Path(weights).is_file():
-            raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or null")
-        size = Path(weights).stat().st_size
-        if size > _LARGEST:
-            raise SatIntervalsError(
-                f"cost.weights {weights} has {size / 1e6:.0f} MB, a network like MC-CNN has less than "
-                f"{_LARGEST / 1e6:.0f} MB: name an ONNX network, or null"
-            )
-        return Path(weights).resolve()
-    try:
-        found = [file for file in files(_DISTRIBUTION) or [] if file.name == _OFFICIAL]
-    except PackageNotFoundError as error:
-        raise SatIntervalsError(f"cost mccnn needs the package {_DISTRIBUTION}: {_INSTALL}") from error
-    if not found:
-        raise SatIntervalsError(f"the installed {_DISTRIBUTION} has no {_OFFICIAL}: {_INSTALL}, or set cost.weights")
-    return Path(str(found[0].locate())).resolve()
 
 
 class Network:
@@ -100,7 +67,7 @@ def _session(file: Path) -> Any:
     try:
         import onnxruntime
     except ImportError as error:
-        raise SatIntervalsError(f"cost mccnn needs onnxruntime: {_INSTALL}") from error
+        raise SatIntervalsError(f"cost mccnn needs onnxruntime: {INSTALL_MCCNN}") from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # tiles are the only parallelism
     options.log_severity_level = 4

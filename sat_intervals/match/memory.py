@@ -25,7 +25,7 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     lanes = padded_to_lanes(config.disparity.count)
     patch = size + 2 * config.tiles.margin
     volume = 2 * (size + 2) ** 2 * lanes
-    accurate = config.cross_check is not None and config.cross_check.method == "accurate"
+    accurate = config.matches_right_view
     if accurate:
         volume = 2 * size * (size + config.disparity.count) * lanes  # the volume of the right view is wider
     if config.cost.precomputed:

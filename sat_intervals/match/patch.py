@@ -1,5 +1,6 @@
 """Raw products of one patch: the windows that it needs, its costs, its match, its right view."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,15 +8,36 @@ import numpy as np
 from sat_intervals.config import Config, CosineSgm, Disparity, Sgm
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
-from sat_intervals.kernels.sgm import Borders
+from sat_intervals.kernels.sgm import Borders, Ring
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
+from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, textureless, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, MISMATCH, NO_DISPARITY, RANGE_END
 from sat_intervals.tiling import Views, Window, facing
 
 # Number of disparities up to which a range has no ends of its own.
 _SHORT = 8
+
+
+class Frame(NamedTuple):
+    """A core and what surrounds it in its view.
+
+    Attributes
+    ----------
+    core
+        Pixels whose products are kept.
+    region
+        Pixels of the whole run.
+    whole
+        All pixels of the left image; in the right view, all pixels that face them.
+    mirrored
+        Whether this is the right view.
+    """
+
+    core: Window
+    region: Window
+    whole: Window
+    mirrored: bool = False
 
 
 class Patch(NamedTuple):
@@ -28,16 +50,21 @@ class Patch(NamedTuple):
     output
         The core and, inside the region, a ring of one pixel around it, which neighbours compute too.
     right
-        The right view among the core's left pixels.
+        The right view among the core's left pixels; with exact seams and accurate cross-checking that of the right
+        pixels of `mirrored_frame`.
+    leaving
+        Path states of the last wavefront that leave the left and, if it is matched, the right view.
     """
 
     raw: Raw
     output: Window
     right: RightView
+    leaving: list[Ring]
 
 
 def kernel_settings(config: Config) -> Settings:
     """Convert a configuration to the settings of the kernels."""
+    cuts = config.cuts
     # penalties that follow gradients come with these
     constant = config.sgm if isinstance(config.sgm, Sgm | CosineSgm) else None
     return Settings(
@@ -47,20 +74,25 @@ def kernel_settings(config: Config) -> Settings:
         p1=config.in_steps(constant.p1) if constant else 0,
         p2=config.in_steps(constant.p2) if constant else 0,
         regularized=config.sgm is not None,
-        cut_level=-1 if config.cut_level is None else config.cut_level,
+        cut_level=-1 if cuts or config.cut_level is None else config.cut_level,
         weights=np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights,
         refine=config.refinement is not None,
+        high=cuts.high if cuts else -1.0,
+        low=cuts.low if cuts and config.subpixel_levels == 2 else -1.0,
+        steps=config.bound_steps,
     )
 
 
 def patch_settings(base: Window, config: Config, ranges: LocalRanges | None) -> tuple[Settings, Cells | None]:
     """Settings of the kernels for a patch, and the ranges of its cells; ``base`` is its window of the left image."""
+    settings = kernel_settings(config)
     if ranges is None:
-        return kernel_settings(config), None
-    settings = kernel_settings(ranges.within(base, config))
-    search = config.disparity
-    whole = settings._replace(offset=settings.minimum - search.minimum, total=search.count)
-    return whole, ranges.cells(base, settings.minimum)
+        return settings, None
+    here, whole = ranges.within(base, config).disparity, config.disparity
+    settings = settings._replace(
+        minimum=here.minimum, count=here.count, offset=here.minimum - whole.minimum, total=whole.count
+    )
+    return settings, ranges.cells(base, here.minimum)
 
 
 def _of_whole_range(view: RightView, core: Window, settings: Settings) -> RightView:
@@ -72,9 +104,26 @@ def _of_whole_range(view: RightView, core: Window, settings: Settings) -> RightV
     return RightView(cost, winner)
 
 
-def path_window(core: Window, region: Window, whole: Window, config: Config) -> Window:
+def frames_of(core: Window, region: Window, whole: Window, config: Config) -> list[Frame]:
+    """Frames of the views that matching a core with exact seams needs: left and, for accurate cross-checking, right."""
+    left = Frame(core, region, whole)
+    return [left, mirrored_frame(left, config)] if config.matches_right_view else [left]
+
+
+def mirrored_frame(frame: Frame, config: Config) -> Frame:
+    """Frame of the right view: the pixels that face a left core at the smallest disparity.
+
+    The last core of a row also has the others that face it, so that each right pixel belongs to one core.
+    """
+    search, (core, region, whole, _) = config.disparity, frame
+    last = search.minimum if core.column_stop < region.column_stop else search.maximum
+    around, all_facing = (facing(there, search.minimum, search.maximum) for there in (region, whole))
+    return Frame(facing(core, search.minimum, last), around, all_facing, mirrored=True)
+
+
+def path_window(frame: Frame, config: Config) -> Window:
     """Pixels whose paths a tile computes: its core and, at the ends of the region, the pixels that support it."""
-    around = _supported(region, whole, config)
+    core, region, around = frame.core, frame.region, _supported(frame, config)
     row = around.row if core.row == region.row else core.row
     column = around.column if core.column == region.column else core.column
     row_stop = around.row_stop if core.row_stop == region.row_stop else core.row_stop
@@ -82,13 +131,14 @@ def path_window(core: Window, region: Window, whole: Window, config: Config) -> 
     return Window(row, column, row_stop - row, column_stop - column)
 
 
-def patch_window(core: Window, region: Window, whole: Window, config: Config) -> Window:
-    """Pixels that a tile reads: those of `path_window` and one more on each side where another tile follows."""
-    return path_window(core, region, whole, config).grown(1, 1).clipped(_supported(region, whole, config))
+def frame_area(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> Area:
+    """Area that a tile reads: `path_window` and one more pixel on each side where another tile follows."""
+    window = path_window(frame, config).grown(1, 1).clipped(_supported(frame, config))
+    return Area.mirror(window, config) if frame.mirrored else Area.of(window, narrowed(ranges, window, config))
 
 
-def _supported(region: Window, whole: Window, config: Config) -> Window:
-    return region.grown(config.tiles.support, config.tiles.support).clipped(whole)
+def _supported(frame: Frame, config: Config) -> Window:
+    return frame.region.grown(config.tiles.support, config.tiles.support).clipped(frame.whole)
 
 
 def patch_areas(
@@ -100,11 +150,10 @@ def patch_areas(
     """
     overlap = config.tiles.overlap
     if overlap == "exact":
-        base = patch_window(core, region, whole, config)
-        return [Area.of(base, narrowed(ranges, base, config))]
+        return [frame_area(frame, config, ranges) for frame in frames_of(core, region, whole, config)]
     base = core.grown(overlap, overlap).clipped(whole)
     areas = [Area.of(base, narrowed(ranges, base, config))]
-    if config.cross_check and config.cross_check.method == "accurate":
+    if config.matches_right_view:
         areas.append(_right_area(core, whole, overlap, config))
     return areas
 
@@ -131,7 +180,6 @@ def match_patch(
     whole: Window,
     config: Config,
     statistics: PairStatistics | None = None,
-    borders: Borders | None = None,
     ranges: LocalRanges | None = None,
 ) -> Patch:
     """Match a core.
@@ -150,54 +198,93 @@ def match_patch(
         Settings.
     statistics
         Mean and standard deviation of the whole images; None if the matching cost needs none.
-    borders
-        Path states of the neighbours; by default every path starts where the patch does.
     ranges
         Local search ranges; by default all pixels search the whole range.
     """
-    output = core if config.tiles.overlap == "exact" else core.grown(1, 1).clipped(region)
-    area, *of_right = patch_areas(core, region, whole, config, ranges)
+    costs = cost_areas(views, patch_areas(core, region, whole, config, ranges), config, statistics)
+    return match_costed(views, Frame(core, region, whole), costs, config, ranges=ranges)
+
+
+def match_costed(
+    views: Views,
+    frame: Frame,
+    costs: Sequence[MatchingCost],
+    config: Config,
+    borders: Sequence[Borders] | None = None,
+    ranges: LocalRanges | None = None,
+) -> Patch:
+    """Match a core from its costs.
+
+    Parameters
+    ----------
+    views
+        Both images in the `patch_windows` of the core.
+    frame
+        Of the core in the left view.
+    costs
+        Of the `patch_areas`.
+    config
+        Settings.
+    borders
+        Path states of the neighbours for each area; by default every path starts where its area does.
+    ranges
+        As for `match_patch`.
+    """
+    is_exact, core = config.tiles.overlap == "exact", frame.core
+    output = core if is_exact else core.grown(1, 1).clipped(frame.region)
+    areas = patch_areas(core, frame.region, frame.whole, config, ranges)
+    area, cost = areas[0], costs[0]
     settings, cells = patch_settings(area.base, config, ranges)
-    cost, *cost_of_right = cost_areas(views, [area, *of_right], config, statistics, cells)
-    wants_fast = config.cross_check is not None and config.cross_check.method == "fast"
+    wants_fast = config.cross_check is not None and not config.matches_right_view
     right_core = core if wants_fast else Window(core.row, core.column, 0, 0)
-    raw, right_view = match_costs(
+    raw, right, *leaving = match_costs(
         cost.costs,
         settings,
         output.relative_to(area.base),
         right_core.relative_to(area.base),
         cost.gradients,
-        borders,
+        borders[0] if borders else None,
         cells,
     )
     if ranges:
-        right_view = _of_whole_range(right_view, right_core, settings)
+        right = _of_whole_range(right, right_core, settings)
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
-    _mark_ambiguous(raw, cost.textureless[inside], config)
-    _mark_ends(raw, cost.textureless[inside], config.disparity)
+    flat = textureless(views, area, cost.costs, config, cells)[inside]
+    _mark_ambiguous(raw, flat, config)
+    _mark_ends(raw, flat, config.disparity)
     if ranges:
         _reject_ends(raw, *ranges.at(output), config.disparity)
-    if of_right:
-        right_view = match_right(cost_of_right[0], of_right[0], core, settings)
-    return Patch(raw, output, right_view)
+    if config.matches_right_view:
+        search = config.disparity
+        reach = mirrored_frame(frame, config).core if is_exact else facing(core, search.minimum, search.maximum)
+        right, of_right = match_right(costs[1], areas[1], reach, settings, borders[1] if borders else None)
+        leaving.append(of_right)
+    return Patch(raw, output, right, leaving)
 
 
-def _mark_ambiguous(raw: Raw, textureless: np.ndarray, config: Config) -> None:
+def _mark_ambiguous(raw: Raw, flat: np.ndarray, config: Config) -> None:
     """Set the interval of textureless pixels to the whole search range, and their ambiguity to the largest."""
-    if not textureless.any():
+    if not flat.any():
         return
-    ambiguous = textureless & (raw.winner != NO_DISPARITY)
+    ambiguous = flat & (raw.winner != NO_DISPARITY)
     if config.interval:
-        raw.lower[ambiguous], raw.upper[ambiguous] = config.disparity.minimum, config.disparity.maximum
+        search, steps = config.disparity, config.bound_steps
+        first, last = (0, steps * (search.count - 1)) if steps else (search.minimum, search.maximum)
+        raw.lower[ambiguous], raw.upper[ambiguous] = first, last
+        if config.subpixel_levels == 2:
+            raw.lower_low[ambiguous], raw.upper_low[ambiguous] = first, last
     raw.ambiguity[ambiguous] = config.largest_ambiguity
 
 
-def _mark_ends(raw: Raw, textureless: np.ndarray, search: Disparity) -> None:
-    """Set the flag of winners at the first two and the last two candidates; a short range consists of ends only."""
+def _mark_ends(raw: Raw, flat: np.ndarray, search: Disparity) -> None:
+    """Set the flag of winners at the first two and the last two candidates; a short range consists of ends only.
+
+    ``flat`` marks textureless pixels, whose winner means nothing.
+    """
     if search.count > _SHORT:
         ends = (raw.winner <= search.minimum + 1) | (raw.winner >= search.maximum - 1)
-        raw.validity[ends & (raw.winner != NO_DISPARITY) & ~textureless] |= RANGE_END
+        raw.validity[ends & (raw.winner != NO_DISPARITY) & ~flat] |= RANGE_END
 
 
 def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparity) -> None:
@@ -211,10 +298,19 @@ def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparit
     raw.validity[ends] |= MISMATCH
 
 
-def match_right(cost: MatchingCost, area: Area, core: Window, settings: Settings) -> RightView:
-    """Match the right view of a core with its own volume: the images swap, and disparities change sign."""
+def mirrored_settings(settings: Settings) -> Settings:
+    """Settings of the right view, where disparities change sign; only its winners are read."""
     maximum = settings.minimum + settings.count - 1
-    mirrored = settings._replace(minimum=-maximum, cut_level=-1, weights=np.zeros(0, np.uint16), refine=False)
-    reach = facing(core, settings.minimum, maximum).relative_to(area.base)
-    raw, _ = match_costs(cost.costs, mirrored, reach, reach, cost.gradients)
-    return RightView(raw.cost, np.where(raw.winner == NO_DISPARITY, NO_DISPARITY, -raw.winner).astype(np.int16))
+    return settings._replace(
+        minimum=-maximum, cut_level=-1, low=-1.0, steps=0, weights=np.zeros(0, np.uint16), refine=False
+    )
+
+
+def match_right(
+    cost: MatchingCost, area: Area, core: Window, settings: Settings, borders: Borders | None = None
+) -> tuple[RightView, Ring]:
+    """Match right pixels, ``core``, with a volume of their own: the images swap; return also the leaving states."""
+    inside = core.relative_to(area.base)
+    raw, _, leaving = match_costs(cost.costs, mirrored_settings(settings), inside, inside, cost.gradients, borders)
+    winner = np.where(raw.winner == NO_DISPARITY, NO_DISPARITY, -raw.winner).astype(np.int16)
+    return RightView(raw.cost, winner), leaving

@@ -15,7 +15,20 @@ from sat_intervals.kernels.confidence import low_confidence, normalize, percenti
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
-from sat_intervals.products import INVALID, NO_DISPARITY, OPEN_ABOVE, OPEN_BELOW, RANGE_END, REGULARIZED, Bands
+from sat_intervals.products import (
+    BOUND_STEPS,
+    INVALID,
+    NO_DISPARITY,
+    OPEN_ABOVE,
+    OPEN_BELOW,
+    RANGE_END,
+    REGULARIZED,
+    Bands,
+)
+
+# Steps per pixel in which sub-pixel bounds are regularised.
+_STEPS = 8
+_EMPTY = np.empty((0, 0), np.uint16)
 
 Rows = TypeVar("Rows", bound=tuple[Any, ...])
 
@@ -26,7 +39,7 @@ class RawRows(NamedTuple):
     Attributes
     ----------
     winner, lower, upper
-        int16 disparities in pixels, NO_DISPARITY for none.
+        int16 disparities in pixels, NO_DISPARITY for none; bounds may be in steps, see `Raw`.
     disparity
         float32 pixels, NaN for none.
     ambiguity
@@ -35,6 +48,8 @@ class RawRows(NamedTuple):
         uint16 flags.
     right_winner
         ``(rows, columns + count - 1)`` int16, see `RightView`.
+    lower_low, upper_low
+        Bounds of low-confidence pixels, see `Raw`; empty without two levels.
     """
 
     winner: np.ndarray
@@ -44,11 +59,27 @@ class RawRows(NamedTuple):
     ambiguity: np.ndarray
     validity: np.ndarray
     right_winner: np.ndarray
+    lower_low: np.ndarray = _EMPTY
+    upper_low: np.ndarray = _EMPTY
 
     @classmethod
     def of(cls, raw: Raw, right: RightView) -> "RawRows":
         """Make the rows of a pair that was matched as one tile."""
-        return cls(raw.winner, raw.lower, raw.upper, raw.disparity, raw.ambiguity, raw.validity, right.winner)
+        return cls(
+            **{name: getattr(raw, name) for name in cls._fields if name != "right_winner"}, right_winner=right.winner
+        )
+
+
+class Filtered(NamedTuple):
+    """Rows before regularisation: bands with their halo, low-confidence pixels (None without), pixels to write."""
+
+    disparity: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    confidence: np.ndarray
+    validity: np.ndarray
+    low: np.ndarray | None
+    written: np.ndarray
 
 
 class ConfidenceScale(NamedTuple):
@@ -93,6 +124,11 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
     scale
         See `confidence_scale`; the same for the whole image.
     """
+    return finish_rows(filter_rows(rows, scale, config), first, last, config)
+
+
+def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filtered:
+    """Cross-check, confidence and medians: all steps before regularisation; parameters as in `postprocess_rows`."""
     searched = rows.winner != NO_DISPARITY
     validity = rows.validity.copy()
     if config.cross_check:
@@ -102,22 +138,36 @@ def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScal
     confidence = normalize(rows.ambiguity, searched, scale.p1, scale.p99)
     if config.opens_ends:
         _open_ends(rows, validity, confidence, config)
-    disparity, (lower, upper) = rows.disparity, _bounds(rows, config)
+    low = None
+    if config.regularization:
+        low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
+    disparity, (lower, upper) = rows.disparity, _bounds(rows, low, config)
     if config.median:
         disparity = median(disparity, kept, config.median.size)
         if config.interval:
             lower, upper = median(lower, kept, config.median.size), median(upper, kept, config.median.size)
+    written = searched if config.products.keep_rejected else kept
+    return Filtered(disparity, lower, upper, confidence, validity, low, written)
+
+
+def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
+    """Regularise, and complete the final bands of the rows ``[first, last)``; see `postprocess_rows`."""
+    disparity, lower, upper, confidence, validity, low, written = rows
     inner = slice(first, last)
-    if config.regularization:
-        lower, upper, low = _regularized(lower, upper, confidence, first, last, config)
-        validity[inner][low] |= REGULARIZED
+    validity = validity[inner].copy()
+    if low is not None:
+        lower, upper = _regularized(lower, upper, low, first, last, config)
+        validity[low[inner]] |= REGULARIZED
     else:
         lower, upper = lower[inner], upper[inner]
-    written = (searched if config.products.keep_rejected else kept)[inner]
-    disparity = np.where(written, disparity[inner], np.float32(np.nan))
+    disparity = np.where(written[inner], disparity[inner], np.float32(np.nan))
     # Widen the intervals that medians or quantiles moved off the disparity.
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
-    return Bands(disparity, lower, upper, confidence[inner], validity[inner])
+    if config.bound_steps:
+        lower, upper = (
+            round_(bound * BOUND_STEPS) / BOUND_STEPS for round_, bound in ((np.floor, lower), (np.ceil, upper))
+        )
+    return Bands(disparity, lower, upper, confidence[inner], validity)
 
 
 def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, config: Config) -> None:
@@ -129,33 +179,45 @@ def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, conf
         validity[ends] |= np.where(below[ends], OPEN_BELOW, OPEN_ABOVE).astype(validity.dtype)
 
 
-def _bounds(rows: RawRows, config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """Both bounds as float32; values where nothing was searched are never written."""
+def _bounds(rows: RawRows, low: np.ndarray | None, config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """Both bounds in pixels as float32, of the level of each pixel's class.
+
+    Values where nothing was searched are never written.
+    """
     if config.interval is None:
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
         return nothing, nothing
-    return rows.lower.astype(np.float32), rows.upper.astype(np.float32)
+    lower, upper, steps = rows.lower, rows.upper, config.bound_steps
+    if low is not None and config.subpixel_levels == 2:
+        lower, upper = np.where(low, rows.lower_low, lower), np.where(low, rows.upper_low, upper)
+    lower, upper = lower.astype(np.float32), upper.astype(np.float32)
+    if not steps:
+        return lower, upper
+    minimum = np.float32(config.disparity.minimum)
+    return lower / steps + minimum, upper / steps + minimum
 
 
 def _regularized(
-    lower: np.ndarray, upper: np.ndarray, confidence: np.ndarray, first: int, last: int, config: Config
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Regularised bounds and the low-confidence pixels of the rows ``[first, last)``."""
-    settings = config.regularization
+    lower: np.ndarray, upper: np.ndarray, low: np.ndarray, first: int, last: int, config: Config
+) -> tuple[np.ndarray, np.ndarray]:
+    """Regularised bounds of the rows ``[first, last)``; ``low`` marks low-confidence pixels."""
+    settings, cuts = config.regularization, config.cuts
     assert settings is not None
+    quantile = settings.quantile if cuts is None else cuts.quantile
+    if quantile is None:
+        return lower[first:last], upper[first:last]
     top, bottom = max(0, first - settings.depth), last + settings.depth
-    low = low_confidence(confidence[top:bottom], settings.threshold, settings.kernel)
     lower, upper = regularize(
         lower[top:bottom],
         upper[top:bottom],
-        low,
+        low[top:bottom],
         config.disparity.minimum,
         settings.depth,
-        settings.quantile,
-        first - top,
-        last - top,
+        quantile,
+        (first - top, last - top),
+        min(_STEPS, config.bound_steps) if config.bound_steps else 2,
     )
-    return lower, upper, low[first - top : last - top]
+    return lower, upper
 
 
 def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config: Config) -> Iterator[Bands]:

@@ -1,4 +1,4 @@
-"""The search range of a pair, found by matching reduced images from coarse to fine (METHOD.md, section 16).
+"""The search range of a pair, found by matching reduced images from coarse to fine (METHOD.md, section 17).
 
 A level has its step: the images averaged over ``rows x columns`` pixels. The coarsest is searched widely, each finer
 one within what the level before found. Disparities of a level are in its own pixels; times the step they are in pixels.

@@ -3,8 +3,11 @@
 import numpy as np
 
 from sat_intervals.config import Config
+from sat_intervals.kernels.sgm import WAVEFRONTS
+from sat_intervals.match.borders import borders_of, trace_area
+from sat_intervals.match.matching_cost import cost_areas
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
-from sat_intervals.match.patch import match_patch, patch_windows
+from sat_intervals.match.patch import Frame, frame_area, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postprocess_strips
 from sat_intervals.tiling import View, Window
 
@@ -19,5 +22,10 @@ def compile_kernels(config: Config) -> None:
         View(window, pixels, np.zeros(pixels.shape, np.uint8)) for window, pixels in zip(windows, images, strict=True)
     )
     statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
-    patch = match_patch((left, right), spot, spot, spot, config, statistics)
+    views = left, right
+    patch = match_patch(views, spot, spot, spot, config, statistics)
+    if config.hands_states_on:
+        frame = Frame(spot, spot, spot)
+        (cost,) = cost_areas(views, [frame_area(frame, config)], config, statistics)
+        trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config)
     list(postprocess_strips([RawRows.of(patch.raw, patch.right)], ConfidenceScale(0.0, 1.0), config))

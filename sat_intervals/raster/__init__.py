@@ -4,6 +4,9 @@ from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_fil
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
 from sat_intervals.raster.layers import (
+    MARK,
+    check_marked,
+    is_marked,
     north_up,
     put_back,
     read_layers,
@@ -16,11 +19,13 @@ from sat_intervals.raster.layers import (
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
+from sat_intervals.raster.publishing import OutputError, stamps
 from sat_intervals.raster.surfaces import check_reference, is_surface, read_heights, read_place, resolution_of
 from sat_intervals.raster.windows import read_views, read_window
-from sat_intervals.raster.writer import OutputError, OutputWriter, check_space, remove_scratch
+from sat_intervals.raster.writer import OutputWriter, check_space, remove_scratch, restore
 
 __all__ = [
+    "MARK",
     "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
@@ -31,9 +36,11 @@ __all__ = [
     "OutputError",
     "OutputWriter",
     "Projection",
+    "check_marked",
     "check_pair",
     "check_reference",
     "check_space",
+    "is_marked",
     "is_surface",
     "north_up",
     "open_image",
@@ -50,6 +57,8 @@ __all__ = [
     "read_window",
     "remove_scratch",
     "resolution_of",
+    "restore",
+    "stamps",
     "surface_file",
     "utm_of",
     "whole_file",

@@ -1,11 +1,13 @@
 """Read and write layers that fit in memory, and replace files atomically."""
 
 import os
+import re
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from rasterio import Env
@@ -17,11 +19,15 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
+from sat_intervals.raster.publishing import stamps
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
 
 # Name of a file kept aside: the report's stamp and the file's name.
 _ASIDE = ".sat-intervals.{}.{}"
+
+MARK = MappingProxyType({"SOFTWARE": "sat-intervals"})
+"""Tag of rasters that this tool may replace."""
 
 
 def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing:
@@ -68,7 +74,8 @@ def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
 def _settle(files: Sequence[Path], report: Path) -> None:
     """Restore the copies that belong to the current report, and delete those of an earlier one."""
     for file in files:
-        for kept in file.parent.glob(_ASIDE.format("*", file.name)):
+        ours = re.compile(rf"\.sat-intervals\.(?:[0-9a-f]+-[0-9a-f]+|none)\.{re.escape(file.name)}")
+        for kept in [other for other in file.parent.iterdir() if ours.fullmatch(other.name)]:
             if kept == _aside(file, report):
                 os.replace(kept, file)
             kept.unlink(missing_ok=True)  # os.replace does nothing between links to the same file
@@ -76,13 +83,16 @@ def _settle(files: Sequence[Path], report: Path) -> None:
 
 def _aside(file: Path, report: Path) -> Path:
     """Return where the copy of a file is kept until the current report is replaced."""
-    status = report.stat() if report.exists() else None
-    which = f"{status.st_size:x}-{status.st_mtime_ns:x}" if status else "none"
+    which = stamps(report.parent, [report.name]).get(report.name, "none")
     return file.with_name(_ASIDE.format(which, file.name))
 
 
 def write_layer(
-    path: str | os.PathLike[str], pixels: np.ndarray, nodata: float, georeferencing: Georeferencing
+    path: str | os.PathLike[str],
+    pixels: np.ndarray,
+    nodata: float,
+    georeferencing: Georeferencing,
+    tags: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Write ``(rows, columns)`` as a tiled, compressed GeoTIFF of one band; replaces an existing file."""
     height, width = pixels.shape
@@ -92,6 +102,7 @@ def write_layer(
         Env(),
         gdal.create(str(new), height=height, width=width, **kind, **georeferencing.creation_options()) as dataset,
     ):
+        dataset.update_tags(**tags)
         dataset.write(pixels, 1)
 
 
@@ -121,12 +132,12 @@ def write_rows(
 def write_once(
     path: Path, pixels: np.ndarray, nodata: float, georeferencing: Georeferencing, *, overwrite: bool
 ) -> None:
-    """Write a layer with `write_layer` unless the file already has the same content.
+    """Write a layer with `write_layer` and `MARK`, unless the file already has the same content.
 
     Raises
     ------
     SatIntervalsError
-        The file has other content and ``overwrite`` is not set.
+        The file has other content, and ``overwrite`` is not set or the file has no mark.
     """
     if path.exists():
         with suppress(SatIntervalsError):
@@ -134,7 +145,8 @@ def write_once(
                 return
         if not overwrite:
             raise SatIntervalsError(f"{path} has other content: choose another folder or --overwrite")
-    write_layer(path, pixels, nodata, georeferencing)
+        check_marked(path)
+    write_layer(path, pixels, nodata, georeferencing, MARK)
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> np.ndarray:
@@ -148,6 +160,22 @@ def read_shape(path: str | os.PathLike[str]) -> tuple[int, int, int]:
     """Return the numbers of bands, rows and columns of a file."""
     with opened(str(path)) as dataset:
         return dataset.count, dataset.height, dataset.width
+
+
+def is_marked(path: str | os.PathLike[str]) -> bool:
+    """Return whether a raster has the tag of all files of this tool, see `MARK`."""
+    with suppress(SatIntervalsError):
+        tags = read_tags(path)
+        return tags.get("SOFTWARE", tags.get("Software", "")).startswith(MARK["SOFTWARE"])  # the latter in PNG
+    return False
+
+
+def check_marked(path: Path) -> None:
+    """Raise if a raster exists without the mark of this tool. Links are replaced, never followed: they pass."""
+    if path.exists() and not path.is_symlink() and not is_marked(path):
+        raise SatIntervalsError(
+            f"{path} exists and was not made by sat-intervals, or by a version that left no mark in it: move it away"
+        )
 
 
 def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,18 +18,18 @@ from rasterio.io import DatasetReader, DatasetWriter
 from rasterio.shutil import copy
 from rasterio.windows import Window as RasterioWindow
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, publish, put_back, stamps
 from sat_intervals.store.folder import LocalFolder
 
 # Locked folder of unfinished files, named after the first of them. Files of these names from a killed process are
 # replaced, others stay.
 _SCRATCH = ".unpublished-{}"
-# Reports that are published with files: of a run, and of its points.
-_REPORTS = "run.json", "points.json"
+# Names there: a final one, that of its strips, and those of GDAL beside both.
+_UNFINISHED = r"(?:strips-)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
 # Layout of the temporary strips. Blocks are low, so that a strip fills most of those it touches; interleaving by band
 # saves a fifth of the time of the final files.
 _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "band", "bigtiff": "IF_SAFER"}
@@ -36,6 +37,8 @@ _STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "ba
 # bits per pixel; level 6: 3.2 and 46; no compression: 9.1 and 186. Predictors are slower and larger (4.3 and 63), since
 # bounds are integers and V-fits are fractions of small ones, whose bytes repeat.
 _COG = {"COMPRESS": "DEFLATE", "LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
+# Tags in the file itself, not in another beside it.
+_PNG = {"WRITE_METADATA_AS_TEXT": "YES"}
 # Side in pixels of the smallest overview.
 _OVERVIEW_SIZE = 512
 # GDAL's block cache in bytes; the default is a twentieth of the memory. A larger cache is not faster, even for strips
@@ -45,10 +48,6 @@ _CACHE = 16 << 20
 _READ_BACK = 512, 4096
 _SUM_WRAPS = 1 << 64  # sums of bits are modulo 2^64
 _WAY_OUT = "free disk space or choose another folder"
-
-
-class OutputError(SatIntervalsError):
-    """An output that cannot be written."""
 
 
 class OutputWriter:
@@ -98,15 +97,18 @@ class OutputWriter:
     ) -> None:
         self._folder = Path(folder)
         self._hidden = self._folder / _SCRATCH.format(files[0].name)
-        self._scratch, self._replaced = self._hidden / "files", self._hidden / "files" / "replaced"
+        self._scratch, self._replaced = self._hidden / "files", self._hidden / "files" / REPLACED
         self._locked = ExitStack()
         self._files = tuple(files)
+        self._names = (*(file.name for file in files), *REPORTS)
         self._shape = height, width
         self._georeferencing = georeferencing
         self._tags = dict(tags)
         self._threads = "ALL_CPUS" if threads is None else str(threads)
         self._strips: dict[str, DatasetWriter] = {}
         self._sums = {file.name: 0 for file in files}
+        self._there: dict[str, str] = {}
+        self._is_published = False
 
     def __enter__(self) -> Self:
         for file in self._files:
@@ -121,8 +123,10 @@ class OutputWriter:
         self._locked.enter_context(LocalFolder(self._hidden).locked())
         try:
             with self._failing(self._folder):
+                put_back(self._scratch, self._folder, self._names)
                 self._remove_scratch()
                 self._replaced.mkdir(parents=True, exist_ok=True)
+                self._there = stamps(self._folder, self._names)
             check_space(self._folder, self._files, *self._shape)
             for file in self._files:
                 self._strips[file.name] = self._create(file)
@@ -153,7 +157,7 @@ class OutputWriter:
 
     def _build(self, file: File) -> dict[str, int]:
         name, strips, whole = file.name, self._strips[file.name], self._scratch / file.name
-        options = _COG | {"NUM_THREADS": self._threads, "PREDICTOR": file.predictor} if file.driver == "COG" else {}
+        options = _COG | {"NUM_THREADS": self._threads, "PREDICTOR": file.predictor} if file.driver == "COG" else _PNG
         with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
             if file.driver == "COG":
                 self._add_overviews(strips)
@@ -166,11 +170,17 @@ class OutputWriter:
         os.unlink(strips.name)
         return made
 
-    def publish(self, report: tuple[str, str] | None = None) -> None:
-        """Rename the files to their final names, all of them or none.
+    def publish(self, report: tuple[str, str] | None = None, *, replaceable: Mapping[str, str] | None = None) -> None:
+        """Rename the files to their final names, all of them or none; `publishing.publish` has the rules.
 
-        ``report`` is name and text of a file that marks the others as complete: the old one is removed first and the
-        new one comes last. If a rename fails, the old files are restored.
+        Parameters
+        ----------
+        report
+            Name and text of a file that marks the others as complete: the old one is removed first and the new one
+            comes last.
+        replaceable
+            `stamps` of the files that may be replaced, by default of those that were there when the context was
+            entered.
         """
         self.build()
         names = [file.name for file in self._files]
@@ -180,35 +190,8 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 (self._scratch / name).write_text(text, encoding="utf-8")
                 _flush(self._scratch / name)
-        try:
-            if report:
-                self._put_aside(names[-1])
-            for name in names:
-                if name != names[-1]:  # after the last rename nothing is restored
-                    self._put_aside(name)
-                with self._failing(self._folder / name):
-                    os.replace(self._scratch / name, self._folder / name)
-        except BaseException:
-            if (self._scratch / names[-1]).exists():
-                self._take_back(names)
-            raise
-
-    def _put_aside(self, name: str) -> None:
-        """Move an existing file aside until all new files have their names."""
-        place = self._folder / name
-        with self._failing(place), suppress(FileNotFoundError):
-            if place.is_dir() and not place.is_symlink():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-            os.replace(place, self._replaced / name)
-
-    def _take_back(self, names: Sequence[str]) -> None:
-        """Restore the files that had the names before."""
-        for name in names:
-            with suppress(OSError):
-                if os.path.lexists(self._replaced / name):
-                    os.replace(self._replaced / name, self._folder / name)
-                elif not (self._scratch / name).exists():
-                    os.unlink(self._folder / name)
+        publish(self._scratch, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
+        self._is_published = True
 
     def _create(self, file: File) -> DatasetWriter:
         """Create a plain GeoTIFF for the strips, with all metadata of the final file."""
@@ -273,23 +256,38 @@ class OutputWriter:
         self._locked.close()
 
     def _remove_scratch(self) -> None:
-        """Delete temporary files of this or a killed process, and no others."""
-        names = [file.name for file in self._files]
-        ours = (*names, *(f"strips-{name}" for name in names), *_REPORTS)
+        """Delete temporary files of this or a killed process, and the replaced ones after publishing; no others."""
+        ours = re.compile(_UNFINISHED.format("|".join(map(re.escape, self._names))))
         for folder in (self._replaced, self._scratch):
             with suppress(OSError):
-                for file in folder.iterdir():
-                    if file.name.startswith(ours) and not file.is_dir():
+                for file in folder.iterdir() if folder == self._scratch or self._is_published else ():
+                    if ours.fullmatch(file.name) and not file.is_dir():
                         file.unlink()
                 folder.rmdir()
 
 
 def remove_scratch(folder: Path, files: Sequence[File]) -> None:
     """Delete temporary files of a killed process whose final files exist."""
-    hidden = folder / _SCRATCH.format(files[0].name)
-    if hidden.is_dir() and not hidden.is_symlink():
-        with LocalFolder(hidden).locked():
-            OutputWriter(folder, files, 0, 0, Georeferencing(), {})._remove_scratch()
+    with _killed(folder, files) as writer:
+        writer._is_published = True
+
+
+def restore(folder: Path, files: Sequence[File]) -> None:
+    """Restore the files that a killed process put aside, and delete its temporary ones."""
+    with _killed(folder, files) as writer:
+        put_back(writer._scratch, folder, writer._names)
+
+
+@contextmanager
+def _killed(folder: Path, files: Sequence[File]) -> Iterator[OutputWriter]:
+    """Yield the writer of a killed process; afterwards delete its temporary files."""
+    writer = OutputWriter(folder, files, 0, 0, Georeferencing(), {})
+    if writer._hidden.is_dir() and not writer._hidden.is_symlink():
+        with LocalFolder(writer._hidden).locked():
+            yield writer
+            writer._remove_scratch()
+    else:
+        yield writer
 
 
 def check_space(folder: Path, files: Sequence[File], height: int, width: int) -> None:

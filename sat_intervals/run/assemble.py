@@ -8,24 +8,25 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from typing import Any, TypeVar
 
 import numpy as np
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, calibration_of
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter
+from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter, stamps
 from sat_intervals.run.job import Job
-from sat_intervals.run.output import stamps
+from sat_intervals.run.output import OUTPUTS
 from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
-from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced
+from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced, replaceable_files
 
 Item = TypeVar("Item")
 
@@ -68,9 +69,9 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     """
     config, store, region = job.config, job.store, job.store.grid.region
     records, statistics = store.records(), job.statistics()
-    _check_done(job, records)
+    check_done(job, records)
     histogram, seams = store.histogram(records), store.seams(records)
-    _check_matched(job, records, int(histogram.sum()))
+    check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count, config.disparity.minimum)
     where = job.left.georeferencing.shifted(region)
@@ -98,9 +99,10 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
             _LOG.warning("%s", line)
         if not keep_tiles:
             mark_finished(store.home, job.name)
-        writer.publish(report=("run.json", json.dumps(report, indent=1) + "\n"))
+        text = json.dumps(report, indent=1) + "\n"
+        writer.publish(("run.json", text), replaceable=replaceable_files(store.home))
         if not keep_tiles:
-            mark_finished(store.home, job.name, stamps(job.out))
+            mark_finished(store.home, job.name, list(stamps(job.out, OUTPUTS).values()))
         mark_replaced(store.home)
         progress("files", 1, 1)
     return report
@@ -125,7 +127,7 @@ def _prefetched(items: Iterable[Item]) -> Iterator[Item]:
             yield item
 
 
-def _check_done(job: Job, records: Records) -> None:
+def check_done(job: Job, records: Records) -> None:
     """Raise if tiles are missing; a retry restores them."""
     missing = [tile.name for tile in job.store.grid if tile.name not in records]
     if missing:
@@ -134,7 +136,7 @@ def _check_done(job: Job, records: Records) -> None:
         )
 
 
-def _check_matched(job: Job, records: Records, searched: int) -> None:
+def check_matched(job: Job, records: Records, searched: int) -> None:
     """Raise if no pixel could be matched, with the likely reason."""
     if searched:
         return
@@ -158,9 +160,29 @@ def _tags(config: Config) -> dict[str, str]:
         "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
         "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
     }
-    if config.interval:
-        tags["ALPHA"] = f"{config.interval.alpha} (level of possibility, not a probability)"
+    interval = config.interval
+    if interval and interval.coverage is not None:
+        calibration = calibration_of(config)
+        tags["COVERAGE"] = f"{interval.coverage} (mean over pixels like those of the calibration, not of each pixel)"
+        tags["CALIBRATION"] = f"{calibration.name} {calibration.sha256}"
+    elif interval:
+        tags["ALPHA"] = f"{interval.alpha} (level of possibility, not a probability)"
     return tags
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on, read once from their files."""
+    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def _calibration(config: Config) -> dict[str, Any] | None:
+    """Return what the run took from its calibration, whose content is in the settings."""
+    if config.interval is None or config.interval.coverage is None or config.cuts is None:
+        return None
+    calibration = calibration_of(config)
+    return {"name": calibration.name, "sha256": calibration.sha256, **config.cuts._asdict()}
 
 
 def _report(
@@ -173,7 +195,6 @@ def _report(
 ) -> dict[str, Any]:
     """Return the content of run.json."""
     grid, config = job.store.grid, job.config
-    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
     return {
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "settings": config.model_dump(mode="json"),
@@ -189,6 +210,7 @@ def _report(
             "overlap": config.tiles.overlap,
         },
         "cost_span": config.cost_span,
+        "calibration": _calibration(config),
         "normalization": statistics and statistics.report(),
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
         "counts": tally.report(),
@@ -198,5 +220,5 @@ def _report(
         },
         "overlap_left": None if config.tiles.overlap == "exact" else seam_report(seams, grid),
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
+        "versions": dict(_versions()),
     }

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from distributed import Client
 from sat_intervals.config import Config, load_config
 from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.match.search_range import Found
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
@@ -26,8 +26,8 @@ from sat_intervals.run.cluster import Connection
 from sat_intervals.run.inputs import changes_since, with_range_of
 from sat_intervals.run.job import Job, Search, fitted_to_jobs, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
-from sat_intervals.run.pair import assemble_repaired, check_failures, match_jobs, measure_images
-from sat_intervals.run.search_range import search_range
+from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, find_on, match_jobs, measure_images
+from sat_intervals.run.status import read_report
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
@@ -78,10 +78,9 @@ def match_batch(
     _raise_file_limit()
     with ExitStack() as stack:
         stack.enter_context(LocalFolder(out).locked())
+        read_report(out)  # raises if it is not ours
         connection = stack.enter_context(Connection(cluster, out))
-
-        def find(left: Image, right: Image, files: dict[str, dict[str, Any]]) -> Found:
-            return search_range(connection.client(), left, right, files, progress)
+        find = partial(find_on, connection, {}, progress)
 
         def note(states: Mapping[str, dict[str, Any]]) -> None:
             for name, how in states.items():
@@ -213,8 +212,8 @@ def _matched(
             except RunError as error:
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
-        for job, failures in match_jobs(client, list(measured.values()), progress):
-            assembling[thread.submit(_assembled, client, job, failures, keep_tiles, check)] = names[id(job)]
+        for matched in match_jobs(client, list(measured.values()), progress):
+            assembling[thread.submit(_assembled, client, matched, keep_tiles, check)] = names[id(matched.job)]
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()
         total = len(assembling)
@@ -247,18 +246,18 @@ def _kernels(config: Config) -> str:
     return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
-def _assembled(
-    client: Client, job: Job, failures: dict[str, BaseException], keep_tiles: bool, progress: Progress
-) -> dict[str, Any]:
+def _assembled(client: Client, matched: Matched, keep_tiles: bool, progress: Progress) -> dict[str, Any]:
+    job, failures, seconds = matched
+
     def match() -> None:
         measure_images(client, job, progress)
-        for _, failures in match_jobs(client, [job], progress):
-            check_failures(job, failures)
+        for again in match_jobs(client, [job], progress):
+            check_failures(job, again.failures)
 
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assemble_repaired(job, match, {}, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others

@@ -7,7 +7,7 @@ from importlib.metadata import version
 from typing import Any
 
 from sat_intervals.config import Config, Mccnn, load_config
-from sat_intervals.match.mccnn import weights_file
+from sat_intervals.config.weights import weights_file
 from sat_intervals.raster import Image, other_files
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.store.manifest import differences

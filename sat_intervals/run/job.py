@@ -6,21 +6,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, Mccnn, load_config
+from sat_intervals.config import Config, Mccnn, load_config, resolved
+from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.mccnn import load_network, weights_file
+from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
-from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image
+from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, restore, stamps
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.local_ranges import searched
-from sat_intervals.run.output import OUTPUTS, check_output, holds_run, is_complete
+from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run, inputs_before, search_before
@@ -96,10 +97,11 @@ class Job:
         if not overwrite and is_complete(self.out):  # another run may have ended before this one got the lock
             raise holds_run(self.out, OUTPUTS)
         check_output(self.out, overwrite)
-        self.store.open(self.manifest, overwrite=overwrite)
+        restore(self.out, RUN_FILES)
+        self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
         if self.found or self.local:
-            search = {"of": _origin(self.inputs), "found": self.found and self.found.report()}
-            self.store.write_search(search | {"ranges": self.local and self.local.report()})
+            search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
+            self.store.write_search(search, _origin(self.inputs))
 
     def check_inputs(self) -> None:
         """Raise if an input changed since the start of the run, or this process has other weights.
@@ -141,7 +143,7 @@ class Job:
         if not self.config.disparity.is_local:
             return None
         if self.local is None:
-            stored = (self.store.search() or {}).get("ranges")
+            stored = (self.store.search(_origin(self.inputs)) or {}).get("ranges")
             if stored is None or digest(stored) != self.grid:
                 raise DamagedTilesError(
                     f"the local search ranges in {self.store.folder} are missing: rerun the same command: it resumes"
@@ -175,7 +177,7 @@ def prepare(
     ``pair`` distinguishes otherwise equal pairs of a batch in an external store. ``find`` finds a search range that is
     not given; one that an interrupted run has found is taken over.
     """
-    config, out = load_config(config), Path(out)
+    config, out = resolved(load_config(config)), Path(out)
     requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
@@ -184,24 +186,26 @@ def prepare(
     check_output(out, overwrite)
     home, elsewhere = out / "tiles", None
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
-    before = None if overwrite else search_before(home, config.cluster.store)
-    config, found, local = searched(
-        config, left, lambda: _found_before(before, inputs) or _find(find, left, right, files)
-    )
+    before = None if overwrite else _found_before(home, config.cluster.store, inputs)
+    config, found, local = searched(config, left, lambda: before or _find(find, left, right, files))
     marked = digest(local.report()) if local else None
     checked_pair(left, right, config)
     config = fitted_to_jobs(config)
     check_tiles(config, region)
     check_space(out, RUN_FILES, region.height, region.width)
     read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
+    run = digest(_manifest(config, inputs, region, marked))
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
-        name = "-".join(filter(None, (pair, digest(_manifest(config, inputs, region, marked)))))
+        name = "-".join(filter(None, (pair, run)))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
     # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
+    if overwrite:
+        check_replaceable(out)
     grid = Grid(region, config.tiles.size)
-    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, elsewhere)
+    levels = config.subpixel_levels
+    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, run, elsewhere)
     return Job(left, right, config, store, out, inputs, files, requested, found, marked, local)
 
 
@@ -217,11 +221,10 @@ def _origin(inputs: Mapping[str, Any]) -> str:
     return digest({"version": version("sat-intervals"), "kernels": FINGERPRINT, "inputs": images})
 
 
-def _found_before(search: Mapping[str, Any] | None, inputs: Mapping[str, Any]) -> Found | None:
+def _found_before(home: Path, store: str | None, inputs: Mapping[str, Any]) -> Found | None:
     """Return the search range that an interrupted run of the same images has stored, None without one."""
-    if not search or search.get("of") != _origin(inputs) or not search.get("found"):
-        return None
-    return Found.of_report(search["found"])
+    search = search_before(home, store, _origin(inputs))
+    return Found.of_report(search["found"]) if search and search["found"] else None
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:

@@ -1,12 +1,13 @@
 """Check the folder of a run: whether it can be used, is complete, and has the published files."""
 
+import json
 import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import RUN_FILES
+from sat_intervals.raster import RUN_FILES, is_marked, stamps
 from sat_intervals.store.tiles import finished_run, has_begun, is_replacing
 
 OUTPUTS = (*(file.name for file in RUN_FILES), "run.json")
@@ -32,6 +33,24 @@ def check_output(out: Path, overwrite: bool) -> None:
         raise SatIntervalsError(f"{out} cannot be written: {error.strerror}: choose another folder") from error
 
 
+def check_replaceable(out: Path) -> None:
+    """Raise if a folder has files with names of a run's, but none that a run made; call it to overwrite."""
+    there = [out / name for name in OUTPUTS if (out / name).exists()]
+    if there and not any(_is_of_run(file) for file in there):
+        raise SatIntervalsError(
+            f"{there[0]} exists and was not made by sat-intervals, or is damaged: move it away or choose another folder"
+        )
+
+
+def _is_of_run(file: Path) -> bool:
+    if file.name != "run.json":
+        return is_marked(file)
+    try:
+        return bool({"settings", "inputs", "tiles"} <= json.loads(file.read_text(encoding="utf-8")).keys())
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return False
+
+
 def holds_run(out: Path, there: Sequence[str]) -> SatIntervalsError:
     """Return the error for a folder with a run that must not be replaced."""
     return SatIntervalsError(f"{out} already holds a run ({', '.join(there)}): choose another folder or --overwrite")
@@ -40,12 +59,6 @@ def holds_run(out: Path, there: Sequence[str]) -> SatIntervalsError:
 def is_complete(out: Path) -> bool:
     """Return whether a folder has all files of a run, and no unfinished run is to replace them."""
     return all((out / name).exists() for name in OUTPUTS) and not is_replacing(out / "tiles")
-
-
-def stamps(out: Path) -> list[str]:
-    """Return sizes and modification times of the files of a run; a copy that preserves times has the same."""
-    found = [(out / name).stat() for name in OUTPUTS]
-    return [f"{status.st_size:x}-{status.st_mtime_ns:x}" for status in found]
 
 
 def check_as_published(out: Path) -> None:
@@ -57,8 +70,9 @@ def check_as_published(out: Path) -> None:
         Names the first changed file.
     """
     _, noted = finished_run(out / "tiles") or ("", [])
-    for name, before, now in zip(OUTPUTS, noted, stamps(out), strict=False):
-        if now != before:
+    now = stamps(out, OUTPUTS)
+    for name, before in zip(OUTPUTS, noted, strict=False):
+        if now.get(name) != before:
             raise SatIntervalsError(
                 f"{out / name} was changed after the run, but the tiles still exist: delete it and rerun the same "
                 "command to make it again, or start again with --overwrite"

@@ -4,8 +4,9 @@ import errno
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from distributed import Client
 
@@ -27,8 +28,8 @@ from sat_intervals.run.schedule import Schedule, Step
 from sat_intervals.run.search_range import search_range
 from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_tile, measure_block, trace_tile
-from sat_intervals.store.borders import whole_borders
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.steps import BORDERS, whole_steps
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Tile, Window
 
@@ -101,7 +102,7 @@ def _match_pair(
     """Match a pair on a cluster; see `match_pair`."""
     seconds: dict[str, float] = {}
 
-    find = partial(_find, connection, seconds, progress)
+    find = partial(find_on, connection, seconds, progress)
     with logged_stage(seconds, "start"):
         job = prepare(*pair, out, config, window=window, overwrite=overwrite, find=find)
 
@@ -111,8 +112,9 @@ def _match_pair(
                 client = connection.client()
                 with logged_stage(seconds, "tiles.images"):
                     measure_images(client, job, progress)
-                for _, failures in match_jobs(client, [job], progress):
-                    check_failures(job, failures)
+                for matched in match_jobs(client, [job], progress):
+                    check_failures(job, matched.failures)
+                    seconds.update(matched.seconds)
 
     with LocalFolder(job.store.home).locked():
         if not overwrite and job.is_finished():
@@ -135,7 +137,7 @@ def _match_pair(
     return report
 
 
-def _find(
+def find_on(
     connection: Connection,
     seconds: dict[str, float],
     progress: Progress,
@@ -143,7 +145,7 @@ def _find(
     right: Image,
     files: dict[str, dict[str, Any]],
 ) -> Found:
-    """Find the search range of a pair; see `search_range`."""
+    """Find the search range of a pair on a cluster; see `search_range`. The time is added to ``seconds``."""
     with logged_stage(seconds, "start.range"):
         return search_range(connection.client(), left, right, files, progress)
 
@@ -206,32 +208,39 @@ def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
             raise error
     if failures:
         lines = "\n".join(f"  tile {name}: {reason(error)}" for name, error in sorted(failures.items()))
+        waiting = " or wait for their path states" if job.config.hands_states_on else ""
         raise RunError(
-            f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept; fix the cause and rerun the "
-            f"same command: it resumes; add --overwrite if an input changed:\n{lines}"
+            f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept{waiting}; fix the cause and "
+            f"rerun the same command: it resumes; add --overwrite if an input changed:\n{lines}"
         ) from min(failures.items())[1]
 
 
-def match_jobs(
-    client: Client, jobs: Sequence[Job], progress: Progress
-) -> Iterator[tuple[Job, dict[str, BaseException]]]:
-    """Match the unfinished tiles of jobs; yield each job after its last tile, with its failures by tile.
+class Matched(NamedTuple):
+    """A job whose last tile has ended, its failures by tile, and seconds by stage, those of its tiles apart."""
+
+    job: Job
+    failures: dict[str, BaseException]
+    seconds: dict[str, float]
+
+
+def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
+    """Match the unfinished tiles of jobs; yield each job after its last tile.
 
     Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the
     number of tiles. Workers write the products to the store and return nothing.
     """
     waiting = [job.waiting() for job in jobs]
     schedules = [_schedule(job, tiles) for job, tiles in zip(jobs, waiting, strict=True)]
-    failures: list[dict[str, BaseException]] = [{} for _ in jobs]
+    matched = [Matched(job, {}, {}) for job in jobs]
     total = sum(len(job.store.grid) for job in jobs) - sum(map(len, waiting)) + sum(map(len, schedules))
-    yield from ((job, {}) for job, schedule in zip(jobs, schedules, strict=True) if not schedule)
+    yield from (ended for ended, schedule in zip(matched, schedules, strict=True) if not schedule)
     done = total - sum(map(len, schedules))
     progress("tiles", done, total)
     for outcome in Submission(client, _tasks(jobs, schedules)):
         if outcome is None:
             progress("tiles", done, total)
             continue
-        (i, step), _, error = outcome
+        (i, step), seconds, error = outcome
         if isinstance(error, OSError) and error.errno in _FULL_DISK:  # all other tiles would fail too
             raise RunError(
                 f"{error.filename or jobs[i].store.folder}: {error.strerror}: free disk space and rerun the same "
@@ -239,23 +248,25 @@ def match_jobs(
             ) from error
         if error is None:
             schedules[i].ended(step)
+            for stage, took in (seconds or {}).items():  # of tracing; a tile keeps its own in its record
+                matched[i].seconds[f"tiles.{stage}"] = matched[i].seconds.get(f"tiles.{stage}", 0.0) + took
         else:
-            failures[i][step.name] = error
+            matched[i].failures.setdefault(step.tile.name, error)
             schedules[i].failed(step)
             jobs[i].store.write_failure(step.tile.name, reason(error))
         _LOG.debug("%s: tile %s %s", jobs[i].out, step.name, f"failed: {reason(error)}" if error else "done")
         done = total - sum(map(len, schedules))
         progress("tiles", done, total)
         if not schedules[i]:
-            yield jobs[i], failures[i]
+            yield matched[i]
 
 
 def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:
-    grid, borders = job.store.grid, None
+    grid, borders, views = job.store.grid, None, 1 + job.config.matches_right_view
     if job.config.hands_states_on:
-        names = (Step(tile, wavefront).name for tile in grid for wavefront in range(len(WAVEFRONTS)))
-        borders = whole_borders(job.store.folder, names)
-    return Schedule(grid, tiles, borders)
+        steps = (Step(*of) for of in product(grid, range(len(WAVEFRONTS)), [False, True][:views]))
+        borders = whole_steps(job.store.folder, job.store.run, BORDERS, (step.name for step in steps))
+    return Schedule(grid, tiles, borders, views)
 
 
 def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task | None]:
@@ -263,7 +274,7 @@ def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task 
     while any(schedules):
         ready = [(i, step) for i, schedule in enumerate(schedules) if (step := schedule.next())]
         for i, step in ready:
-            function, rest = (match_tile, ()) if step.wavefront is None else (trace_tile, (step.wavefront,))
+            function, rest = (match_tile, ()) if step.wavefront is None else (trace_tile, step[1:])
             yield Task((i, step), function, (jobs[i], step.tile, *rest), jobs[i].config.cluster.retries)
         if not ready:
             yield None

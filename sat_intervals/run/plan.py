@@ -6,8 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.kernels.cost import padded_to_lanes
+from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
@@ -22,7 +26,8 @@ from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image.
 SAMPLE = 512
-# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed), strips of the final bands, files.
+# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each sub-pixel level),
+# strips of the final bands, files.
 _STORE_BYTES, _STRIP_BYTES, _FILE_BYTES = 12, 18, 10
 
 
@@ -37,7 +42,7 @@ class Plan:
     workers
         Tiles at once.
     extra_work
-        Work on overlaps, relative to that on cores.
+        Work on overlaps or, with exact seams, on the path states that tiles hand on, relative to that on cores.
     worker_bytes
         Memory of a process with one tile at once.
     together, together_bytes
@@ -98,33 +103,55 @@ def plan(
     region = checked_region(left, window)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
-    work = _work(grid, region, config)
     # Compiled once a machine: a part of the first plan, not of the run.
     progress("kernels", 0, 1)
     compile_kernels(config)
+    seconds, extra = _expected(left, right, config, workers, grid)
     pixels = region.height * region.width
     together = {"threads": workers, "processes": 1, "address": 1}.get(config.cluster.kind, config.cluster.cores)
     return Plan(
         tile_size=config.tiles.size,
         tiles=len(grid),
         workers=workers,
-        extra_work=work / pixels - 1,
+        extra_work=extra,
         worker_bytes=PROCESS_BYTES + tile_bytes(config),
         together=together,
         together_bytes=PROCESS_BYTES + together * tile_bytes(config),
-        disk_bytes=pixels * (_STORE_BYTES + _STRIP_BYTES + _FILE_BYTES),
-        seconds=_expected_seconds(left, right, config, workers, work, region),
+        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels + _STRIP_BYTES + _FILE_BYTES)
+        + _handed_bytes(grid, config),
+        seconds=seconds,
     )
 
 
-def _work(grid: Grid, region: Window, config: Config) -> int:
+def _handed_bytes(grid: Grid, config: Config) -> int:
+    """Return the bytes that steps hand to each other: path states on the tiles' borders, and precomputed costs."""
+    if not config.hands_states_on:
+        return 0
+    height, width = grid.region.height, grid.region.width
+    lines = grid.columns * height + grid.rows * width
+    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(config.disparity.count) * np.dtype(np.uint16).itemsize
+    costs = config.cost.precomputed * height * width * config.disparity.count
+    return (1 + config.matches_right_view) * (states + costs)
+
+
+def _traced(grid: Grid) -> int:
+    """Return the pixels of the tiles that hand on path states, summed over the wavefronts but the last.
+
+    Tiles hand on the last one when they are matched. The tile in the corner where a wavefront ends hands nothing on.
+    """
+    ends = (grid.rows - 1, grid.columns - 1), (grid.rows - 1, 0), (0, 0)
+    corners = (grid.tile(*end).core for end in ends)
+    return len(ends) * grid.region.height * grid.region.width - sum(core.height * core.width for core in corners)
+
+
+def _work(grid: Grid, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows behind its core."""
     overlap = config.tiles.margin
     total = 0
     for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
         for column, columns in _kinds(grid.columns, -(-overlap // grid.size)):
             core = grid.tile(row, column).core
-            patch = core.grown(overlap, overlap).clipped(region)
+            patch = core.grown(overlap, overlap).clipped(grid.region)
             total += rows * columns * (patch.width * (core.height + patch.height) // 2)
     return total
 
@@ -139,17 +166,25 @@ def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
         yield ends, count - 2 * ends
 
 
-def _expected_seconds(left: Image, right: Image, config: Config, workers: int, work: int, region: Window) -> float:
-    """Estimate the seconds of a run from a sample: tiles scaled by work, the rest by pixels."""
+def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
+    """Estimate the seconds of a run from a sample, and its extra work: tiles scaled by work, the rest by pixels."""
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
+    if config.hands_states_on:  # the sample needs seams
+        size = min(SAMPLE // 2, config.tiles.size)
+        one = one.model_copy(update={"tiles": config.tiles.model_copy(update={"size": size})})
     with tempfile.TemporaryDirectory() as folder:
-        sample, seconds = _sampled(left, right, Path(folder) / "sample", one, region)
-    sampled = _work(Grid(sample, config.tiles.size), region, config)
-    tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / sampled
-    tiles /= min(workers, len(Grid(region, config.tiles.size)))
-    files = (seconds["bands"] + seconds["files"]) * (region.height * region.width) / (sample.height * sample.width)
+        window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region)
+    sample = Grid(window, one.tiles.size)
+    pixels, sampled = (there.height * there.width for there in (grid.region, window))
+    work = _work(grid, config)
+    tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / _work(sample, one)
+    tiles += seconds.get("tiles.costs", 0.0) * pixels / sampled
+    paths = seconds.get("tiles.trace", 0.0) * _traced(grid) / max(1, _traced(sample))
+    files = (seconds["bands"] + seconds["files"]) * pixels / sampled
     images = seconds["tiles.images"]  # the sample already measures whole images
-    return float(seconds["start"] + seconds["kernels"] + images + tiles + files)
+    parallel = (tiles + paths) / min(workers, len(grid))
+    extra = paths / tiles if config.hands_states_on else work / pixels - 1
+    return float(seconds["start"] + seconds["kernels"] + images + parallel + files), extra
 
 
 def _sampled(left: Image, right: Image, out: Path, config: Config, region: Window) -> tuple[Window, dict[str, float]]:

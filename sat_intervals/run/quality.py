@@ -84,7 +84,7 @@ def doubts(quality: dict[str, Any], paths: dict[str, str], *, is_census: bool = 
     if (quality["noise"] or 0) > _NOISE and is_census:
         lines.append(
             f"{paths['left']} and {paths['right']}: matches differ {quality['noise']:.2f} times as much as random "
-            "pixels, the pair is noisy: --preset satellite has penalties for such images"
+            "pixels, the pair is noisy: --preset satellite has penalties for such images, calibrate --tune finds some"
         )
     return lines
 

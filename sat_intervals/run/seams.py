@@ -29,12 +29,14 @@ def seam_lines(raw: Raw, output: Window, core: Window, size: int) -> np.ndarray:
 
     Returns
     -------
-    int16 ``(side, own or ring, winner or lower or upper, size)``; NO_DISPARITY where there is no pixel.
+    int16 ``(side, own or ring, winner or bound, size)``, bounds of all levels; NO_DISPARITY where there is no pixel.
     """
-    lines = np.full((4, 2, 3, size), NO_DISPARITY, np.int16)
+    bounds = (raw.lower, raw.upper, raw.lower_low, raw.upper_low)
+    products = [raw.winner, *(bound.view(np.int16) for bound in bounds if bound.size)]
+    lines = np.full((4, 2, len(products), size), NO_DISPARITY, np.int16)
     inner = core.relative_to(output)
     rows, columns = inner.slices
-    for i, product in enumerate((raw.winner, raw.lower, raw.upper)):
+    for i, product in enumerate(products):
         for side, own, ring in ((TOP, inner.row, -1), (BOTTOM, inner.row_stop - 1, 1)):
             lines[side, OWN, i, : core.width] = product[own, columns]
             if 0 <= own + ring < output.height:
@@ -101,4 +103,4 @@ def _borders(lines: np.ndarray, grid: Grid) -> Iterator[tuple[tuple[str, str], _
 def _compare(first: np.ndarray, second: np.ndarray) -> _Difference:
     differs = first != second
     pixels = (first[0] != NO_DISPARITY) | (second[0] != NO_DISPARITY)
-    return _Difference(int(pixels.sum()), int(differs[0].sum()), int((differs[1] | differs[2]).sum()))
+    return _Difference(int(pixels.sum()), int(differs[0].sum()), int(differs[1:].any(axis=0).sum()))

@@ -9,6 +9,7 @@ from sat_intervals.config.pairs import REPORT
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.place import ElsewhereError
+from sat_intervals.store.removal import BORDERS
 from sat_intervals.store.tiles import is_replacing, store_of
 
 __all__ = ["ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
@@ -22,6 +23,8 @@ class Status:
     ----------
     total, done
         Numbers of tiles.
+    handed_on
+        Number of path states that tiles handed to their neighbours, which come before the tiles.
     failed
         Why tiles failed, by name, without those done since.
     running
@@ -30,6 +33,7 @@ class Status:
 
     total: int
     done: int
+    handed_on: int
     failed: dict[str, str]
     running: bool
 
@@ -50,7 +54,8 @@ def read_status(home: Path, store: str | None = None) -> Status:
         There is no store, or it is not the one that the user names.
     """
     there = store_of(home, store)
-    return Status(len(there.grid), len(there.done()), there.failures(), LocalFolder(home).is_locked())
+    handed_on = len(there.folder.inside(BORDERS).sizes())
+    return Status(len(there.grid), len(there.done()), handed_on, there.failures(), LocalFolder(home).is_locked())
 
 
 def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
@@ -63,4 +68,6 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
             str(name): {"error": "", **ended, "state": str(ended["state"])} for name, ended in json.loads(text).items()
         }
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise SatIntervalsError(f"{out / REPORT} is not the report of a batch: rerun the batch") from error
+        raise SatIntervalsError(
+            f"{out / REPORT} is not the report of a batch: move it away and rerun the batch"
+        ) from error

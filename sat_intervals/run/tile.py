@@ -1,28 +1,39 @@
 """Match one tile on a worker, or trace its paths: read, compute, write the intermediate products."""
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
-from sat_intervals.match.borders import Border, Place, borders_of, rehulled, trace_patch
+from sat_intervals.match.borders import Border, Place, borders_of, rehulled, trace_area
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
+from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
-from sat_intervals.match.patch import Patch, match_patch, patch_window, patch_windows, path_window
+from sat_intervals.match.patch import (
+    Frame,
+    Patch,
+    frame_area,
+    frames_of,
+    match_costed,
+    mirrored_frame,
+    patch_areas,
+    path_window,
+)
 from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_views, read_window
 from sat_intervals.raster.identity import check_unchanged
 from sat_intervals.run.job import Job
-from sat_intervals.run.schedule import Step, needs
+from sat_intervals.run.schedule import LAST, Step, needs
 from sat_intervals.run.seams import seam_lines
-from sat_intervals.store.borders import read_border, write_border
+from sat_intervals.store.steps import BORDERS, COSTS, read_step, write_step
 from sat_intervals.tiling import Tile, Views, Window
 
 # Tiles along each side of the grid, at most, in which the quality of a pair is looked at.
@@ -49,10 +60,10 @@ def match_tile(job: Job, tile: Tile) -> None:
         _match_tile(job, tile)
 
 
-def trace_tile(job: Job, tile: Tile, wavefront: int) -> None:
-    """Write the path states that a tile hands to its neighbours in a wavefront; runs on a worker."""
+def trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[str, float]:
+    """Write the path states that a tile hands on in a wavefront; return seconds by stage; runs on a worker."""
     with _logged_failure(job, tile):
-        _trace_tile(job, tile, wavefront)
+        return _trace_tile(job, tile, wavefront, mirrored)
 
 
 @contextmanager
@@ -70,17 +81,24 @@ def _logged_failure(job: Job, tile: Tile) -> Iterator[None]:
 
 def _match_tile(job: Job, tile: Tile) -> None:
     job.store.check_space(tile)
-    region, whole = job.store.grid.region, _image(job)
+    frame, borders = _frame(job, tile), None
     seconds: dict[str, float] = {}
     ranges = job.ranges()
-    views, statistics = _read(job, patch_windows(tile.core, region, whole, job.config, ranges), seconds)
-    borders = _borders(job, tile, range(len(WAVEFRONTS)), ranges) if job.config.hands_states_on else None
+    costed = _costs(job, patch_areas(*frame[:3], job.config, ranges), tile, seconds)
+    if job.config.hands_states_on:
+        with timed(seconds, "read"):
+            frames = frames_of(*frame[:3], job.config)
+            borders = [_borders(job, tile, of_view, range(len(WAVEFRONTS)), ranges) for of_view in frames]
+    seconds["match"] = seconds.get("match", 0.0) + seconds.pop("costs", 0.0)
     with timed(seconds, "match"):
-        patch = match_patch(views, tile.core, region, whole, job.config, statistics, borders, ranges)
-    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
+        patch = match_costed(costed.views, frame, costed.made, job.config, borders, ranges)
+    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), costed.views, strict=True)}
     with timed(seconds, "write"):
+        if job.config.hands_states_on:
+            for mirrored, ring in enumerate(patch.leaving):
+                write_step(job.store.folder, job.store.run, BORDERS, Step(tile, LAST, bool(mirrored)).name, *ring)
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    looks = [look._asdict() for look in _looks(views, tile, job)]
+    looks = [look._asdict() for look in _looks(costed.views, tile, job)]
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files, "looks": looks})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
@@ -93,17 +111,22 @@ def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
     return look_in_tile(views, tile.core, search.minimum, search.maximum)
 
 
-def _trace_tile(job: Job, tile: Tile, wavefront: int) -> None:
-    region, whole = job.store.grid.region, _image(job)
-    ranges, patch = job.ranges(), patch_window(tile.core, region, whole, job.config)
-    views, statistics = _read(job, patch_windows(tile.core, region, whole, job.config, ranges), {})
-    borders = _borders(job, tile, [wavefront], ranges)
-    ring = trace_patch(views, patch, borders, wavefront, job.config, statistics, ranges)
-    write_border(job.store.folder, f"{tile.name}_{wavefront}", *ring)
+def _trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[str, float]:
+    frame, ranges = _frame(job, tile), job.ranges()
+    if mirrored:
+        frame = mirrored_frame(frame, job.config)
+    seconds: dict[str, float] = {}
+    with timed(seconds, "trace"):
+        (cost,) = _costs(job, [frame_area(frame, job.config, ranges)], tile, seconds).made
+        borders = _borders(job, tile, frame, [wavefront], ranges)
+        ring = trace_area(cost, frame, borders, wavefront, job.config, ranges)
+        write_step(job.store.folder, job.store.run, BORDERS, Step(tile, wavefront, mirrored).name, *ring)
+    costs = seconds.get("costs", 0.0)
+    return {"costs": costs, "trace": seconds["trace"] - costs}
 
 
-def _image(job: Job) -> Window:
-    return Window(0, 0, job.left.height, job.left.width)
+def _frame(job: Job, tile: Tile) -> Frame:
+    return Frame(tile.core, job.store.grid.region, Window(0, 0, job.left.height, job.left.width))
 
 
 def _read(job: Job, windows: tuple[Window, Window], seconds: dict[str, float]) -> tuple[Views, PairStatistics | None]:
@@ -119,27 +142,60 @@ def _read(job: Job, windows: tuple[Window, Window], seconds: dict[str, float]) -
     return views, statistics
 
 
-def _borders(job: Job, tile: Tile, wavefronts: Iterable[int], ranges: LocalRanges | None) -> Borders:
-    """Read the path states that a tile takes over from its neighbours."""
-    grid, whole = job.store.grid, _image(job)
-    here = narrowed(ranges, patch_window(tile.core, grid.region, whole, job.config), job.config)
+class _Costed(NamedTuple):
+    """Both images in the windows of some areas, and the costs of these."""
+
+    views: Views
+    made: list[MatchingCost]
+
+
+def _costs(job: Job, areas: Sequence[Area], tile: Tile, seconds: dict[str, float]) -> _Costed:
+    """Read both images and compute the costs of a tile's areas.
+
+    Precomputed costs take longer than SGM: the first of the tile's steps keeps them for the others, uncompressed, since
+    those of noisy images do not shrink.
+    """
+    views, statistics = _read(job, view_windows(areas, job.config), seconds)
+    if not (job.config.cost.precomputed and job.config.hands_states_on):
+        with timed(seconds, "match"):
+            return _Costed(views, cost_areas(views, areas, job.config, statistics))
+    folder = job.store.folder
+    names = [f"{tile.name}_right" if area.mirrored else tile.name for area in areas]
+    with timed(seconds, "read"):
+        kept = [costs for name in names for costs in read_step(folder, job.store.run, COSTS, name) or ()]
+    if len(kept) == len(names):
+        missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
+        made = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
+        with timed(seconds, "match"):
+            return _Costed(views, cost_areas(views, areas, job.config, statistics, made))
+    with timed(seconds, "costs"):
+        costed = cost_areas(views, areas, job.config, statistics)
+        for name, area, cost in zip(names, areas, costed, strict=True):
+            write_step(folder, job.store.run, COSTS, name, cost.costs.left[:, :, : area.disparities])
+    return _Costed(views, costed)
+
+
+def _borders(job: Job, tile: Tile, frame: Frame, wavefronts: Iterable[int], ranges: LocalRanges | None) -> Borders:
+    """Read the path states that a tile takes over from its neighbours in a view."""
+    here = narrowed(ranges, frame_area(frame, job.config).base, job.config)
     found: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
     for wavefront in wavefronts:
-        for step in needs(grid, Step(tile, wavefront)):
-            states = read_border(job.store.folder, step.name)
+        for step in needs(job.store.grid, Step(tile, wavefront, frame.mirrored)):
+            states = read_step(job.store.folder, job.store.run, BORDERS, step.name)
             if states is None:
                 raise RunError(
                     f"the path states of tile {step.tile.name} in {job.store.folder} are missing or damaged: rerun the "
                     "same command: it resumes"
                 )
             place = step.tile.grid_row - tile.grid_row, step.tile.grid_column - tile.grid_column
-            inside = path_window(step.tile.core, grid.region, whole, job.config)
+            there = _frame(job, step.tile)
+            if frame.mirrored:
+                there = mirrored_frame(there, job.config)
             ring = Ring(*states)
             if ranges:
-                around = patch_window(step.tile.core, grid.region, whole, job.config)
-                ring = rehulled(ring, narrowed(ranges, around, job.config).disparity.minimum, here)
-            found[wavefront][place] = Border(inside, ring)
-    return borders_of(tile.core, grid.region, whole, here, found)
+                ring = rehulled(ring, frame_area(there, job.config, ranges).minimum, here)
+            found[wavefront][place] = Border(path_window(there, job.config), ring)
+    return borders_of(frame, here, found)
 
 
 def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
@@ -147,6 +203,8 @@ def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     raw = patch.raw
     inner = tile.core.relative_to(patch.output).slices
     arrays = {name: getattr(raw, name)[inner] for name in ("winner", "lower", "upper", "disparity", "validity")}
+    if job.config.subpixel_levels == 2:
+        arrays |= {name: getattr(raw, name)[inner] for name in ("lower_low", "upper_low")}
     ambiguity = raw.ambiguity[inner]
     histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.store.ambiguities)
     if job.config.cross_check:

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.curves import read_alpha_cuts, read_winners
-from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.kernels.curves import read_alpha_cuts, read_subpixel_cut, read_winners
+from sat_intervals.kernels.matching import Settings, cost_volume
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import kernel_settings
-from sat_intervals.products import FLAGS, IMPOSSIBLE_COST
+from sat_intervals.products import FLAGS, IMPOSSIBLE_COST, REGULARIZED
 from sat_intervals.raster import read_views
 from sat_intervals.results import Results
 from sat_intervals.tiling import Window
@@ -27,8 +27,10 @@ class Curve(NamedTuple):
         Float64, aggregated by SGM if the run uses it; NaN where a candidate is impossible.
     possibilities
         0 to 1, 1 at the lowest cost; NaN where a candidate is impossible.
+    level
+        Possibility at which the curve is cut, None if the run has no intervals.
     cut
-        Whether a disparity belongs to the alpha-cut; all false if the run has no intervals.
+        Whether a disparity belongs to the cut; all false if the run has no intervals.
     disparity
         The disparity of lowest cost, refined if the run refines, in pixels.
     lower, upper
@@ -38,10 +40,11 @@ class Curve(NamedTuple):
     disparities: np.ndarray
     costs: np.ndarray
     possibilities: np.ndarray
+    level: float | None
     cut: np.ndarray
     disparity: float
-    lower: int | None
-    upper: int | None
+    lower: float | None
+    upper: float | None
 
 
 def read_curve(results: Results, row: int, column: int) -> Curve:
@@ -78,16 +81,39 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     costs = np.where(possible, curve[0, 0].astype(np.float64), np.nan)
     above = costs - np.nanmin(costs)
     _, disparity, _ = read_winners(curve, settings.minimum, settings.weights, settings.refine)
-    lower, upper = read_alpha_cuts(curve, settings.minimum, settings.cut_level, settings.refine)
+    largest = _largest_above(results, row, column, settings)
+    bounds = None if largest is None else _bounds(curve, largest, float(disparity[0, 0]), settings)
     return Curve(
         disparities=np.arange(settings.minimum, settings.minimum + settings.count),
         costs=costs,
         possibilities=np.maximum(1 - above / config.cost_span, 0),
-        cut=above <= (-1 if config.cut_level is None else config.cut_level),
+        level=None if largest is None else _possibility(largest, results),
+        cut=above <= (-1 if largest is None else largest),
         disparity=float(disparity[0, 0]),
-        lower=int(lower[0, 0]) if config.interval else None,
-        upper=int(upper[0, 0]) if config.interval else None,
+        lower=None if bounds is None else bounds[0],
+        upper=None if bounds is None else bounds[1],
     )
+
+
+def _largest_above(results: Results, row: int, column: int, settings: Settings) -> float | None:
+    """Return the largest cost above the lowest that belongs to the cut of a pixel's class; None without intervals."""
+    if settings.steps == 0:
+        return settings.cut_level if settings.cut_level >= 0 else None
+    is_low = settings.low >= 0 and results.read_pixel(row, column).validity & REGULARIZED
+    return settings.low if is_low else settings.high
+
+
+def _bounds(curve: np.ndarray, largest: float, disparity: float, settings: Settings) -> tuple[float, float]:
+    if settings.steps:
+        return read_subpixel_cut(curve[0, 0], settings.minimum, largest, settings.steps, disparity)
+    lower, upper = read_alpha_cuts(curve, settings.minimum, settings.cut_level, settings.refine)
+    return int(lower[0, 0]), int(upper[0, 0])
+
+
+def _possibility(largest: float, results: Results) -> float:
+    """Return the possibility at which a curve is cut: alpha, or that of a calibrated level."""
+    interval = results.config.interval
+    return float(interval.alpha) if interval and interval.alpha else max(0.0, 1 - largest / results.config.cost_span)
 
 
 def _explain(results: Results, row: int, column: int) -> str:

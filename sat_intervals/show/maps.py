@@ -181,7 +181,8 @@ def _caption(results: Results, thinned: tuple[int, int] | None) -> str:
     height, width = results.shape
     search, interval = results.config.disparity, results.config.interval
     parts = [f"{height} x {width} pixels", f"disparities {search.minimum} to {search.maximum} px searched"]
-    parts += [f"alpha {interval.alpha}"] if interval else []
+    if interval:
+        parts.append(f"alpha {interval.alpha}" if interval.coverage is None else f"coverage {interval.coverage}")
     if thinned:
         ratio = height * width / (thinned[0] * thinned[1])
         parts.append(f"one pixel in {ratio:,.{0 if ratio >= 10 else 1}f} shown")

@@ -104,16 +104,18 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     """Draw the alpha-cut of the possibilities and the interval derived from it."""
     assert curve.lower is not None
     assert curve.upper is not None
-    assert results.config.interval is not None
-    level = float(results.config.interval.alpha)
-    chart.axhline(level, color=INK, lw=0.8, ls="--")
+    assert curve.level is not None
+    interval = results.config.interval
+    name = f"level {curve.level:.3f}" if interval is None or interval.alpha is None else f"alpha = {curve.level:g}"
+    chart.axhline(curve.level, color=INK, lw=0.8, ls="--")
     right = chart.get_yaxis_transform()
-    chart.text(1, level, f"alpha = {level:g}", transform=right, ha="right", va="bottom", color=INK)
+    chart.text(1, curve.level, name, transform=right, ha="right", va="bottom", color=INK)
     cut = curve.cut
     chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
     inside = curve.disparities[cut]
-    wider = curve.lower < inside.min() or curve.upper > inside.max()
-    ends = f"{curve.lower} to {curve.upper} px"
+    is_whole = results.config.subpixel_levels == 0
+    wider = is_whole and (curve.lower < inside.min() or curve.upper > inside.max())
+    ends = f"{curve.lower:.6g} to {curve.upper:.6g} px"
     text = f"interval, {ends}:\ncut pushed out by refinement" if wider else f"interval of the cut, {ends}"
     chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)
     arrow = {"arrowstyle": "<->", "color": BLUE, "shrinkA": 0, "shrinkB": 0}

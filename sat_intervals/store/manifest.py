@@ -21,23 +21,35 @@ class StoreError(SatIntervalsError):
     """A store of another run, or one that cannot be used."""
 
 
-def sealed(content: Mapping[str, Any]) -> str:
-    """Return an object as JSON with a checksum, so that damage is detected, see `unsealed`."""
-    return json.dumps({**content, _SEAL: _checksum(content)}, indent=1)
+def sealed(content: Mapping[str, Any], of: str = "") -> str:
+    """Return an object as JSON with a checksum, so that damage is detected, see `unsealed`.
+
+    ``of`` says what the object belongs to, so that one of another run or tile is not taken for it.
+    """
+    return json.dumps({**content, _SEAL: _checksum(content, of)}, indent=1)
 
 
-def unsealed(text: str | None) -> dict[str, Any] | None:
+def unsealed(text: str | None, of: str = "") -> dict[str, Any] | None:
     """Return the object of a `sealed` text; None for any other text and for None."""
     try:
         content = json.loads(text or "")
     except (ValueError, RecursionError):
         return None
-    is_whole = isinstance(content, dict) and content.pop(_SEAL, None) == _checksum(content)
+    is_whole = isinstance(content, dict) and content.pop(_SEAL, None) == _checksum(content, of)
     return content if is_whole else None
 
 
-def _checksum(content: Mapping[str, Any]) -> int:
-    return zlib.crc32(json.dumps(content).encode())
+def is_sealed(text: str) -> bool:
+    """Return whether a text looks like one of `sealed`, whatever it belongs to."""
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and isinstance(content.get(_SEAL), int)
+
+
+def _checksum(content: Mapping[str, Any], of: str) -> int:
+    return zlib.crc32((of + json.dumps(content)).encode())
 
 
 def parsed(manifest: str, folder: Folder) -> dict[str, Any]:

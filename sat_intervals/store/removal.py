@@ -5,21 +5,23 @@ import re
 from contextlib import suppress
 
 from sat_intervals.store.folder import Folder
-from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed, unsealed
+from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, is_sealed, parsed
 from sat_intervals.store.zarr_arrays import MADE_BY
 
-ARRAYS, RECORDS, FAILURES, BORDERS = "arrays.zarr", "records", "failures", "borders"
+ARRAYS, RECORDS, FAILURES, BORDERS, COSTS = "arrays.zarr", "records", "failures", "borders", "costs"
+FOLDERS = RECORDS, FAILURES, BORDERS, COSTS
 NORMALIZATION, SEARCH = "normalization.json", "range.json"
 _GROUP = f"{ARRAYS}/zarr.json"
 _OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
-    rf"|{BORDERS}/(\d+)_(\d+)_[0-3]"
+    rf"|{BORDERS}/(\d+)_(\d+)(?:_right)?_[0-3]"
+    rf"|{COSTS}/(\d+)_(\d+)(?:_right)?"
     rf"|{ARRAYS}/(?:u?int\d+/c/0|right/c|seams/c|histogram/c)/(\d+)/(\d+)(?:/0)*"
 )
 # Folders of a run. If one of them were a link, writing would replace the user's files behind it.
 _FOLDER = re.compile(
-    rf"{RECORDS}|{FAILURES}|{BORDERS}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
+    rf"{RECORDS}|{FAILURES}|{BORDERS}|{COSTS}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
 )
 # Temporary names of `LocalFolder` and of zarr, which a killed process leaves, with the final name as group.
 _UNFINISHED = re.compile(r"(?:(?<=/)|^)\.([^/]+)\.[0-9a-f]{32}$"), re.compile(r"()\.[0-9a-f]{32}\.partial$")
@@ -34,7 +36,7 @@ def drop(folder: Folder) -> None:
     if is_of_run(folder):
         # The manifest first, since the rest is invalid without it. The group last, to recognise an unfinished removal.
         folder.delete(MANIFEST)
-        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES, BORDERS))
+        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, FOLDERS)
         folder.delete_all([_GROUP], [ARRAYS])
     folder.delete_if_empty()
 
@@ -69,14 +71,20 @@ def _names(folder: Folder) -> dict[str, int]:
         grid = grid_of(parsed(folder.read(MANIFEST) or "", folder), folder)
 
     def is_named(name: str) -> bool:
-        for unfinished in _UNFINISHED:
-            name = unfinished.sub(r"\1", name)
+        name = final_name(name)
         if _OF_RUN.fullmatch(name) or (found := _OF_TILE.fullmatch(name)) is None:
             return _OF_RUN.fullmatch(name) is not None
         row, column = (int(number) for number in found.groups() if number is not None)
         return grid is None or (row < grid.rows and column < grid.columns)
 
     return {name: size for name, size in folder.sizes().items() if is_named(name)}
+
+
+def final_name(name: str) -> str:
+    """Return the name that an unfinished file was to have; that of any other file is unchanged."""
+    for unfinished in _UNFINISHED:
+        name = unfinished.sub(r"\1", name)
+    return name
 
 
 def is_of_run(folder: Folder) -> bool:
@@ -87,4 +95,4 @@ def is_of_run(folder: Folder) -> bool:
     with suppress(ValueError, AttributeError):
         if json.loads(folder.read(_GROUP) or "").get("attributes") == MADE_BY:
             return True
-    return any(unsealed(text) is not None for text in folder.read_all(RECORDS).values())
+    return any(is_sealed(text) for text in folder.read_all(RECORDS).values())

@@ -21,17 +21,18 @@ import numpy as np
 
 from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
-from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, grid_of, parsed, sealed, unsealed
+from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
-    BORDERS,
     FAILURES,
+    FOLDERS,
     NORMALIZATION,
     RECORDS,
     SEARCH,
     check_not_foreign,
     drop,
+    final_name,
     is_of_run,
 )
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
@@ -41,13 +42,11 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 6
+LAYOUT = 8
 
-# Marker files in the folder of a run.
-# Present while a run replaces an earlier one.
-_REPLACING = ".sat-intervals.replacing"
-# Name of the run, from the publication of its files to the removal of its tiles.
-_FINISHED = ".sat-intervals.finished"
+# Marker files in the folder of a run: present while it replaces an earlier run; its name, from the publication of its
+# files to the removal of its tiles.
+_REPLACING, _FINISHED = ".sat-intervals.replacing", ".sat-intervals.finished"
 
 
 class DamagedTilesError(RunError):
@@ -71,6 +70,10 @@ class Store:
         Number of disparities of the search range.
     ambiguities
         Largest possible ambiguity of a pixel.
+    levels
+        Levels of sub-pixel bounds, see `TileArrays`.
+    run
+        Digest of the manifest: what belongs to another run is not taken for a part of this one.
     elsewhere
         Folder of the tiles in the store that the user names; by default ``home``.
     """
@@ -79,6 +82,8 @@ class Store:
     grid: Grid
     count: int
     ambiguities: int
+    levels: int
+    run: str
     elsewhere: str | None = None
 
     @property
@@ -88,9 +93,11 @@ class Store:
 
     @property
     def _arrays(self) -> TileArrays:
-        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities)
+        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels)
 
-    def open(self, manifest: Mapping[str, Any], *, overwrite: bool = False) -> None:
+    def open(
+        self, manifest: Mapping[str, Any], *, overwrite: bool = False, replaceable: Mapping[str, str] | None = None
+    ) -> None:
         """Create the store or resume an existing one; call it while ``home`` is locked.
 
         Parameters
@@ -100,6 +107,8 @@ class Store:
         overwrite
             Whether to delete existing tiles and replace the files of an earlier run. Tiles in a store that the user
             does not name are kept.
+        replaceable
+            What `replaceable_files` returns afterwards, with ``overwrite``.
 
         Raises
         ------
@@ -127,12 +136,12 @@ class Store:
                 drop(folder)
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
-            for name in ("", RECORDS, FAILURES, BORDERS):
+            for name in ("", *FOLDERS):
                 folder.make(name)
             home.make("")
             home.delete(_FINISHED)
             if overwrite:
-                home.write(_REPLACING, "")
+                home.write(_REPLACING, json.dumps(dict(replaceable or {})))
             if self.elsewhere:
                 home.write(PLACE, json.dumps(str(folder)))
             else:
@@ -208,25 +217,28 @@ class Store:
     def write_record(self, tile: Tile, record: Mapping[str, Any]) -> None:
         """Write the record of a tile, with its checksums in ``files``; the tile is then done."""
         name = f"{RECORDS}/{tile.name}.json"
-        self.folder.write(name, sealed(record))
+        self.folder.write(name, sealed(record, f"{self.run}/{tile.name}"))
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
             self.folder.delete(name)
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Write the statistics of the whole images, so that all tiles use the same."""
-        self.folder.write(NORMALIZATION, sealed(normalization))
+        self.folder.write(NORMALIZATION, sealed(normalization, self.run))
 
     def normalization(self) -> dict[str, Any] | None:
         """Read the statistics of `write_normalization`; None if missing or damaged."""
-        return unsealed(self.folder.read(NORMALIZATION))
+        return unsealed(self.folder.read(NORMALIZATION), self.run)
 
-    def write_search(self, search: Mapping[str, Any]) -> None:
-        """Write the search range that was found, so that it is not searched again, see `search_before`."""
-        self.folder.write(SEARCH, sealed(search))
+    def write_search(self, search: Mapping[str, Any], of: str) -> None:
+        """Write the search range that was found, so that it is not searched again, see `search_before`.
 
-    def search(self) -> dict[str, Any] | None:
-        """Read what `write_search` wrote; None if missing or damaged."""
-        return unsealed(self.folder.read(SEARCH))
+        ``of`` names all that decides which range is found: not the run, which depends on the range.
+        """
+        self.folder.write(SEARCH, sealed(search, of))
+
+    def search(self, of: str) -> dict[str, Any] | None:
+        """Read what `write_search` wrote; None if missing, damaged or of other images."""
+        return unsealed(self.folder.read(SEARCH), of)
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Write why a tile failed, for `failures`; a later record replaces it."""
@@ -251,7 +263,7 @@ class Store:
         texts, sizes = self.folder.read_all(RECORDS), self._arrays.folder.sizes()
         found = {}
         for tile in self.grid:
-            record = unsealed(texts.get(tile.name))
+            record = unsealed(texts.get(tile.name), f"{self.run}/{tile.name}")
             files = record.get("files", {}) if record else {}
             is_complete = files.keys() == self._arrays.files_of(tile)
             if record and is_complete and all(sizes.get(name) == size for name, (size, _) in files.items()):
@@ -304,8 +316,8 @@ class Store:
 def remove_tiles(home: Path, place: Folder) -> None:
     """Delete a run's tiles in ``place``, and its marker files in ``home``."""
     drop(place)
-    for name in (PLACE, _REPLACING, _FINISHED):
-        folder_at(home).delete(name)
+    names = PLACE, _REPLACING, _FINISHED
+    folder_at(home).delete_all([name for name in folder_at(home).sizes() if final_name(name) in names])
 
 
 def mark_finished(home: Path, run: str, stamps: Sequence[str] = ()) -> None:
@@ -332,6 +344,14 @@ def is_replacing(home: Path) -> bool:
     return folder_at(home).read(_REPLACING) is not None
 
 
+def replaceable_files(home: Path) -> dict[str, str]:
+    """Return the stamps of the files that an unfinished run is to replace, by name."""
+    try:
+        return dict(json.loads(folder_at(home).read(_REPLACING) or "{}"))
+    except (ValueError, TypeError, RecursionError):
+        return {}
+
+
 def has_begun(home: Path) -> bool:
     """Return whether a run made this folder of tiles; a user's folder may have the same name."""
     return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
@@ -345,10 +365,10 @@ def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
         return {}
 
 
-def search_before(home: Path, store: str | None) -> dict[str, Any] | None:
-    """Return what `Store.write_search` wrote with existing tiles; None if it cannot be read."""
+def search_before(home: Path, store: str | None, of: str) -> dict[str, Any] | None:
+    """Return what `Store.write_search` wrote with existing tiles; None if it cannot be read or is of other images."""
     try:
-        return unsealed(place_of(home, store).read(SEARCH))
+        return unsealed(place_of(home, store).read(SEARCH), of)
     except (OSError, ValueError):
         return None
 
@@ -382,4 +402,5 @@ def store_of(home: Path, store: str | None = None) -> Store:
     text = folder.read(MANIFEST)
     if text is None:
         raise StoreError(f"{home.parent} has no run: give the folder that match was given")
-    return Store(home, grid_of(parsed(text, folder), folder), 1, 0, str(folder))
+    manifest = parsed(text, folder)
+    return Store(home, grid_of(manifest, folder), 1, 0, 0, digest(manifest), str(folder))

@@ -23,17 +23,14 @@ from sat_intervals.store.folder import Folder
 from sat_intervals.tiling import Grid, Tile
 
 # Raw products of a core's pixels, in one array per type; its planes are read and written together.
-_PLANES: dict[str, dict[str, type[np.generic]]] = {
-    "int16": {"winner": np.int16, "lower": np.int16, "upper": np.int16, "validity": np.uint16},
-    "uint32": {"disparity": np.float32, "ambiguity": np.uint32},
-}
+_WORDS: dict[str, type[np.generic]] = {"winner": np.int16, "lower": np.int16, "upper": np.int16, "validity": np.uint16}
+_SUBPIXEL: dict[str, type[np.generic]] = dict.fromkeys(("lower", "upper", "lower_low", "upper_low"), np.uint16)
+_LONG_WORDS: dict[str, type[np.generic]] = {"disparity": np.float32, "ambiguity": np.uint32}
 # Right view of each core, see `_rank`.
 _RIGHT = "right"
 # Rank of a right pixel without candidates.
 _UNSEEN = np.uint32(0xFFFFFFFF)
 SIDES = ("top", "bottom", "left", "right")
-# Raw products that are compared along a seam.
-SEAM_PRODUCTS = ("winner", "lower", "upper")
 
 # Rows of a shard that are compressed together; strips of these rows read only what they need.
 _ROWS_TOGETHER = 128
@@ -63,12 +60,15 @@ class TileArrays:
         Number of disparities of the search range.
     ambiguities
         Largest possible ambiguity of a pixel.
+    levels
+        Levels of sub-pixel bounds, each with a lower and an upper one; 0 for bounds in whole pixels.
     """
 
     folder: Folder
     grid: Grid
     count: int
     ambiguities: int
+    levels: int
 
     @property
     def _reach(self) -> int:
@@ -76,7 +76,7 @@ class TileArrays:
 
     def create(self) -> None:
         """Write missing or damaged metadata of the arrays; every run writes the same."""
-        texts, _ = _descriptions(self.grid, self.count, self.ambiguities)
+        texts, _ = _descriptions(self.grid, self.count, self.ambiguities, self.levels)
         for name, text in texts.items():
             if self.folder.read(name) != text:
                 self.folder.make(name.rpartition("/")[0])
@@ -84,7 +84,7 @@ class TileArrays:
 
     def _array(self, name: str, store: Store) -> zarr.Array[Any]:
         """Open an array of a store without reading its metadata there, which are for other tools."""
-        _, metadata = _descriptions(self.grid, self.count, self.ambiguities)
+        _, metadata = _descriptions(self.grid, self.count, self.ambiguities, self.levels)
         array = zarr.Array(zarr.AsyncArray(metadata[name], StorePath(store, name)))
         # Write blocks of fill values too, so that every finished tile has all its files.
         return array.with_config({"write_empty_chunks": True})
@@ -97,13 +97,13 @@ class TileArrays:
         """Return the names of a tile's files."""
         place = f"{tile.grid_row}/{tile.grid_column}"
         return {
-            *(f"{dtype}/c/0/{place}" for dtype in _PLANES),
+            *(f"{dtype}/c/0/{place}" for dtype in _planes(self.levels)),
             f"{_RIGHT}/c/{place}", f"seams/c/{place}/0/0/0/0", f"histogram/c/{place}/0",
         }  # fmt: skip
 
     def bytes_of(self, tile: Tile) -> int:
         """Return the size of a tile's products before compression."""
-        pixel = sum(np.dtype(dtype).itemsize for planes in _PLANES.values() for dtype in planes.values())
+        pixel = sum(np.dtype(dtype).itemsize for planes in _planes(self.levels).values() for dtype in planes.values())
         return tile.core.height * (tile.core.width * pixel + self._reach * np.dtype(np.uint32).itemsize)
 
     def write(self, tile: Tile, arrays: Mapping[str, np.ndarray]) -> Checksums:
@@ -115,14 +115,14 @@ class TileArrays:
             The tile.
         arrays
             ``winner``, ``lower``, ``upper``, ``disparity``, ``ambiguity`` and ``validity`` of the core's shape;
-            optionally ``right_cost`` and ``right_winner``; ``seams`` (SIDES, own line or ring, SEAM_PRODUCTS, size);
-            ``histogram``.
+            with two levels ``lower_low`` and ``upper_low``; optionally ``right_cost`` and ``right_winner``; ``seams``
+            (SIDES, own line or ring, winner and bounds, size); ``histogram``.
         """
         size, row, column = self.grid.size, tile.grid_row, tile.grid_column
         height, width = arrays["winner"].shape
         rows = slice(row * size, row * size + height)
         store = _WrittenStore(self._store())
-        for dtype, planes in _PLANES.items():
+        for dtype, planes in _planes(self.levels).items():
             made = np.stack([arrays[name].view(dtype) for name in planes])
             self._array(dtype, store)[:, rows, column * size : column * size + width] = made
         rank = np.full((height, self._reach), _UNSEEN)
@@ -173,11 +173,11 @@ class TileArrays:
         """
         step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
         store = _CheckedStore(self._store(), checksums)
-        stored = {name: self._array(name, store) for name in (*_PLANES, _RIGHT)}
+        stored = {name: self._array(name, store) for name in (*_planes(self.levels), _RIGHT)}
         for first in range(0, self.grid.region.height, step):
             here = slice(first, min(first + step, self.grid.region.height))
             strip: dict[str, np.ndarray] = {}
-            for dtype, planes in _PLANES.items():
+            for dtype, planes in _planes(self.levels).items():
                 read = np.asarray(stored[dtype][:, here, : self.grid.region.width])
                 strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
             yield strip | {"right_winner": self._merged(np.asarray(stored[_RIGHT][here]))}
@@ -192,8 +192,13 @@ class TileArrays:
         return _winner(best)
 
 
+def _planes(levels: int) -> dict[str, dict[str, type[np.generic]]]:
+    bounds = dict(list(_SUBPIXEL.items())[: 2 * levels])
+    return {"int16": {**_WORDS, **bounds}, "uint32": _LONG_WORDS}
+
+
 @lru_cache(maxsize=16)
-def _descriptions(grid: Grid, count: int, ambiguities: int) -> tuple[dict[str, str], dict[str, Any]]:
+def _descriptions(grid: Grid, count: int, ambiguities: int, levels: int) -> tuple[dict[str, str], dict[str, Any]]:
     """Return the metadata of the group and arrays as texts by file name, and as objects by array name."""
     texts: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(texts), zarr_format=3, attributes=MADE_BY)
@@ -213,7 +218,7 @@ def _descriptions(grid: Grid, count: int, ambiguities: int) -> tuple[dict[str, s
 
     size, height, width = grid.size, grid.rows * grid.size, grid.columns * grid.size
     together, reach = math.gcd(size, _ROWS_TOGETHER), _reach(grid, count)
-    for dtype, planes in _PLANES.items():
+    for dtype, planes in _planes(levels).items():
         planes_together = len(planes)
         describe(
             dtype,
@@ -223,7 +228,7 @@ def _descriptions(grid: Grid, count: int, ambiguities: int) -> tuple[dict[str, s
             dtype,
         )
     describe(_RIGHT, (height, grid.columns * reach), (size, reach), (together, reach), np.uint32, _UNSEEN)
-    lines, counts = (len(SIDES), 2, len(SEAM_PRODUCTS), size), ambiguities + 1
+    lines, counts = (len(SIDES), 2, 5 if levels == 2 else 3, size), ambiguities + 1
     describe("seams", (grid.rows, grid.columns, *lines), None, (1, 1, *lines), np.int16, NO_DISPARITY)
     describe("histogram", (grid.rows, grid.columns, counts), None, (1, 1, counts), np.uint32)
     return {name: text.to_bytes().decode() for name, text in texts.items()}, metadata

@@ -702,7 +702,7 @@ def test_match__overwrites_when_asked(folder, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     for name in OUTPUTS:
-        (out / name).write_text("of another time")
+        (out / name).write_text('{"settings": {}, "inputs": {}, "tiles": {}}')  # a run whose bands are damaged
     (out / "notes.txt").write_text("mine")
     assert invoke(*matching(folder, out, "--overwrite")).exit_code == 0
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "notes.txt"])
@@ -784,14 +784,15 @@ def test_match__refuses_two_presets(folder, tmp_path):
 def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(tmp_path):
     out = tmp_path / "out"
     arguments = ("demo", out, "--size", 150, 180, "--seed", 4)
-    result = command(*arguments)
-    assert result.returncode == 0
+    result = invoke(*arguments)
+    assert result.exit_code == 0
     assert "the ends of the search range" in result.stderr  # a small scene: much of it lies beside the images' borders
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "left.tif", "right.tif", "truth.tif"])
-    last = result.stdout.splitlines()[-1]
+    held, *compared = result.stdout.splitlines()[-3:]
     found = re.fullmatch(
-        r"The interval contains the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", last
+        r"The interval contains the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", held
     )
+    assert [line.split()[:3] for line in compared] == [["alpha", "0.9", "coverage"], ["coverage", "0.9", "coverage"]]
     scene = make_scene(150, 180, seed=4)
     with rasterio.open(out / "truth.tif") as file:
         np.testing.assert_array_equal(file.read(1), scene.truth)

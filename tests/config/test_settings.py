@@ -104,8 +104,7 @@ def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
 )
 def test_preset_text__changes_census_and_penalties(name: str, window: int, p1: int, p2: int) -> None:
     config = load_config(yaml.safe_load(preset_text(name)), RANGE)
-    tiles = {"overlap": 128} if name == "satellite" else {}
-    assert config == settings(preset=name, cost={"window": window}, sgm={"p1": p1, "p2": p2}, tiles=tiles)
+    assert config == settings(preset=name, cost={"window": window}, sgm={"p1": p1, "p2": p2})
 
 
 def test_preset_text__satellite_mccnn_has_constant_penalties_with_their_span() -> None:
@@ -308,11 +307,11 @@ REFUSED = [
     ),
     ("ambiguity", None, "regularization needs ambiguity, set to null: give ambiguity or set"),
     ("interval", None, "regularization needs interval, set to null: give interval or set"),
-    ("interval", {"alpha": 0}, "interval.alpha is 0, allowed: number > 0, <= 1"),
-    ("interval", {"alpha": 1.01}, "interval.alpha is 1.01, allowed: number > 0, <= 1"),
-    ("interval", {"alpha": "0.9"}, "interval.alpha is '0.9', allowed: number > 0, <= 1"),
-    ("interval", {"alpha": True}, "interval.alpha is true, allowed: number > 0, <= 1"),
-    ("interval", {"alpha": None}, "interval.alpha is null, allowed: number > 0, <= 1"),
+    ("interval", {"alpha": 0}, "interval.alpha is 0, allowed: number > 0, <= 1 or null"),
+    ("interval", {"alpha": 1.01}, "interval.alpha is 1.01, allowed: number > 0, <= 1 or null"),
+    ("interval", {"alpha": "0.9"}, "interval.alpha is '0.9', allowed: number > 0, <= 1 or null"),
+    ("interval", {"alpha": True}, "interval.alpha is true, allowed: number > 0, <= 1 or null"),
+    ("interval", {"alpha": None}, "interval: alpha and coverage are null: give one of them, or set interval to null"),
     ("refinement", {"method": "quadratic"}, "refinement.method is 'quadratic', allowed: vfit"),
     ("cross_check", {"method": "slow"}, "cross_check.method is 'slow', allowed: fast or accurate"),
     ("cross_check", {"tolerance": -1}, "cross_check.tolerance is -1, allowed: integer >= 0"),

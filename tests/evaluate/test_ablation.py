@@ -169,7 +169,9 @@ def test_command__prints_json_and_a_table(folder):
     assert result.exit_code == 0
     assert json.loads(result.stdout) == report
     assert result.stderr == f"matching {folder}\n"
-    label, scenes, _, *figures = invoke("ablate", folder).stdout.splitlines()[2].split()
+    result = invoke("ablate", folder, "-q")
+    assert result.stderr == ""
+    label, scenes, _, *figures = result.stdout.splitlines()[2].split()
     assert (label, scenes) == ("all", "1")
     assert figures == [f"{report[name]['accuracy']:.3f}" for name in METHODS]
 

@@ -80,7 +80,15 @@ def scenes(draw):
         truth=truth,
     )
     depth, kernel = draw(st.integers(0, 3)), draw(st.sampled_from([1, 3, 5]))
-    criteria = Criteria(minimum, maximum, 0.6, kernel, depth, draw(st.sampled_from([0.0, 0.25])))
+    criteria = Criteria(
+        minimum,
+        maximum,
+        0.6,
+        kernel,
+        depth,
+        draw(st.sampled_from([0.0, 0.25])),
+        nominal=draw(st.sampled_from([None, 0.9])),
+    )
     return scene, criteria, draw(st.lists(st.integers(1, 5), max_size=6))
 
 
@@ -128,14 +136,14 @@ def test_evaluate__worked_example():
     #   1 - area / width: 1 - 3/1 = -2, 1 - 3/6 = .5, 1 - .5/1 = .5, 1 - 3/4 = .25: median .375
     #   with the rejected pixel, a miss of error 4 alone in its area, width 2: 1 - 4/2 = -1, median .25
     #   disparity - truth: 0 .5 3 . 0 / .5 3 -2 0: median .25
-    criteria = Criteria(-2, 8, 0.6, 1, 1)
+    #   the miss is by 1; at a nominal coverage of .75 it adds 2 / .25 to the widths: 2.5 + 8 / 8, 2, 3 + 8 / 4
+    criteria = Criteria(-2, 8, 0.6, 1, 1, nominal=0.75)
     report = evaluate(lambda: [rows_of(EXAMPLE)], criteria, with_rejected=True)
-    assert report["all"] == {"count": 8, "accuracy": 0.875, "relative_size": 0.2, "mean_width": 2.5}
-    assert report["high"] == {"count": 4, "accuracy": 1, "relative_size": 0.2, "mean_width": 2}
+    names = ("count", "accuracy", "relative_size", "mean_width", "median_width", "interval_score")
+    assert report["all"] == dict(zip(names, (8, 0.875, 0.2, 2.5, 2, 3.5), strict=True))
+    assert report["high"] == dict(zip(names, (4, 1, 0.2, 2, 2, 2), strict=True))
     low = report["low"]
-    assert low == {
-        "count": 4, "accuracy": 0.75, "relative_size": 0.25, "mean_width": 3, "relative_overestimation": 0.375
-    }  # fmt: skip
+    assert low == dict(zip(names, (4, 0.75, 0.25, 3, 2.5, 5), strict=True)) | {"relative_overestimation": 0.375}
     assert (report["bad1"], report["bad3"], report["truth_outside_range"]) == (0.375, 0, 0)
     assert report["with_rejected"]["all"]["count"] == 9
     assert report["with_rejected"]["low"]["accuracy"] == 0.6
@@ -216,7 +224,7 @@ def criteria_of(out, tolerance=0.0):
     report = json.loads((out / "run.json").read_text())["settings"]
     names = {"kernel", "threshold", "depth"}
     low = {name: value for name, value in report["regularization"].items() if name in names}
-    return SimpleNamespace(**report["disparity"], **low, tolerance=tolerance)
+    return SimpleNamespace(**report["disparity"], **low, tolerance=tolerance, nominal=0.9)
 
 
 def test_evaluate_run__equals_the_slow_twin(pair, run, tmp_path, monkeypatch):
@@ -380,7 +388,9 @@ def test_command__prints_the_form_of_json(run):
     report = json.loads(text)
     assert status == 0
     assert report == json.loads(json.dumps(evaluate_run(run)))
-    assert set(report["all"]) == set(report["high"]) == {"count", "accuracy", "relative_size", "mean_width"}
+    assert set(report["all"]) == set(report["high"]) == {
+        "count", "accuracy", "relative_size", "mean_width", "median_width", "interval_score"
+    }  # fmt: skip
     assert set(report["low"]) == {*report["all"], "relative_overestimation"}
     assert {"bad1", "bad3", "deciles", "with_rejected", "tolerance", "bias"} < set(report)
 
@@ -420,8 +430,8 @@ def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
     reports = json.loads(text)
     assert list(reports) == ["one", "two", str(run)]
     assert reports["one"] == reports[str(run)]
-    status, text, _ = command("evaluate", pair, other)
-    assert status == 0
+    status, text, shown = command("evaluate", pair, other, "--quiet")
+    assert (status, shown) == (0, "")
     label, scenes, reached, accuracy, *_ = text.splitlines()[2].split()
     assert (label, scenes) == ("synthetic", "2")
     accuracies = [reports[name]["all"]["accuracy"] for name in ("one", "two")]

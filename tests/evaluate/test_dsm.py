@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 
 from sat_intervals.evaluate.dsm import evaluate_surface
-from sat_intervals.evaluate.metrics import Histogram
+from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import SURFACE
 
 PLACE = Affine(1, 0, 370_000, 0, -1, 4_830_000)

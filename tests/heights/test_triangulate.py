@@ -383,6 +383,20 @@ def test_triangulate__keeps_a_foreign_report(level_run, tmp_path, text):
     assert not (out / "points.tif").exists()
 
 
+def test_triangulate__keeps_foreign_points(level_run):
+    out, files = level_run
+    path, foreign = out / "points.tif", [b"mine", (out / "intervals.tif").read_bytes()]
+    for content in foreign:
+        path.write_bytes(content)
+        with pytest.raises(SatIntervalsError, match=r"points.tif exists and was not made by triangulate"):
+            triangulate(out, *files)
+        assert path.read_bytes() == content
+    path.unlink()
+    triangulate(out, *files)
+    (out / "points.json").unlink()  # of an earlier version
+    triangulate(out, *files)
+
+
 def test_triangulate_command__needs_a_run(tmp_path):
     files = cameras(tmp_path, 40, 50)
     result = invoke("triangulate", tmp_path, *given(files))

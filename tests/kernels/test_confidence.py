@@ -38,7 +38,7 @@ def test_match_costs__ambiguity_worked_example():
     scene = SimpleNamespace(window=5, minimum=-2, count=4, p1=8, p2=32, regularized=False)
     parameters = Settings(**reference.settings_of(scene, eta_max="0.15", eta_step="0.05"))
     assert parameters.weights.tolist() == [3, 2, 1] + 22 * [0]
-    raw, _ = match_costs(between(left, right), parameters, Window(0, 0, 3, 1))
+    raw, *_ = match_costs(between(left, right), parameters, Window(0, 0, 3, 1))
     assert raw.ambiguity.tolist() == [[4], [9], [7]]
     assert reference.ambiguity(curves[:, np.newaxis], "0.15", "0.05", 24).tolist() == [[4], [9], [7]]
 

@@ -47,7 +47,7 @@ def bare(left_levels, right_levels, minimum=0, **options):
     count = codes[1].state.shape[1] - codes[0].state.shape[1] + 1
     scene = SimpleNamespace(window=5, minimum=minimum, count=count, p1=8, p2=32, regularized=False)
     parameters = Settings(**reference.settings_of(scene, **options))
-    return match_costs(between(*codes), parameters, Window(0, 0, *codes[0].state.shape))
+    return match_costs(between(*codes), parameters, Window(0, 0, *codes[0].state.shape))[:2]
 
 
 # ---- Winner and refinement ---------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def test_match_costs__validity_worked_example():
     state = np.array([[0, 0, 1, 1, 0], [2, 1, 2, 0, 0], [0, 0, 0, 0, 0]], np.uint8)
     right = Codes(np.zeros((1, 3, 5), np.uint32), state)
     scene = SimpleNamespace(window=3, minimum=0, count=2, p1=1, p2=2, regularized=True)
-    raw, _ = match_costs(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 3, 4))
+    raw, *_ = match_costs(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 3, 4))
     part = RANGE_INCOMPLETE | NOT_REFINED
     expected = [
         [NOT_REFINED, part, NO_CANDIDATE, part],
@@ -244,7 +244,7 @@ def test_match_costs__left_window_and_no_candidate_stand_together():
     scene = SimpleNamespace(window=3, minimum=0, count=2, p1=1, p2=2, regularized=True)
     for states, bit in (([1, 1], NO_CANDIDATE), ([1, 2], RIGHT_MASKED), ([3, 1], RIGHT_MASKED), ([0, 1], 0)):
         right = Codes(np.zeros((1, 1, 2), np.uint32), np.array([states], np.uint8))
-        raw, _ = match_costs(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 1, 1))
+        raw, *_ = match_costs(between(left, right), Settings(**reference.settings_of(scene)), Window(0, 0, 1, 1))
         assert raw.validity.item() == LEFT_WINDOW | bit
 
 

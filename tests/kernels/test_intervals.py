@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import reference
-from helpers import matched
+from helpers import calibration, matched
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +18,7 @@ from sat_intervals.kernels.matching import Settings, match_costs
 from sat_intervals.match.in_memory import match_arrays
 from sat_intervals.match.patch import match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
-from sat_intervals.products import IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
+from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import View, Window
 
 bounded = settings(max_examples=60, derandomize=True, deadline=None)
@@ -134,6 +134,52 @@ def test_match_costs__interval_holds_the_disparity(scene, refine, alpha):
     assert (raw.upper[found] <= scene.minimum + scene.count - 1).all()
 
 
+# ---- Sub-pixel cuts ----------------------------------------------------------------------------------------
+def test_match_costs__subpixel_cut_worked_example():
+    # Level 2.5, steps of 1/64 above the first disparity.
+    #     9 3 5 9    limit 5.5: down from 1 by 2.5 / 6, up from 2 by 0.5 / 4: 64 - ceil(26.67) = 37, 128 + 8
+    #     4 4 4 7    limit 6.5: from the end of the range; up from 2 by 2.5 / 3: 128 + ceil(53.33) = 182
+    #     . 2 6 4    limit 4.5: beside the impossible candidate, and at the end of the range: 64, 192
+    raw = of_curves(CURVES, -2, refine=False, cuts=(2.5, 0.0), steps=64)
+    assert raw.lower.tolist() == [[37], [0], [64]]
+    assert raw.upper.tolist() == [[136], [182], [192]]
+    assert raw.lower.dtype == np.uint16
+    # Level 0 is the winner, ties included; with refinement the V-fit (1 + 1 / 3, 0.5, unrefined) is inside.
+    assert raw.lower_low.tolist() == [[64], [0], [64]]
+    assert raw.upper_low.tolist() == [[64], [128], [64]]
+    refined = of_curves(CURVES, -2, cuts=(2.5, 0.0), steps=64)
+    assert refined.upper_low.tolist() == [[86], [128], [64]]
+
+
+LEVELS = st.integers(0, 1200).map(lambda quarters: reference.Fraction(quarters, 4))
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@bounded
+@given(scene=reference.scenes(), levels=st.tuples(LEVELS, LEVELS), steps=st.sampled_from([64, 4]))
+def test_match_costs__subpixel_cuts_equal_reference(refine, scene, levels, steps):
+    raw = matched(scene, refine=refine, cuts=levels, steps=steps)[0]
+    found = raw.winner != N
+    for level, bounds in zip(levels, ((raw.lower, raw.upper), (raw.lower_low, raw.upper_low)), strict=True):
+        expected = reference.subpixel_cut(reference.volume_of(scene), level, steps, refine)
+        for bound, of_reference in zip(bounds, expected, strict=True):
+            np.testing.assert_array_equal(bound[found], of_reference[found])
+
+
+@few
+@given(scene=reference.scenes(), levels=st.tuples(LEVELS, LEVELS))
+def test_match_costs__a_higher_level_never_narrows_and_the_disparity_is_inside(scene, levels):
+    low, high = sorted(levels)
+    raw = matched(scene, cuts=(high, low), steps=64)[0]
+    found = raw.winner != N
+    for narrow, wide in ((raw.lower_low, raw.lower), (raw.upper, raw.upper_low)):
+        assert (wide[found] <= narrow[found]).all()
+    disparity = (raw.disparity[found] - scene.minimum) * np.float64(64)
+    assert (raw.lower_low[found] <= disparity + 1e-3).all()  # the disparity is rounded to float32
+    assert (raw.upper_low[found] >= disparity - 1e-3).all()
+    assert (raw.upper[found] <= 64 * (scene.count - 1)).all()
+
+
 @few
 @given(scene=reference.scenes())
 def test_match_costs__without_interval(scene):
@@ -159,7 +205,7 @@ def test_regularize__worked_example():
     new_lower = np.array([[0.2, 0.2, 9, 2.1], [9, 0.2, 9, 2.2], [9, 9, 9, 3.4]], np.float32)
     new_upper = np.array([[11, 11, 9, 5.8], [9, 11, 9, 7.6], [9, 9, 9, 7.8]], np.float32)
     for result in (
-        regularize(lower, upper, low, 0, 1, 0.9, 0, 3),
+        regularize(lower, upper, low, 0, 1, 0.9, (0, 3), 2),
         reference.regularize(lower, upper, low, 1, 0.9),
     ):
         np.testing.assert_allclose(result[0], new_lower, rtol=1e-6)
@@ -175,7 +221,7 @@ def test_regularize__reaches_back_into_the_same_row():
     bounds = np.array([[0, 99, 8], [4, 4, 4]], np.float32)
     for depth, first, last in ((0, (0, 0), (8, 8)), (1, (0, 4), (4, 8)), (2, (0, 8), (0, 8))):
         for lower, upper in (
-            regularize(bounds, bounds, low, 0, depth, 1.0, 0, 2),
+            regularize(bounds, bounds, low, 0, depth, 1.0, (0, 2), 2),
             reference.regularize(bounds, bounds, low, depth, 1.0),
         ):
             assert (lower[0, 0], upper[0, 0]) == first
@@ -188,7 +234,7 @@ def test_regularize__corners_do_not_touch():
     #     . x     9 5
     low = np.eye(2, dtype=bool)
     bounds = np.array([[1, 9], [9, 5]], np.float32)
-    lower, upper = regularize(bounds, bounds, low, 0, 2, 0.9, 0, 2)
+    lower, upper = regularize(bounds, bounds, low, 0, 2, 0.9, (0, 2), 2)
     np.testing.assert_array_equal(lower, bounds)
     np.testing.assert_array_equal(upper, bounds)
 
@@ -200,7 +246,7 @@ def test_regularize__long_segments():
     low[1] = True
     low[0, ::2] = True
     lower = np.arange(3 * columns, dtype=np.float32).reshape(3, columns)
-    new_lower, new_upper = regularize(lower, lower, low, 0, 2, 0.9, 0, 3)
+    new_lower, new_upper = regularize(lower, lower, low, 0, 2, 0.9, (0, 3), 2)
     area = lower[low].astype(np.float64)
     assert new_lower[low].tolist() == pytest.approx([np.quantile(area, 0.1)] * low.sum())
     assert new_upper[low].tolist() == pytest.approx([np.quantile(area, 0.9)] * low.sum())
@@ -229,7 +275,7 @@ MINIMUM = -8
 def test_regularize__equals_reference(strip, depth, quantile):
     lower, upper, low = strip
     rows = len(low)
-    result = regularize(lower, upper, low, MINIMUM, depth, quantile, 0, rows)
+    result = regularize(lower, upper, low, MINIMUM, depth, quantile, (0, rows), 2)
     expected = reference.regularize(lower, upper, low, depth, quantile)
     np.testing.assert_allclose(result, expected, rtol=1e-6, atol=1e-6)
     assert result[0].dtype == result[1].dtype == np.float32
@@ -241,10 +287,10 @@ def test_regularize__a_halo_of_depth_rows_is_enough(strip, depth, quantile, data
     lower, upper, low = strip
     first = data.draw(st.integers(0, len(low) - 1))
     last = data.draw(st.integers(first + 1, len(low)))
-    whole = regularize(lower, upper, low, MINIMUM, depth, quantile, 0, len(low))
+    whole = regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2)
     start, stop = max(0, first - depth), min(len(low), last + depth)
     halo = np.s_[start:stop]
-    part = regularize(lower[halo], upper[halo], low[halo], MINIMUM, depth, quantile, first - start, last - start)
+    part = regularize(lower[halo], upper[halo], low[halo], MINIMUM, depth, quantile, (first - start, last - start), 2)
     np.testing.assert_array_equal(part[0], whole[0][first:last])
     np.testing.assert_array_equal(part[1], whole[1][first:last])
 
@@ -254,7 +300,7 @@ def test_regularize__a_halo_of_depth_rows_is_enough(strip, depth, quantile, data
 def test_regularize__keeps_order_and_what_is_not_low(strip, depth, quantile):
     lower, upper, low = strip
     before = lower.copy(), upper.copy()
-    new_lower, new_upper = regularize(lower, upper, low, MINIMUM, depth, quantile, 0, len(low))
+    new_lower, new_upper = regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2)
     np.testing.assert_array_equal((lower, upper), before)
     np.testing.assert_array_equal(new_lower[~low], lower[~low])
     np.testing.assert_array_equal(new_upper[~low], upper[~low])
@@ -265,7 +311,9 @@ def test_regularize__keeps_order_and_what_is_not_low(strip, depth, quantile):
 @given(strip=strips(), depth=st.integers(0, 3))
 def test_regularize__a_larger_quantile_never_narrows(strip, depth):
     lower, upper, low = strip
-    results = [regularize(lower, upper, low, MINIMUM, depth, quantile, 0, len(low)) for quantile in (0.5, 0.8, 1.0)]
+    results = [
+        regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2) for quantile in (0.5, 0.8, 1.0)
+    ]
     for narrow, wide in pairwise(results):
         assert (wide[0][low] <= narrow[0][low]).all()
         assert (wide[1][low] >= narrow[1][low]).all()
@@ -294,7 +342,7 @@ def configs(draw):
         "method": draw(st.sampled_from(["fast", "accurate"])),
         "tolerance": draw(st.integers(0, 2)),
     }
-    return load_config(
+    config = load_config(
         {
             "disparity": {"minimum": minimum, "maximum": minimum + draw(st.integers(0, 9))},
             "cost": {"window": draw(st.sampled_from([3, 5]))},
@@ -308,6 +356,16 @@ def configs(draw):
             "products": {"keep_rejected": draw(st.booleans())},
         }
     )
+    return load_config(config, {"interval": draw(subpixel(config))} if interval and draw(st.booleans()) else {})
+
+
+@st.composite
+def subpixel(draw, config):
+    """Sub-pixel bounds for settings: with alpha, or with a coverage and some levels."""
+    if draw(st.booleans()):
+        return {"alpha": float(config.interval.alpha), "bounds": "subpixel"}
+    levels = draw(st.integers(0, 99)) / 4, draw(st.integers(0, 199)) / 4
+    return {"coverage": 0.9, "calibration": calibration(config, *levels, draw(st.sampled_from([0.9, 0.6, None])))}
 
 
 def image_pair(seed, disparity, holes=0):
@@ -338,13 +396,17 @@ def view(image, state, window):
     return View(window, np.pad(image, margin)[there], np.pad(state, margin, constant_values=NO_DATA)[there])
 
 
-def check(bands, validity, expected):
-    """Compare the bands disparity, lower, upper, confidence, and validity, with the reference's."""
+def check(bands, validity, expected, config):
+    """Compare the bands disparity, lower, upper, confidence, and validity, with the reference's.
+
+    A quantile close to a multiple of 1/64 px may be rounded outwards to the next one.
+    """
+    step = 1e-6 if config.bound_steps == 0 else 1 / BOUND_STEPS
     disparity, lower, upper, confidence = bands
     np.testing.assert_array_equal(validity, expected.validity)
     np.testing.assert_array_equal(disparity, expected.disparity)
-    np.testing.assert_allclose(lower, expected.lower, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(upper, expected.upper, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(lower, expected.lower, rtol=1e-6, atol=step)
+    np.testing.assert_allclose(upper, expected.upper, rtol=1e-6, atol=step)
     np.testing.assert_allclose(confidence, expected.confidence, rtol=1e-6, atol=1e-6)
 
 
@@ -363,7 +425,7 @@ def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
         scale = confidence_scale(config.ambiguity, histogram)
     final = postprocess_rows(rows, 0, whole.height, scale, config)
     expected = reference.match_arrays(left, right, left_state, right_state, config)
-    check(final[:4], final.validity, expected)
+    check(final[:4], final.validity, expected, config)
 
 
 @some
@@ -375,7 +437,7 @@ def test_match_arrays__equals_reference(seed, config, holes):
     found = match_arrays(left, right, config)
     expected = reference.match_arrays(left, right, left_state * 0, right_state * 0, config)
     bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
-    check(bands, found["validity"].values, expected)
+    check(bands, found["validity"].values, expected, config)
     hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
     shown = (found["validity"].values & hidden) == 0
     disparity, lower, upper, _ = bands
@@ -399,7 +461,7 @@ def test_match_arrays__equals_reference_where_texture_ends(seed, config, holes, 
     found = match_arrays(left, right, config)
     expected = reference.match_arrays(left, right, left_state * 0, right_state * 0, config)
     bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
-    check(bands, found["validity"].values, expected)
+    check(bands, found["validity"].values, expected, config)
 
 
 @pytest.mark.parametrize("more", [{}, {"sgm": None}, {"cross_check": {"method": "accurate"}}])
@@ -422,4 +484,4 @@ def test_match_arrays__of_nothing_is_nothing():
     expected = reference.match_arrays(empty, empty, state, state, config)
     assert np.isnan(expected.confidence).all()
     bands = [found[name].values for name in ("disparity", "lower", "upper", "confidence")]
-    check(bands, found["validity"].values, expected)
+    check(bands, found["validity"].values, expected, config)

@@ -45,11 +45,23 @@ def images():
     return [np.ma.masked_equal(image, 0).astype(np.float32) for image in (scene.left, scene.right)]
 
 
-def test_match_whole__ranges_of_all_cells_as_wide_as_the_whole_change_nothing(images):
-    config = load_config(SEARCH)
+@pytest.mark.parametrize("interval", [{}, {"coverage": 0.9}])
+def test_match_whole__ranges_of_all_cells_as_wide_as_the_whole_change_nothing(images, interval):
+    config = load_config(SEARCH | {"interval": interval})
     whole = ranges(np.full((6, 10), -14), np.full((6, 10), 27))
     for one, other in zip(match_whole(*images, config), match_whole(*images, config, ranges=whole), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("bounds", ["whole", "subpixel"])
+def test_match_whole__cells_of_one_range_have_the_bounds_of_that_range_alone(images, bounds):
+    off = dict.fromkeys(("ambiguity", "cross_check", "median", "regularization"))
+    config = load_config(SEARCH | off | {"interval": {"bounds": bounds}})
+    alone = match_whole(*images, load_config(config, {"disparity": {"minimum": 0, "maximum": 20}}))
+    found = match_whole(*images, config, ranges=ranges(np.full((6, 10), 0), np.full((6, 10), 20)))
+    assert found.valid.mean() > 0.5
+    for one, other in zip(found[:3], alone[:3], strict=True):
+        np.testing.assert_array_equal(one[found.valid], other[found.valid])
 
 
 def test_match_whole__a_cell_that_misses_the_truth_is_not_more_confident(images):

@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 import rasterio
 import reference
-from helpers import bands, hashes, invoke, shares_that_differ, write_pair
+from helpers import bands, hashes, invoke, write_pair
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
 from sat_intervals.config.pairs import PairOfBatch
+from sat_intervals.config.weights import weights_file
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.in_memory import _view
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
-from sat_intervals.match.mccnn import Network, load_network, weights_file
+from sat_intervals.match.mccnn import Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
@@ -81,7 +82,7 @@ def test_weights_file__names_the_missing_extra(monkeypatch):
     def nowhere(name):
         raise metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr("sat_intervals.match.mccnn.files", nowhere)
+    monkeypatch.setattr("sat_intervals.config.weights.files", nowhere)
     with pytest.raises(SatIntervalsError, match=r"needs the package MCCNN: pip install sat-intervals\[mccnn\]"):
         weights_file(None)
 
@@ -403,12 +404,3 @@ def test_match_arrays__is_as_accurate_as_asked_on_development_scenes(shared_data
             sizes.append((upper - lower)[judged] / (maximum - minimum))
         assert np.concatenate(inside).mean() >= accuracy
         assert np.median(np.concatenate(sizes)) <= size
-
-
-def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
-    left, right = (shared_data / "phr_picanteo_pre" / f"{side}.tif" for side in ("left", "right"))
-    for name, size in (("whole", 1216), ("tiles", 256)):
-        match_pair(left, right, tmp_path / name, settings(-13, 33, tiles={"size": size, "overlap": 100}))
-    disparity, interval = shares_that_differ(tmp_path / "whole", tmp_path / "tiles")
-    assert disparity <= 0.003
-    assert interval <= 0.006

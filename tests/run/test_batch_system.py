@@ -64,10 +64,14 @@ def submitted(
         subprocess.run(["scancel", "--user", "root"], check=True, timeout=30)
 
 
-def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
-    records = folder / "out" / "tiles" / "records"
-    wait_until(lambda: len(list(records.glob("[0-9]*.json"))) >= count or process.poll() is not None, "tiles", 60)
+def wait_for_files(process: subprocess.Popen, folder: Path, files: str, count: int) -> None:
+    tiles = folder / "out" / "tiles"
+    wait_until(lambda: len(list(tiles.glob(files))) >= count or process.poll() is not None, files, 60)
     assert process.poll() is None, "ended before it was disturbed"
+
+
+def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
+    wait_for_files(process, folder, "records/[0-9]*.json", count)
 
 
 def jobs(state: str = "RUNNING") -> set[str]:
@@ -93,9 +97,12 @@ def assert_complete(pair, out: Path) -> None:
 
 def test_match__goes_on_in_a_new_job_after_scancel(slurm, pair, tmp_path):
     with submitted(pair, tmp_path, own={"JOBQUEUE__SLURM__LOG_DIRECTORY": tmp_path / "own-logs"}) as process:
-        wait_for_tiles(process, tmp_path, 5)
-        (job,) = jobs()
-        subprocess.run(["scancel", job], check=True, timeout=30)
+        before = set()
+        for files, count in (("borders/[0-9]*", 20), ("records/[0-9]*.json", 5)):  # in both phases
+            wait_for_files(process, tmp_path, files, count)
+            (job,) = jobs() - before
+            before.add(job)
+            subprocess.run(["scancel", job], check=True, timeout=30)
     assert list((tmp_path / "own-logs").glob("*.err"))
     assert_complete(pair, tmp_path / "out")
     wait_until(lambda: not jobs(), "end of the jobs", 40)

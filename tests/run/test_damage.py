@@ -78,8 +78,8 @@ def assert_same(scene, out):
 
 
 # Every damage to one file of a kind, and one to each of the others.
-THOROUGH = [SHARDS[1], CHUNKS[1], *DESCRIPTIONS[:2], "records/1_0.json", "manifest.json"]
-ONCE = [SHARDS[0], SHARDS[2], CHUNKS[0], *DESCRIPTIONS[2:]]
+THOROUGH = [SHARDS[1], DESCRIPTIONS[0], "records/1_0.json", "manifest.json"]
+ONCE = [SHARDS[0], SHARDS[2], *CHUNKS, *DESCRIPTIONS[1:]]
 
 
 @pytest.mark.parametrize(("name", "how"), [*itertools.product(THOROUGH, DAMAGES), *itertools.product(ONCE, ["bit"])])
@@ -108,7 +108,18 @@ def test_match__matches_tiles_again_that_were_exchanged(scene, tmp_path):
     assert_same(scene, tmp_path / "out")
 
 
-@pytest.mark.parametrize("name", [*SHARDS, *CHUNKS])
+def test_match__matches_tiles_again_that_are_of_another_run(scene, tmp_path):
+    other = tmp_path / "other"
+    settings = yaml.safe_load((scene / "settings.yaml").read_text())
+    match_pair(scene / "right.tif", scene / "left.tif", other, settings, keep_tiles=True)
+    tiles = unfinished(scene, tmp_path / "out")
+    for name in ("records", "arrays.zarr"):
+        shutil.copytree(other / "tiles" / name, tiles / name, dirs_exist_ok=True)
+    match(scene, tmp_path / "out")
+    assert_same(scene, tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", [SHARDS[0], SHARDS[2], CHUNKS[1]])
 def test_match__heals_what_is_damaged_before_it_is_assembled(scene, tmp_path, monkeypatch, name):
     log = tmp_path / "log"
     log.touch()
@@ -171,7 +182,7 @@ def test_strips__of_a_file_that_changes_between_two_of_them_end(tmp_path, scene)
 
 
 @pytest.mark.peer("onnxruntime", "mc_cnn")
-@pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize("how", [*DAMAGES, "of another run"])
 def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp_path, how):
     weights = write_network(tmp_path / "network.onnx", random_weights())
     settings = yaml.safe_load((scene / "settings.yaml").read_text())
@@ -181,7 +192,12 @@ def test_match__measures_images_again_where_their_figures_are_damaged(scene, tmp
     expected = hashes(out)
     for name in ("run.json", "tiles/records/0_0.json"):
         (out / name).unlink()
-    damage(out / "tiles" / "normalization.json", how)
+    figures = out / "tiles" / "normalization.json"
+    if how == "of another run":
+        match_pair(*images[::-1], tmp_path / "other", settings, keep_tiles=True)
+        shutil.copy(tmp_path / "other" / "tiles" / "normalization.json", figures)
+    else:
+        damage(figures, how)
     again = match_pair(*images, out, settings)
     assert again["normalization"] == once["normalization"]
     assert hashes(out) == expected

@@ -1,5 +1,6 @@
 """Files of the user are never lost: inputs, unrelated files in a folder, and a finished run."""
 
+import itertools
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import threading
 import zipfile
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +29,7 @@ from sat_intervals.raster import (
     OutputWriter,
     open_image,
     other_files,
+    publishing,
     put_back,
     write_layer,
 )
@@ -48,10 +51,14 @@ VRT = """<VRTDataset rasterXSize="180" rasterYSize="150"><VRTRasterBand dataType
 <SourceFilename relativeToVRT="1">mask.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
 
 
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(150, 180, seed=2)
+
+
 @pytest.fixture
-def pair(tmp_path):
-    """A folder with left.tif, right.tif, mask.tif, mask.vrt of it, and other.tif; and settings of six tiles."""
-    scene = make_scene(150, 180, seed=2)
+def pair(scene, tmp_path):
+    """A folder with left.tif, right.tif, mask.tif, mask.vrt of it, and other.tif; and settings of nine tiles."""
     write_layer(tmp_path / "other.tif", scene.right[::-1].copy(), 0, PLACE)
     write_layer(tmp_path / "mask.tif", np.zeros(scene.left.shape, np.uint8), 0, PLACE)
     (tmp_path / "mask.vrt").write_text(VRT)
@@ -84,8 +91,9 @@ def swap(file, content):
     os.replace(new, file)
 
 
-@pytest.mark.parametrize("stage", ["tiles", "bands"])
-@pytest.mark.parametrize("name", ["right.tif", "mask.tif", "link"])
+@pytest.mark.parametrize(
+    ("name", "stage"), [("right.tif", "tiles"), ("right.tif", "bands"), ("mask.tif", "bands"), ("link", "tiles")]
+)
 def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, name, stage):
     folder, settings = pair
     right, mask, kept = folder / "right.tif", folder / "mask.vrt", (folder / "right.tif").read_bytes()
@@ -170,10 +178,9 @@ def test_match_pair__goes_on_where_an_input_is_touched_and_not_changed(pair):
     assert report["inputs"]["right"]["sha256"] == identity(str(folder / "right.tif"))["sha256"]
 
 
-def test_prepare__refuses_an_image_that_was_replaced_since_it_was_opened(pair):
+def test_prepare__refuses_an_image_that_was_replaced_since_it_was_opened(scene, pair):
     folder, settings = pair
     left, right = open_image(folder / "left.tif"), open_image(folder / "right.tif")
-    scene = make_scene(150, 180, seed=2)
     write_layer(folder / "left.tif", scene.left, int(scene.left[70, 80]), PLACE)  # another no-data value
     with pytest.raises(ChangedInputError, match=r"left.tif was replaced or changed since it was opened: rerun the"):
         prepare(left, right, folder / "out", settings)
@@ -184,7 +191,7 @@ def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
     job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     job.begin()
     (folder / "left.tif").unlink()
-    monkeypatch.setattr("sat_intervals.run.tile.match_patch", None)
+    monkeypatch.setattr("sat_intervals.run.tile.cost_areas", None)
     with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed"):
         match_tile(job, next(iter(job.store.grid)))
 
@@ -613,7 +620,6 @@ def test_demo__replaces_links_and_does_not_follow_them(tmp_path):
     precious.write_text("mine")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "left.tif").symlink_to(precious)
-    (tmp_path / "out" / "right.tif").hardlink_to(precious)
     command = ["demo", str(tmp_path / "out"), "--size", "120", "140", "--quiet"]
     assert invoke(*command).exit_code == 2
     assert invoke(*command, "--overwrite").exit_code == 0
@@ -658,7 +664,7 @@ def test_export__that_fails_keeps_the_files_of_before(finished, tmp_path, monkey
     assert contents(tmp_path / "otb") == before
 
 
-@pytest.mark.parametrize("name", ["report.html", "overview.png", "profile.png"])
+@pytest.mark.parametrize("name", ["report.html", "profile.png"])
 def test_report_and_plot__replace_only_files_that_they_made(finished, name):
     command = ["report", finished] if name == "report.html" else ["plot", finished, "--row", 0, "--dpi", 50]
     assert invoke(*command).exit_code == 0
@@ -704,6 +710,186 @@ def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, m
         write()
     monkeypatch.undo()
     assert contents(finished) == before
+
+
+# Files of others with the names of ours
+
+
+NAMES = "intervals.tif", "validity.tif", "run.json"
+
+
+class Killed(BaseException):
+    """As a kill by the system: nothing is tidied up."""
+
+
+def killed(number, *arguments, **options):
+    """`match_pair` that is killed at its n-th change of names; at 0 before it writes any file of the run."""
+    calls = itertools.count(1)
+
+    def counted(function):
+        def call(*arguments, **options):
+            if next(calls) >= number:
+                raise Killed
+            return function(*arguments, **options)
+
+        return call
+
+    def publish(*arguments):
+        changing = {name: counted(getattr(os, name)) for name in ("replace", "link", "unlink")}
+        patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
+        publishing.publish(*arguments)
+
+    def create(writer, file):
+        raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
+        patch.setattr("sat_intervals.raster.writer.publish", publish)
+        if not number:
+            patch.setattr(OutputWriter, "_create", create)
+        with pytest.raises(Killed):
+            match_pair(*arguments, **options)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A pair, settings of one tile, and two runs of it that kept their tiles."""
+    folder = tmp_path_factory.mktemp("runs")
+    settings = write_pair(folder, make_scene(60, 90, seed=2), cluster={"workers": 1})
+    images = folder / "left.tif", folder / "right.tif"
+    other = settings | {"median": None}
+    match_pair(*images, folder / "one", settings, keep_tiles=True)
+    match_pair(*images, folder / "two", other, keep_tiles=True)
+    assert hashes(folder / "one") != hashes(folder / "two")
+    return folder, images, settings, other
+
+
+def old_files(out, before):
+    """Names of the earlier run's files that still exist, anywhere in the folder of the run."""
+    there = {file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    return {name for name in NAMES if before[str(out / name)] in there}
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_match__keeps_a_file_of_the_user_that_appears_during_the_run(runs, tmp_path, name, overwrite):
+    _, images, settings, other = runs
+    out = tmp_path / "out"
+    if overwrite:
+        match_pair(*images, out, other)
+
+    def progress(stage, done, total):
+        if stage == "bands" and not done < total:
+            (out / name).write_text("mine")
+
+    before = contents(out)
+    with pytest.raises(
+        RunError, match=rf"{name} is not of this run, .*: move it away; rerun the same command"
+    ) as error:
+        match_pair(*images, out, settings, overwrite=overwrite, progress=progress)
+    assert "\n" not in str(error.value)
+    found = {file: content for file, content in contents(out).items() if "/tiles/" not in file}
+    assert found == before | {str(out / name): b"mine"}
+    shutil.move(out / name, tmp_path / name)
+    match_pair(*images, out, settings)
+    assert hashes(out) == hashes(runs[0] / "one")
+    assert (tmp_path / name).read_text() == "mine"
+    assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("number", range(1, 7))
+def test_match__goes_on_after_a_kill_between_the_names_of_its_files(runs, tmp_path, number):
+    folder, images, settings, _ = runs
+    out = tmp_path / "out"
+    shutil.copytree(folder / "one", out)
+    for name in NAMES:
+        (out / name).unlink()
+    killed(number, *images, out, settings)
+    match_pair(*images, out, settings)
+    assert hashes(out) == hashes(folder / "one")
+    assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 8, 9])
+def test_match__keeps_the_run_to_replace_until_the_new_one_exists(runs, tmp_path, number):
+    folder, images, settings, _ = runs
+    out = tmp_path / "out"
+    shutil.copytree(folder / "two", out)
+    before = contents(out)
+    killed(number, *images, out, settings, overwrite=True)
+    killed(0, *images, out, settings)
+    assert old_files(out, before) == set(NAMES)
+    if number < 5:  # none of the new files had its name
+        assert {name: (out / name).read_bytes() for name in NAMES} == {name: before[str(out / name)] for name in NAMES}
+    match_pair(*images, out, settings)
+    assert hashes(out) == hashes(folder / "one")
+    assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_match__overwrites_no_file_where_there_is_no_run(runs, tmp_path, name):
+    folder, images, *_ = runs
+    (tmp_path / name).write_bytes((folder / "left.tif").read_bytes() if name.endswith("tif") else b'{"mine": 1}')
+    before = contents(tmp_path)
+    command = ["match", *images, tmp_path, "--config", folder / "settings.yaml", "--overwrite"]
+    refused(command, f"{name} exists and was not made by sat-intervals", "move it away")
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["left.tif", "truth.tif"])
+def test_demo__overwrites_no_image_that_it_did_not_make(tmp_path, name):
+    write_layer(tmp_path / name, np.ones((9, 9), np.uint16), 0, PLACE)
+    before = contents(tmp_path)
+    refused(["demo", tmp_path, "--size", 100, 110, "--overwrite"], f"{name} exists and was not made by sat-intervals")
+    assert before.items() <= contents(tmp_path).items()
+
+
+def test_demo__deletes_no_file_with_a_name_like_that_of_its_copies(tmp_path):
+    mine = tmp_path / ".sat-intervals.mine.left.tif"
+    mine.write_text("mine")
+    with put_back([tmp_path / "left.tif"], tmp_path / "run.json"):
+        pass
+    assert mine.read_text() == "mine"
+
+
+def test_output_writer__deletes_no_file_with_a_name_like_that_of_its_own(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files"
+    (place / "replaced").mkdir(parents=True)
+    mine = [place / "intervals.tif.old", place / "run.json~", place / "replaced" / "validity.tif.backup"]
+    ours = [place / "strips-intervals.tif", place / "intervals.tif.ovr.tmp", place / "validity.tif.aux.xml"]
+    for file in (*mine, *ours):
+        file.write_text("content")
+    with OutputWriter(tmp_path, RUN_FILES, 4, 5, Georeferencing(), {}):
+        pass
+    assert contents(tmp_path) == {str(file): b"content" for file in mine}
+
+
+@pytest.mark.parametrize(
+    ("form", "name"), [("otb", "disparity.tif"), ("s2p", "rectified_mask.png"), ("cars", "epi_disp_mask.tif")]
+)
+def test_export__replaces_only_its_own_files(finished, tmp_path, form, name):
+    target = tmp_path / "target"
+    export(finished, form, target)
+    export(finished, form, target)
+    profile = {"count": 1, "dtype": "uint8", "height": 2, "width": 2}
+    with rasterio.open(target / name, "w", driver="PNG" if name.endswith("png") else "GTiff", **profile) as file:
+        file.write(np.ones((1, 2, 2), np.uint8))
+    before = contents(target)
+    with pytest.raises(SatIntervalsError, match=rf"{name} exists and was not made by sat-intervals, .*move it away"):
+        export(finished, form, target)
+    assert contents(target) == before
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_match__removes_what_a_kill_left_of_its_marks(runs, tmp_path, elsewhere):
+    _, images, settings, _ = runs
+    settings = settings | {"cluster": {"workers": 1} | ({"store": str(tmp_path / "store")} if elsewhere else {})}
+    out = tmp_path / "out"
+    job = prepare(*images, out, settings)
+    job.begin()
+    (out / "tiles" / f"..sat-intervals.finished.{32 * 'a'}").write_text("half")
+    match_pair(*images, out, settings)
+    assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sat_intervals.run.schedule import Schedule, Step, needs
+from sat_intervals.run.schedule import LAST, Schedule, Step, needs
 from sat_intervals.tiling import Grid, Window
 
 GRID = Grid(Window(10, 20, 4 * 64, 5 * 64 - 7), 64)
@@ -27,8 +27,21 @@ def test_schedule__draws_the_order_of_a_grid():
         for wavefront in range(4)
     ]
     upper_left = [[0, 1, 2, 3, 4], [1, 2, 3, 4, 5], [2, 3, 4, 5, 6], [3, 4, 5, 6, None]]
-    upper_right = [row[::-1] for row in upper_left]
-    assert drawn == [upper_left, upper_right, [row[::-1] for row in upper_left[::-1]], upper_left[::-1]]
+    upper_right, lower_right = [row[::-1] for row in upper_left], [row[::-1] for row in upper_left[::-1]]
+    assert drawn == [upper_left, upper_right, lower_right, upper_left[::-1]]
+    tiles = [[turns[Step(GRID.tile(row, column))] for column in range(5)] for row in range(4)]
+    assert tiles == [[7, 6, 5, 6, 7], [6, 5, 4, 5, 6], [6, 5, 4, 5, 6], [7, 6, 5, 6, 7]]
+
+
+def test_schedule__of_one_worker_leaves_the_last_wavefront_to_the_tiles():
+    schedule, done = Schedule(GRID, GRID, set(), views=2), []
+    while (step := schedule.next()) is not None:
+        done.append(step)
+        schedule.ended(step)
+    assert [step.wavefront for step in done].count(None) == 20
+    assert {(step.wavefront, step.mirrored) for step in done if step.wavefront is not None} == {
+        (wavefront, mirrored) for wavefront in range(3) for mirrored in (False, True)
+    }
 
 
 @pytest.mark.parametrize("borders", [set(), {"0_0_0", "1_1_2"}])
@@ -36,7 +49,9 @@ def test_schedule__comes_after_what_it_needs_and_does_nothing_twice(borders):
     done = []
     for steps in in_turn(Schedule(GRID, GRID, borders)):
         for step in steps:
-            assert all(other in done or other.name in borders for other in needs(GRID, step))
+            for other in needs(GRID, step):
+                is_given = other.wavefront == LAST and Step(other.tile) in done
+                assert is_given or other in done or other.name in borders
         done += steps
     assert len(done) == len(set(done))
     assert {step.tile for step in done if step.wavefront is None} == set(GRID)
@@ -57,4 +72,18 @@ def test_schedule__drops_what_needs_a_failed_step():
             schedule.failed(step)
         else:
             schedule.ended(step)
+    assert not schedule
+
+
+def test_schedule__traces_what_a_failed_tile_would_have_given():
+    schedule, failed = Schedule(GRID, GRID, set()), Step(GRID.tile(2, 2))
+    done = set()
+    while (step := schedule.next()) is not None:
+        if step == failed:
+            schedule.failed(step)
+        else:
+            schedule.ended(step)
+            done.add(step)
+    assert Step(failed.tile, LAST) in done
+    assert {step.tile for step in done if step.wavefront is None} == set(GRID) - {failed.tile}
     assert not schedule

@@ -7,7 +7,7 @@ import pytest
 import rasterio
 from helpers import PLACE, bands, invoke, write_pair
 
-from sat_intervals import SatIntervalsError, match_pair, open_image
+from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run_pair
@@ -54,11 +54,28 @@ def test_prepare__a_range_to_be_found_needs_a_search(folder, tmp_path):
         prepare(folder / "left.tif", folder / "right.tif", tmp_path, {})
 
 
-def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path):
+def test_match_pair__takes_no_range_of_other_images(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_pair, "match_jobs", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, tmp_path)
+
+    def search(*_):
+        raise RunError("searched again")
+
+    monkeypatch.setattr(run_pair, "search_range", search)
+    with pytest.raises(RunError, match="searched again"):
+        match_pair(folder / "right.tif", folder / "left.tif", tmp_path, {})
+
+
+OF_MCCNN = pytest.param({"preset": "satellite-mccnn"}, marks=pytest.mark.peer("onnxruntime", "mc_cnn"))
+
+
+@pytest.mark.parametrize("settings", [{}, {"interval": {"coverage": 0.9}}, OF_MCCNN])
+def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path, settings):
     reports = []
     for size in (64, 512):
         tiles = {"size": size, "overlap": "exact"}
-        reports.append(run(folder, tmp_path / str(size), disparity={"local": True}, tiles=tiles))
+        reports.append(run(folder, tmp_path / str(size), disparity={"local": True}, tiles=tiles, **settings))
     assert reports[0]["local_ranges"]["share"] < 0.95
     for one, other in zip(bands(tmp_path / "64"), bands(tmp_path / "512"), strict=True):
         np.testing.assert_array_equal(one, other)

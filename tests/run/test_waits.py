@@ -19,8 +19,8 @@ from helpers import invoke
 from sat_intervals import load_config, open_image
 from sat_intervals.config import Cluster, ConfigError, Mccnn
 from sat_intervals.config.pairs import find_pairs, read_batch
+from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
-from sat_intervals.match.mccnn import weights_file
 from sat_intervals.raster import other_files, read_place
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_run

@@ -67,17 +67,24 @@ function showEvaluation() {
   const row = (name, figures) => [
     name, figures.count, percent(figures.accuracy), size(figures.relative_size),
     figures.mean_width === null ? "none" : `${fixed(figures.mean_width, 2)} px`, size(figures.relative_overestimation ?? null),
+    figures.interval_score === null ? "none" : `${fixed(figures.interval_score, 2)} px`,
   ];
   const rows = [row("all", judged.all), row("high confidence", judged.high), row("low confidence", judged.low)];
-  const head = ["valid pixels", "count", "accuracy: contain the truth", "relative size", "mean width", "relative overestimation"];
+  const head = ["valid pixels", "count", "accuracy: contain the truth", "relative size", "mean width", "relative overestimation", "interval score"];
   find("evaluation").hidden = false;
   find("evaluation").append(
     element("p", {}, "Truth: ", element("code", {}, contents.truth), ". Disparity errors above 1 px: ",
       `${percent(judged.bad1)}, above 3 px: ${percent(judged.bad3)}; truths outside the search range: ${percent(judged.truth_outside_range)}.`),
     table(head, rows),
-    element("p", { class: "quiet" }, "Relative size is the median width over the width of the search range. The level alpha is a possibility, not a guaranteed probability."),
+    element("p", { class: "quiet" }, "Relative size is the median width over the width of the search range. The interval score is the width, and 2 / (1 - nominal) times the distance of a missed truth. " + nominalSentence()),
   );
   if (judged.deciles.length) showDeciles(judged.deciles);
+}
+
+function nominalSentence() {
+  const { coverage } = run.settings.interval;
+  return coverage ? `Nominal coverage: ${percent(coverage)}, a mean over pixels like those of the calibration, not a promise for each pixel.`
+    : "The level alpha is a possibility, not a guaranteed probability.";
 }
 
 /** Show how often intervals contain the truth, by decile of confidence, lowest first. */

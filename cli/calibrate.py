@@ -1,0 +1,206 @@
+"""``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sat_intervals.cli.options import log_options, path, quiet_option, settings_options
+from sat_intervals.cli.pairs import finite
+
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
+    from sat_intervals.config.pairs import Pair
+    from sat_intervals.run.calibrate import Subject
+
+_FILE = click.Path(path_type=Path)
+_CALIBRATION = """\
+# Calibration: levels of the cost curve that reach a coverage, found by sat-intervals calibrate.
+# Use it with: sat-intervals match LEFT RIGHT OUT --coverage 0.9 --calibration FILE, with the settings of `key`.
+# `expected`: figures of pairs with the levels found on the other pairs; coverage of all, high and low confidence.
+"""
+_SETTINGS = """\
+# Settings with their calibration, found by sat-intervals calibrate --tune.
+# Use them with: sat-intervals match LEFT RIGHT OUT --disparity MIN MAX --config FILE
+"""
+
+
+@click.command(short_help="Find the levels that reach a coverage, on pairs with known truth.")
+@click.argument("pairs", nargs=-1, required=True, type=_FILE)
+@click.option("--output", callback=path, required=True, metavar="FILE", help="Calibration to write (YAML).")
+@click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order.")
+@click.option(
+    "--tolerance", type=click.FloatRange(min=0), default=0.0, callback=finite, metavar="PX",
+    help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
+)  # fmt: skip
+@click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth of each pair to its truth.")
+@click.option(
+    "--by-group", is_flag=True, help="Leave out all pairs of a group together (meta.json, CSV), not each pair."
+)
+@click.option("--name", help="Name of the calibration; by default that of the file.")
+@click.option(
+    "--tune", is_flag=True, help="Compare presets and penalties; write the best as settings for match --config."
+)
+@settings_options
+@quiet_option
+@log_options
+def calibrate(
+    pairs: tuple[Path, ...],
+    output: Path,
+    truth: tuple[Path, ...],
+    tolerance: float,
+    remove_bias: bool,
+    by_group: bool,
+    name: str | None,
+    tune: bool,
+    config_file: Path | None,
+    given: dict[str, Any],
+    quiet: bool,
+) -> None:
+    """Find the levels of the cost curve whose intervals reach coverages of .5 to .99 on PAIRS, and write them to FILE.
+
+    Use them with: match --coverage 0.9 --calibration FILE. They fit images like those of PAIRS, and only the settings
+    that they were made with.
+
+    One of PAIRS is a folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum],
+    `group`), a CSV file with the columns left, right, truth, minimum, maximum and optionally name, group, tolerance and
+    remove_bias, or the folder of a finished run, which is matched again from its images. The truth may be sparse:
+    unknown pixels are NaN or no data.
+
+    The table shows what to expect: figures of each pair with the levels found on the others, means over pairs. A single
+    pair is judged in 16 blocks.
+    """
+    if "interval" in given:
+        raise click.UsageError("--coverage and --calibration are options of match: leave them out.")
+    from sat_intervals.cli.console import Console
+    from sat_intervals.cli.tables import show_calibration
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.run.calibrate import calibration_from, check_subjects, measure_subjects
+
+    settings = _Settings(config_file, given, tolerance, remove_bias, by_group)
+    subjects = _subjects(pairs, truth, settings)
+    inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
+    check_not_replaced([*inputs, config_file], [output])
+    folder = _checked_folder(output)
+    check_subjects(subjects)
+    with Console(quiet) as console:
+        if tune:
+            _tune(subjects, output, folder, console)
+            return
+        parts = measure_subjects(subjects, folder, console.progress)
+    calibration, expected = calibration_from(parts, subjects, name or output.stem)
+    _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
+    if not quiet:
+        show_calibration(calibration, expected)
+        click.echo(str(output))
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Options that decide how pairs are matched and compared with their truth."""
+
+    config_file: Path | None
+    given: dict[str, Any]
+    tolerance: float
+    remove_bias: bool
+    by_group: bool
+
+
+def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Settings) -> "list[Subject]":
+    """Open the pairs and runs named by the arguments, in their order."""
+    from sat_intervals.config.pairs import check_names, find_pairs, is_pair
+    from sat_intervals.errors import SatIntervalsError
+
+    is_run = [(path / "run.json").exists() or not is_pair(path) for path in paths]
+    find_pairs(source for source, run in zip(paths, is_run, strict=True) if not run)  # raises if a pair is given twice
+    found: list[tuple[Path, Pair | None]] = []
+    for source, run in zip(paths, is_run, strict=True):
+        found += [(source, None)] if run else [(source, pair) for pair in find_pairs([source])]
+    if len(truths) not in (0, len(found)):
+        raise SatIntervalsError(f"--truth is given {len(truths)} times for {len(found)} PAIRS: give it once for each")
+    subjects = [
+        _of_pair(pair, truth, settings) if pair else _of_run(source, truth, settings)
+        for (source, pair), truth in zip(found, truths or (None,) * len(found), strict=True)
+    ]
+    check_names(subject.name for subject in subjects)
+    return subjects
+
+
+def _of_pair(pair: "Pair", truth: Path | None, settings: _Settings) -> "Subject":
+    from sat_intervals.config import load_config
+    from sat_intervals.raster import open_image
+    from sat_intervals.run.calibrate import Subject, truth_of
+
+    search = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
+    config = load_config(settings.config_file, settings.given | search)
+    left = open_image(pair.left)
+    return Subject(
+        pair.name,
+        pair.group if settings.by_group else pair.name,
+        left,
+        open_image(pair.right),
+        truth_of(left, truth or pair.truth),
+        config,
+        tolerance=settings.tolerance if pair.tolerance is None else pair.tolerance,
+        remove_bias=settings.remove_bias if pair.remove_bias is None else pair.remove_bias,
+    )
+
+
+def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
+    """Open a finished run, with its own settings unless the options choose others."""
+    from sat_intervals.config import load_config
+    from sat_intervals.config.pairs import group_beside
+    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.results import open_results
+    from sat_intervals.run.calibrate import Subject
+
+    run = open_results(out, truth)
+    if run.truth is None:
+        raise SatIntervalsError(f"{out}: there is no truth.tif beside its left image {run.left.path}: give --truth")
+    if settings.config_file or settings.given.keys() & {"preset", "cost"}:
+        search = {"disparity": run.config.disparity.model_dump()}
+        config = load_config(settings.config_file, settings.given | search)
+    else:
+        config = load_config(run.config, settings.given)
+    group = group_beside(run.left.path) if settings.by_group else str(out)
+    return Subject(
+        str(out), group, run.left, run.right, run.truth, config, run.region, settings.tolerance, settings.remove_bias
+    )
+
+
+def _checked_folder(output: Path) -> Path:
+    """Return the folder of a file, where tiles are kept meanwhile; raise if it cannot be written."""
+    from sat_intervals.errors import SatIntervalsError
+
+    folder = output.absolute().parent
+    if output.is_dir() or not os.access(folder, os.W_OK):
+        raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")
+    return folder
+
+
+def _write(output: Path, head: str, content: dict[str, Any]) -> None:
+    import yaml
+
+    from sat_intervals.raster import whole_file
+
+    with whole_file(output) as new:
+        new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
+
+
+def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Console") -> None:
+    """Compare settings, print their figures, and write the best."""
+    from sat_intervals.cli.tables import show_tuned
+    from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
+
+    if not has_network():
+        console.say("MC-CNN is left out: pip install sat-intervals[mccnn]")
+    found = []
+    for name, changes in candidates(with_network=has_network()):
+        console.say(f"calibrating {name}")
+        found.append(tuned(name, changes, subjects, folder, console.progress))
+    best = best_of(found)
+    show_tuned(found, best)
+    _write(output, _SETTINGS, settings_of(best))
+    console.say(str(output))

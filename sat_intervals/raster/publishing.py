@@ -1,0 +1,122 @@
+"""Give finished files their final names, all of them or none, and replace no file that is not to be replaced."""
+
+import errno
+import filecmp
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
+from pathlib import Path
+
+from sat_intervals.errors import SatIntervalsError
+
+# Reports that are published with files: of a run, and of its points.
+REPORTS = "run.json", "points.json"
+# Folder of the replaced files, among the finished ones.
+REPLACED = "replaced"
+
+
+class OutputError(SatIntervalsError):
+    """An output that cannot be written."""
+
+
+def stamps(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return sizes and modification times of the files that exist, by name; a file that is moved keeps them."""
+    found = {}
+    for name in names:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            status = (folder / name).lstat()
+            found[name] = f"{status.st_size:x}-{status.st_mtime_ns:x}"
+    return found
+
+
+def publish(
+    finished: Path,
+    folder: Path,
+    names: Sequence[str],
+    replaceable: Mapping[str, str],
+    failing: Callable[[Path], AbstractContextManager[None]],
+) -> None:
+    """Move files to another folder, all of them or none, the last of ``names`` last.
+
+    Parameters
+    ----------
+    finished
+        Folder of the finished files. Existing files are put aside in its folder ``replaced``. If the process is killed,
+        `put_back` restores them.
+    folder, names
+        Their new folder, and their names in both.
+    replaceable
+        `stamps` of the files that may be replaced. A killed process may also have published some of the same files.
+    failing
+        Context for the work on a final name.
+
+    Raises
+    ------
+    OutputError
+        Names a file that must not be replaced.
+    """
+    try:
+        for name in reversed(names):
+            with failing(folder / name):
+                _put_aside(finished / name, folder / name, replaceable.get(name))
+        for name in names:
+            with failing(folder / name):
+                _rename(finished / name, folder / name)
+    except BaseException:
+        for name in names:
+            new, place = finished / name, folder / name
+            with suppress(OSError):
+                if not new.exists() or os.path.samefile(new, place):
+                    os.unlink(place)
+        put_back(finished, folder, names)
+        raise
+
+
+def put_back(finished: Path, folder: Path, names: Iterable[str]) -> None:
+    """Restore files that were put aside, unless there are others of their names."""
+    for name in names:
+        with suppress(OSError):
+            _rename(finished / REPLACED / name, folder / name)
+
+
+def _put_aside(new: Path, place: Path, stamp: str | None) -> None:
+    """Put a file aside, if it has the stamp or is equal to the new one."""
+    if not os.path.lexists(place):
+        return
+    if place.is_dir() and not place.is_symlink():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    aside = new.parent / REPLACED / new.name
+    is_first = not os.path.lexists(aside)  # otherwise a killed process has put aside the one to restore
+    if is_first:
+        os.replace(place, aside)
+    there = aside if is_first else place
+    if stamps(there.parent, [there.name]).get(there.name) != stamp and not _is_same(there, new):
+        raise OutputError(f"{place} is not of this run, or was changed since it started: move it away")
+    if not is_first:
+        os.unlink(place)
+
+
+def _is_same(file: Path, new: Path) -> bool:
+    """Return whether a file is equal to the new one of its name, and a report to that of the same files."""
+    if file.is_symlink() or not file.is_file():
+        return False
+    if new.name in REPORTS:
+        with suppress(ValueError, LookupError, TypeError, RecursionError):
+            return bool(json.loads(file.read_text())["files"] == json.loads(new.read_text())["files"])
+        return False
+    return filecmp.cmp(file, new, shallow=False)
+
+
+def _rename(source: Path, target: Path) -> None:
+    """Rename a file, but never over another."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except (FileExistsError, FileNotFoundError):
+        raise
+    except OSError:  # a file system without hard links
+        if os.path.lexists(target):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
+        os.replace(source, target)
+    else:
+        os.unlink(source)

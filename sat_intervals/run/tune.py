@@ -1,0 +1,98 @@
+"""Compare settings on pairs with truth: presets and a ladder of penalties, each with its own calibration."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.config import PRESETS, Calibration, Config, Interval, load_config
+from sat_intervals.config.weights import weights_file
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.match.calibration import ladder, left_out, means
+from sat_intervals.match.mccnn import load_network
+from sat_intervals.progress import Progress
+from sat_intervals.run.calibrate import Subject, calibration_from, measure_subjects
+
+COVERAGE = 0.9  # that settings are compared at
+# Settings with fewer good pixels than this share of the most are not chosen, however narrow their intervals.
+_GOOD_ENOUGH = 0.95
+
+_CENSUS = {5: ((8, 64), (12, 64), (16, 128)), 7: ((8, 64), (32, 256)), 11: ((50, 350),)}
+_COSINE = ((0.5, 3.0, 40.0), (0.7, 4.0, 45.0), (1.0, 6.0, 60.0))
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Figures of some settings on all pairs.
+
+    ``kept`` and ``good`` are shares of the pixels with truth: kept by cross-checking, and also within 1 px of it.
+    ``figures`` are the `means` over groups at COVERAGE, each with the levels chosen on the others.
+    """
+
+    name: str
+    subjects: Sequence[Subject]
+    kept: float
+    good: float
+    figures: Mapping[str, float]
+    calibration: Calibration
+
+
+def has_network() -> bool:
+    """Return whether MC-CNN and its weights are installed."""
+    try:
+        load_network(weights_file(None))
+    except SatIntervalsError:
+        return False
+    return True
+
+
+def candidates(*, with_network: bool) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield names and settings: the presets, then penalties with Census and, with the network, with MC-CNN."""
+    for preset in PRESETS:
+        if with_network or "mccnn" not in preset:
+            yield preset, {"preset": preset}
+    for window, penalties in _CENSUS.items():
+        for p1, p2 in penalties:
+            yield f"census {window}, {p1}/{p2}", {"cost": {"window": window}, "sgm": {"p1": p1, "p2": p2}}
+    for lower, upper, span in _COSINE if with_network else ():
+        sgm = {"penalty": "constant", "p1": lower, "p2": upper, "span": span}
+        yield f"mccnn, {lower:g}/{upper:g}", {"preset": "satellite-mccnn", "sgm": sgm}
+
+
+def tuned(
+    name: str, changes: Mapping[str, Any], subjects: Sequence[Subject], folder: Path, progress: Progress
+) -> Tuned:
+    """Calibrate pairs with changed settings, and judge these; parameters as in `measure_subjects`."""
+    subjects = [replace(subject, config=_changed(subject.config, changes)) for subject in subjects]
+    parts = measure_subjects(subjects, folder, progress)
+    calibration, _ = calibration_from(parts, subjects, name)
+    return Tuned(
+        name,
+        subjects,
+        float(np.mean([part.kept / part.known for part in parts if part.known])),
+        float(np.mean([part.good / part.known for part in parts if part.known])),
+        means(left_out(parts, ladder(subjects[0].config), [COVERAGE])[0].values()),
+        calibration,
+    )
+
+
+def _changed(config: Config, changes: Mapping[str, Any]) -> Config:
+    """Return the settings that are compared, with search range, cross-checking and cluster of the others."""
+    kept = config.model_dump(include={"disparity", "cross_check", "cluster"})
+    return load_config(changes, kept)
+
+
+def best_of(found: Sequence[Tuned]) -> Tuned:
+    """Return the settings with the smallest interval score, of those with nearly as many good pixels as any."""
+    most = max(one.good for one in found)
+    return min((one for one in found if one.good >= _GOOD_ENOUGH * most), key=lambda one: one.figures["score"])
+
+
+def settings_of(best: Tuned) -> dict[str, Any]:
+    """Return settings with their calibration, without search range and cluster, as a file for `match --config`."""
+    interval = Interval(coverage=Decimal(str(COVERAGE)), calibration=best.calibration)
+    config = best.subjects[0].config.model_copy(update={"interval": interval})
+    return config.model_dump(mode="json", exclude={"disparity", "cluster", "products"})

@@ -1,0 +1,41 @@
+"""Draw how often intervals contain the truth, and how wide they are, from figures of `evaluate_run`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+
+from sat_intervals.evaluate.disparity import evaluate_run
+from sat_intervals.show.canvas import DPI, INK, page
+from sat_intervals.show.legend import BLUE, ORANGE
+
+_CLASSES = (("all", "valid pixels", "black"), ("high", "high confidence", BLUE), ("low", "low confidence", ORANGE))
+
+
+def draw_coverage(runs: Sequence[Path], truth: Path | None, path: Path, dpi: int = DPI) -> None:
+    """Draw nominal against measured coverage, and mean width against measured coverage.
+
+    ``runs`` are folders of runs of one pair at several coverages, or one. Small dots are deciles of confidence.
+    """
+    reports = sorted((evaluate_run(run, truth) for run in runs), key=lambda report: float(report["nominal"]))
+    with page(path, (9.0, 4.2), dpi, f"{', '.join(run.name for run in runs)}: intervals and truth") as figure:
+        left, right = figure.subplots(1, 2)
+        deciles = [(report["nominal"], decile) for report in reports for decile in report["deciles"]]
+        _draw_line(
+            left, [(nominal, decile["accuracy"]) for nominal, decile in deciles], "deciles of confidence", INK, "."
+        )
+        _draw_line(right, [(decile["accuracy"], decile["mean_width"]) for _, decile in deciles], "", INK, ".")
+        for name, label, colour in _CLASSES:
+            known = [(report["nominal"], report[name]) for report in reports if report[name]["count"]]
+            _draw_line(left, [(nominal, area["accuracy"]) for nominal, area in known], label, colour, "o-")
+            _draw_line(right, [(area["accuracy"], area["mean_width"]) for _, area in known], "", colour, "o-")
+        left.plot([0, 1], [0, 1], color=INK, lw=0.8, ls="--")
+        left.set(xlabel="nominal coverage (or alpha)", ylabel="measured coverage", xlim=(0.45, 1), ylim=(0, 1.02))
+        left.legend(loc="lower right", frameon=False)
+        right.set(xlabel="measured coverage", ylabel="mean width (px)", yscale="log")
+
+
+def _draw_line(chart: Axes, points: Sequence[tuple[float, float]], label: str, colour: str, style: str) -> None:
+    if points:
+        across, up = zip(*points, strict=True)
+        chart.plot(across, up, style, color=colour, ms=5 if style == "o-" else 4, lw=1, label=label or None)

@@ -1,0 +1,162 @@
+"""Calibrations: files, keys, levels between coverages, and messages."""
+
+import pytest
+import yaml
+from helpers import calibration
+
+from sat_intervals.config import ConfigError, calibration_of, key_of, load_calibration, load_config, resolved
+from sat_intervals.config.calibration import COVERAGES, at
+
+RANGE = {"disparity": {"minimum": -3, "maximum": 5}}
+
+
+def rising(**changes):
+    """A calibration of the default settings with levels 0, 10, 20, ... and 0, 1, 2, ..., and changes to its rows."""
+    values = calibration(load_config(RANGE), 0, 0, 0.9)
+    for i, row in enumerate(values["levels"]):
+        row |= {"high": 10.0 * i, "low": float(i)} | changes.get(f"row_{i}", {})
+    return values
+
+
+def test_at__gives_the_rows_and_is_linear_between() -> None:
+    loaded = load_calibration(rising(row_1={"quantile": 0.5}))
+    for i, coverage in enumerate(COVERAGES):
+        assert at(loaded, coverage) == (10 * i, i, 0.5 if i == 1 else 0.9)
+    assert at(loaded, 0.925) == pytest.approx((55, 5.5, 0.9))
+    assert at(loaded, 0.65) == pytest.approx((15, 1.5, 0.7))
+
+
+def test_at__without_a_quantile_at_one_side_takes_the_larger_coverage() -> None:
+    loaded = load_calibration(rising(row_2={"quantile": None}))
+    assert at(loaded, 0.65) == pytest.approx((15, 2, None))
+    assert at(loaded, 0.75) == pytest.approx((25, 3, 0.9))
+    assert at(loaded, 0.7) == (20, 2, None)
+
+
+def test_load_calibration__reads_a_file_and_a_run_keeps_its_content(tmp_path) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text(yaml.safe_dump(rising() | {"provenance": {"scenes": ["one"]}}))
+    config = resolved(load_config(RANGE, {"interval": {"coverage": 0.9, "calibration": str(file)}}))
+    file.unlink()
+    assert load_config(config.model_dump(mode="json")) == config
+    assert calibration_of(config).provenance == {"scenes": ["one"]}
+    assert calibration_of(config).sha256 == load_calibration(rising()).sha256
+    assert config.cuts == (50, 5, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (
+            rising(row_4={"high": 20.0}),
+            "levels: high falls from 30 at coverage 0.8 to 20 at 0.85: a level may not fall",
+        ),
+        (rising(row_4={"low": 0.5}), "levels: low falls from 3 at coverage 0.8 to 0.5 at 0.85"),
+        (rising(row_4={"coverage": 0.84}), "levels: coverages are 0.5, 0.6, 0.7, 0.8, 0.84, 0.9"),
+        (rising(row_4={"high": -1.0}), "levels.4.high: input should be greater than or equal to 0"),
+        (rising(row_4={"quantile": 0.4}), "levels.4.quantile: input should be greater than or equal to 0.5"),
+        (rising(row_4={"high": "a"}), "levels.4.high: input should be a valid number"),
+        ({"name": "x"}, "key: field required"),
+        ([1], "holds [1], allowed: keys name, key, levels, provenance"),
+        ("{", "line 1:"),
+    ],
+)
+def test_load_calibration__names_the_file_and_the_error(tmp_path, values, words) -> None:
+    file = tmp_path / "own.yaml"
+    file.write_text(values if isinstance(values, str) else yaml.safe_dump(values))
+    with pytest.raises(ConfigError) as caught:
+        load_config(RANGE, {"interval": {"coverage": 0.9, "calibration": str(file)}})
+    assert str(file) in str(caught.value)
+    assert words in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_load_calibration__names_a_missing_file() -> None:
+    with pytest.raises(ConfigError, match=r"calibration no.yaml: No such file or directory .*sat-intervals calibrate"):
+        load_calibration("no.yaml")
+
+
+@pytest.mark.parametrize(
+    ("settings", "difference"),
+    [
+        ({"cost": {"window": 7}}, "cost.window is 5 there and 7 here"),
+        ({"sgm": {"p2": 64}}, "sgm.p2 is 32 there and 64 here"),
+        ({"median": None}, "median.size is 3 there and null here"),
+        ({"regularization": {"kernel": 7}}, "confidence.kernel is 5 there and 7 here"),
+        ({"cross_check": {"method": "accurate"}}, "cross_check.method is fast there and accurate here"),
+    ],
+)
+def test_calibration_of__refuses_one_of_other_settings(settings, difference) -> None:
+    interval = {"coverage": 0.9, "calibration": rising()}
+    here = load_config(RANGE, {"interval": interval} | settings)
+    with pytest.raises(ConfigError) as caught:
+        resolved(here)
+    assert f"calibration flat belongs to other settings, {difference}: make one with sat-intervals calibrate" in str(
+        caught.value
+    )
+
+
+def test_key_of__leaves_out_what_levels_do_not_depend_on() -> None:
+    one = load_config(RANGE)
+    other = load_config(
+        {"disparity": {"minimum": 0, "maximum": 60}, "interval": {"alpha": 0.5}, "regularization": {"quantile": 0.7}}
+    )
+    assert key_of(one) == key_of(other)
+
+
+def test_key_of__of_mccnn_has_the_digest_of_its_weights(tmp_path) -> None:
+    weights = tmp_path / "net.onnx"
+    keys = []
+    for content in (b"one", b"other"):
+        weights.write_bytes(content)
+        keys.append(key_of(load_config(RANGE, {"cost": {"method": "mccnn", "weights": str(weights)}})))
+    assert keys[0] != keys[1]
+    assert len(keys[0]["cost"]["weights"]) == 64
+
+
+def test_calibration_of__without_one_names_the_command() -> None:
+    config = load_config(RANGE, {"cost": {"window": 9}, "interval": {"coverage": 0.9}})
+    with pytest.raises(ConfigError, match=r"no built-in calibration .* belongs to these settings: .* calibrate"):
+        resolved(config)
+
+
+# --- settings of the interval
+
+
+def test_load_config__coverage_of_the_command_line_takes_the_place_of_alpha() -> None:
+    file = RANGE | {"interval": {"alpha": 0.8, "bounds": "whole"}}
+    interval = load_config(file, {"interval": {"coverage": 0.95}}).interval
+    assert (interval.alpha, interval.bounds, float(interval.coverage)) == (None, "subpixel", 0.95)
+    assert load_config(RANGE, {"preset": "satellite", "interval": {"coverage": 0.95}}).interval == interval
+    back = load_config(RANGE | {"interval": {"coverage": 0.8, "calibration": rising()}}, {"interval": {"alpha": 0.7}})
+    assert (float(back.interval.alpha), back.interval.bounds, back.interval.coverage) == (0.7, "whole", None)
+    kept = load_config(
+        RANGE | {"interval": {"coverage": 0.8, "calibration": rising()}}, {"interval": {"coverage": 0.7}}
+    )
+    assert kept.interval.calibration == load_calibration(rising())
+
+
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [
+        ({"alpha": 0.8, "coverage": 0.9}, "interval: alpha is 0.8 and coverage 0.9: leave one out or set it to null"),
+        ({"coverage": 0.995}, "interval.coverage is 0.995, allowed: number >= 0.5, <= 0.99 or null"),
+        ({"coverage": 0.9, "bounds": "whole"}, "interval: bounds whole go with alpha only"),
+        ({"calibration": rising()}, "interval: calibration goes with coverage only"),
+        ({"coverage": 0.9, "calibration": 3}, "interval.calibration: calibration is 3, allowed: a file"),
+        ({"bounds": "half"}, "interval.bounds is 'half', allowed: whole or subpixel"),
+    ],
+)
+def test_load_config__explains_intervals(interval, words) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(RANGE, {"interval": interval})
+    assert words in str(caught.value)
+
+
+def test_bound_steps__fit_in_16_bits() -> None:
+    def steps(count):
+        settings = {"disparity": {"minimum": -16000, "maximum": count - 16001}, "interval": {"bounds": "subpixel"}}
+        return load_config(settings).bound_steps
+
+    assert [steps(count) for count in (1, 1024, 1025, 2048, 32001)] == [64, 64, 32, 32, 2]
+    assert load_config(RANGE).bound_steps == 0

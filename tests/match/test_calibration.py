@@ -1,0 +1,130 @@
+"""Levels of a calibration from measured intervals: worked examples and properties."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sat_intervals.config import load_config
+from sat_intervals.match.calibration import (
+    COUNTS,
+    FIELDS,
+    HIGH,
+    INSIDE,
+    MISSED,
+    QUANTILES,
+    SCHEMES,
+    WIDTH,
+    Measured,
+    choose,
+    expected,
+    ladder,
+    left_out,
+    means,
+    measure,
+    pooled,
+)
+
+LEVELS = np.array([0.0, 1, 2, 4, 8, 16, 32, 64])
+PART = np.zeros(4, np.int64)
+
+
+def part(needed_high, needed_low, group="one", widen=None):
+    """A measurement of pixels that need these levels; an interval is as wide as its level, or as ``widen`` tells."""
+    table = np.zeros((LEVELS.size, SCHEMES, FIELDS))
+    for rung, level in enumerate(LEVELS):
+        for scheme in range(SCHEMES):
+            needed = np.asarray(needed_high if scheme == HIGH else needed_low, float)
+            width = np.full(needed.size, widen(scheme, level) if widen else level)
+            truth = np.where(needed <= level, 0.0, width + 1)  # missed by 1 px
+            table[rung, scheme] = measure(0 * width, width, truth, 0.0, np.zeros(needed.size, int), 1)[0]
+    pixels = len(needed_high) + len(needed_low)
+    return Measured(group, 1 / pixels, table, 2 * pixels, pixels // 2)
+
+
+def test_measure__a_worked_example():
+    lower, upper = np.array([0.0, 0, 0, -1]), np.array([2.0, 2, 2, 20.25])
+    fields = measure(lower, upper, np.array([1.0, 2.5, 4, 3]), 0.5, np.array([0, 0, 1, 1]), 2)
+    np.testing.assert_array_equal(fields[:, [INSIDE, WIDTH, MISSED]], [[2, 4, 0], [1, 23.25, 1.5]])
+    np.testing.assert_array_equal(fields[:, COUNTS:].sum(axis=1), [2, 2])
+
+
+def test_measure__the_widest_interval_is_counted():
+    fields = measure(np.array([-16000.0]), np.array([16000.0]), np.zeros(1), 0.0, PART[:1], 1)
+    assert fields[0, COUNTS:].sum() == 1
+
+
+def test_ladder__holds_every_candidate():
+    config = load_config({"disparity": {"minimum": 0, "maximum": 5}})
+    levels = ladder(config)
+    assert levels[0] == 0
+    assert levels[-1] == pytest.approx(config.largest_sum)
+    assert (np.diff(levels) > 0).all()
+    assert levels.size % 2 == 0
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.5, 0.8, 0.9, 0.99]))
+def test_choose__each_class_reaches_the_coverage_by_the_smallest_level(seed, coverage):
+    random = np.random.default_rng(seed)
+    parts = [part(random.exponential(4, 1500), random.exponential(9, 1200), str(i)) for i in range(2)]
+    pool = pooled(parts)
+    choice = choose(pool, LEVELS, coverage)
+    figures = expected(pool.table, LEVELS, choice, coverage)
+    assert not choice.notes
+    for name in ("high", "low"):
+        assert figures[name] == pytest.approx(coverage, abs=1e-6)
+    higher = choose(pool, LEVELS, coverage + 0.005)
+    assert higher.high > choice.high
+
+
+def test_choose__every_pair_weighs_the_same():
+    large, small = part([1] * 9000, [1] * 9000), part([20] * 600, [1] * 600)
+    choice = choose(pooled([large, small]), LEVELS, 0.75)
+    assert 16 < choice.high <= 32  # half of the weight, though a fifteenth of the pixels
+
+
+def test_choose__a_class_with_few_pixels_takes_the_level_of_the_other():
+    pool = pooled([part([4] * 2000, [20] * 190)])
+    choice = choose(pool, LEVELS, 0.9)
+    assert choice.high == choice.low <= 4
+    assert choice.quantile is None
+    assert "190 pixels of low confidence, 200 are needed" in choice.notes[0]
+    pool = pooled([part([4] * 900, [20] * 1200)])
+    assert not choose(pool, LEVELS, 0.975).notes
+    choice = choose(pool, LEVELS, 0.99)
+    assert choice.high == choice.low > 16
+    assert "900 pixels of high" in choice.notes[0]
+
+
+def test_choose__says_what_no_level_reaches():
+    """Truths outside the search range are missed at any level."""
+    pool = pooled([part([1] * 800 + [1e9] * 200, [1] * 1000)])
+    choice = choose(pool, LEVELS, 0.9)
+    assert choice.high == LEVELS[-1]
+    assert choice.notes == ("high confidence does not reach it at any level",)
+    low = part([1] * 1000, [1e9] * 500 + [1] * 500)
+    low.table[:, 1 + QUANTILES.index(0.8), INSIDE] += 1
+    choice = choose(pooled([low]), LEVELS, 0.9)
+    assert (choice.low, choice.quantile) == (LEVELS[-1], 0.8)  # it comes nearest
+    assert choice.notes == ("low confidence does not reach it at any level",)
+
+
+def test_choose__the_narrowest_of_nearly_the_best_scores():
+    def widen(scheme, level):
+        return level * {3: 0.99, 4: 1.0}.get(scheme, 2.0)
+
+    choice = choose(pooled([part([4] * 1000, [4] * 1000, widen=widen)]), LEVELS, 0.9)
+    assert choice.quantile == QUANTILES[3 - 1]
+
+
+def test_left_out__judges_a_group_with_levels_of_the_others():
+    easy = [part([2] * 1000, [2] * 1000, "easy") for _ in range(2)]
+    hard = part([30] * 1000, [2] * 1000, "hard")
+    (groups,) = left_out([*easy, hard], LEVELS, [0.9])
+    assert groups.keys() == {"easy", "hard"}
+    assert groups["hard"]["high"] == pytest.approx(0)
+    assert groups["easy"]["high"] == 1
+    assert means(groups.values())["lowest"] == groups["hard"]["all"] == pytest.approx(0.45)  # of low, by interpolation
+    assert left_out(easy, LEVELS, [0.9]) == [{}]
+    assert means([]) == {}

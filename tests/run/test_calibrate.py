@@ -1,0 +1,214 @@
+"""Calibrations of demo scenes: through the engine, against runs with them, and from mistaken inputs."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+import yaml
+from helpers import PLACE, invoke, write_pair
+
+from sat_intervals import SatIntervalsError, match_pair, open_image
+from sat_intervals.config import PRESETS, calibration_of, load_config
+from sat_intervals.demo import make_scene
+from sat_intervals.evaluate.disparity import evaluate_run
+from sat_intervals.raster import write_layer
+from sat_intervals.run import tune
+from sat_intervals.run.calibrate import Subject, check_subjects, truth_of
+from sat_intervals.run.tune import Tuned, best_of, candidates
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A folder of a pair, with its calibration in calibration.yaml and what the command printed in said."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_pair(folder, make_scene(200, 260, seed=5))
+    result = invoke("calibrate", folder, "--output", folder / "calibration.yaml")
+    assert result.exit_code == 0, result.output
+    (folder / "said").write_text(result.output)
+    return folder
+
+
+def calibrated(folder, output, *options):
+    result = invoke("calibrate", folder, "--output", output, "--quiet", "--name", "one", *options)
+    assert result.exit_code == 0, result.output
+    return output.read_bytes()
+
+
+def settings_with(folder, **interval):
+    low, high = json.loads((folder / "meta.json").read_text())["disparity"]
+    return {"disparity": {"minimum": low, "maximum": high}, "interval": interval}
+
+
+@pytest.mark.parametrize("coverage", [0.5, 0.9, 0.99])
+def test_calibrate__a_run_with_its_levels_has_the_coverage(scene, tmp_path, coverage):
+    """On the pair of the calibration itself, in each class."""
+    settings = settings_with(scene, coverage=coverage, calibration=str(scene / "calibration.yaml"))
+    match_pair(scene / "left.tif", scene / "right.tif", tmp_path, settings)
+    report = evaluate_run(tmp_path, scene / "truth.tif")
+    for name in ("all", "high", "low"):
+        assert report[name]["accuracy"] == pytest.approx(coverage, abs=0.02), name
+
+
+def test_calibrate__the_file_says_what_to_expect(scene):
+    content = yaml.safe_load((scene / "calibration.yaml").read_text())
+    expected = content["provenance"]["expected"]
+    assert [row["coverage"] for row in expected] == [row["coverage"] for row in content["levels"]]
+    nominal = next(row for row in expected if row["coverage"] == 0.9)
+    assert 0.8 < nominal["all"] < 0.96
+    assert nominal["lowest"] < nominal["all"]
+    assert nominal["score"] > nominal["mean_width"] > nominal["median_width"] > 0
+    assert f"{nominal['all']:.3f}" in (scene / "said").read_text()
+
+
+@pytest.mark.process
+def test_calibrate__workers_do_not_change_a_byte(scene, tmp_path):
+    one = calibrated(scene, tmp_path / "one.yaml", "--tile-size", 64, "--workers", 1)
+    assert one == calibrated(scene, tmp_path / "two.yaml", "--tile-size", 64, "--workers", 2)
+    assert one == calibrated(scene, tmp_path / "processes.yaml", "--tile-size", 64, "--cluster", "processes")
+    assert len(list(tmp_path.iterdir())) == 3  # no tiles are left
+
+
+def test_calibrate__a_finished_run_equals_its_pair(scene, tmp_path):
+    """The run is matched again from its images, with its own settings."""
+    match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "run", settings_with(scene, alpha=0.7))
+    found = [calibrated(folder, tmp_path / "one.yaml") for folder in (scene, tmp_path / "run")]
+    contents = [yaml.safe_load(content) for content in found]
+    assert contents[0]["levels"] == contents[1]["levels"]
+    assert contents[0]["key"] == contents[1]["key"]
+
+
+def test_calibrate__bias_and_tolerance_make_up_for_a_shifted_truth(scene, tmp_path):
+    """A constant error of the truth, and truths rounded to whole pixels, cost no width."""
+    with rasterio.open(scene / "truth.tif") as file:
+        truth = file.read(1)
+    write_layer(tmp_path / "truth.tif", np.rint(truth + 1).astype(np.float32), np.nan, PLACE)
+    low, high = json.loads((scene / "meta.json").read_text())["disparity"]
+    rows = [f"{scene}/left.tif,{scene}/right.tif,{tmp_path}/truth.tif,{low},{high},0.5,true"]
+    (tmp_path / "pairs.csv").write_text("left,right,truth,minimum,maximum,tolerance,remove_bias\n" + "\n".join(rows))
+    shifted = yaml.safe_load(calibrated(tmp_path / "pairs.csv", tmp_path / "shifted.yaml"))
+    exact = yaml.safe_load((scene / "calibration.yaml").read_text())
+    assert shifted["levels"][5]["high"] <= 1.05 * exact["levels"][5]["high"]
+
+
+def with_truth(scene, folder, truth):
+    """A copy of a pair with another truth."""
+    for name in ("left.tif", "right.tif", "meta.json"):
+        (folder / name).symlink_to(scene / name)
+    write_layer(folder / "truth.tif", truth.astype(np.float32), np.nan, PLACE)
+    return folder
+
+
+def one_line(result):
+    assert result.exit_code == 2, result.output
+    assert result.output.count("\n") == 1
+    assert result.output.startswith("sat-intervals: ")
+    return result.output
+
+
+@pytest.mark.parametrize(
+    ("truth", "words"),
+    [
+        (np.zeros((30, 40)), "30 x 40 pixels"),
+        (np.full((200, 260), np.nan), "0 known truths, at least 1000"),
+        (np.where(np.arange(200 * 260) == 30_000, -5, np.nan).reshape(200, 260), "1 known truths, at least 1000"),
+        (np.full((200, 260), 500), "52000 of 52000 truths are outside the search range"),
+    ],
+)
+def test_calibrate__a_wrong_truth_is_one_line(scene, tmp_path, truth, words):
+    folder = with_truth(scene, tmp_path, truth)
+    line = one_line(invoke("calibrate", folder, "--output", tmp_path / "calibration.yaml", "--quiet"))
+    assert words in line
+    assert "truth.tif" in line
+
+
+def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
+    output = "--output", tmp_path / "new.yaml"
+    assert "needs confidence" in one_line(invoke("calibrate", scene, *output, "--config", off(tmp_path)))
+    assert "given 2 times for 1 PAIRS" in one_line(invoke("calibrate", scene, *output, *2 * ("--truth", "a.tif")))
+    assert "options of match" in one_line(invoke("calibrate", scene, *output, "--coverage", 0.9))
+    assert "existing folder" in one_line(invoke("calibrate", scene, "--output", tmp_path / "no" / "new.yaml"))
+    assert "truth.tif" in one_line(invoke("calibrate", scene, "--output", scene / "truth.tif"))
+    assert not (tmp_path / "new.yaml").exists()
+
+
+def off(folder):
+    file = folder / "off.yaml"
+    file.write_text("regularization: null\n")
+    return file
+
+
+def test_calibrate__a_calibration_of_other_settings_is_refused(scene, tmp_path):
+    arguments = "match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -10, 10
+    with_calibration = "--coverage", 0.9, "--calibration", scene / "calibration.yaml"
+    line = one_line(invoke(*arguments, *with_calibration, "--preset", "satellite"))
+    assert "belongs to other settings" in line
+    assert "sat-intervals calibrate" in line
+
+
+def test_calibrate__a_run_with_local_ranges_is_matched_over_its_whole_range(scene, tmp_path):
+    settings = settings_with(scene)
+    settings["disparity"]["local"] = True
+    match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+    found = yaml.safe_load(calibrated(tmp_path / "out", tmp_path / "one.yaml"))
+    assert found["levels"] == yaml.safe_load((scene / "calibration.yaml").read_text())["levels"]
+
+
+def test_check_subjects__needs_the_search_range_as_numbers(scene):
+    left, right = (open_image(scene / f"{side}.tif") for side in ("left", "right"))
+    subject = Subject("one", "one", left, right, truth_of(left, scene / "truth.tif"), load_config({}))
+    with pytest.raises(SatIntervalsError, match="one: the search range is auto, but calibrate needs it as numbers"):
+        check_subjects([subject])
+
+
+def test_calibrate__levels_out_of_order_are_refused(scene, tmp_path):
+    content = yaml.safe_load((scene / "calibration.yaml").read_text())
+    content["levels"][3]["high"] = 1e-3
+    (tmp_path / "edited.yaml").write_text(yaml.safe_dump(content))
+    arguments = "match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -10, 10
+    line = one_line(invoke(*arguments, "--coverage", 0.9, "--calibration", tmp_path / "edited.yaml"))
+    assert "edited.yaml" in line
+    assert "high falls" in line
+
+
+MCCNN = [pytest.param(preset, marks=pytest.mark.peer("onnxruntime")) for preset in PRESETS if "mccnn" in preset]
+
+
+@pytest.mark.parametrize("preset", [preset for preset in PRESETS if "mccnn" not in preset] + MCCNN)
+def test_calibration_of__each_preset_has_a_built_in_one(preset):
+    config = load_config({"preset": preset, "disparity": {"minimum": 0, "maximum": 9}, "interval": {"coverage": 0.9}})
+    assert calibration_of(config).name == preset
+
+
+# ---- Tuning ------------------------------------------------------------------------------------------------
+def test_candidates__are_presets_and_a_ladder_of_different_settings():
+    found = dict(candidates(with_network=True))
+    search = {"disparity": {"minimum": 0, "maximum": 1}}
+    assert len({str(load_config({**changes, **search}).sgm) for changes in found.values()}) >= 14
+    assert {"paper", "satellite", "satellite-mccnn", "census 5, 8/64", "mccnn, 1/6"} <= found.keys()
+    assert not any("mccnn" in name for name, _ in candidates(with_network=False))
+
+
+def test_best_of__has_the_best_score_of_those_with_many_good_pixels():
+    found = [Tuned(name, (), 0.9, good, {"score": score}, None) for name, good, score in CANDIDATES]
+    assert best_of(found).name == "best"
+
+
+CANDIDATES = ("few", 0.5, 3.0), ("wide", 0.8, 9.0), ("best", 0.78, 5.0)
+
+
+def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
+    changes = {"sgm": {"p2": 64}}
+    monkeypatch.setattr(tune, "candidates", lambda with_network: [("stronger", changes)])
+    result = invoke("calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml")
+    assert result.exit_code == 0, result.output
+    line = next(line for line in result.output.splitlines() if line.startswith("stronger *"))
+    kept, good, coverage = map(float, line.split()[2:5])
+    assert 0.5 < good < kept < 1
+    assert 0.8 < coverage < 0.96
+    arguments = scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -8, 8
+    result = invoke("match", *arguments, "--config", tmp_path / "tuned.yaml", "--quiet")
+    assert result.exit_code == 0, result.output
+    used = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
+    assert (used["sgm"]["p2"], used["interval"]["coverage"]) == (64, 0.9)
+    assert used["interval"]["calibration"]["name"] == "stronger"
