@@ -727,7 +727,7 @@ def test_match__command_line_wins_over_the_file(folder, tmp_path):
     settings = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
     assert settings["disparity"] == {"minimum": -3, "maximum": 4}
     assert settings["tiles"] == {"size": 128, "overlap": 7}
-    assert settings["interval"] == {"alpha": 0.8}
+    assert settings["interval"]["alpha"] == 0.8
 
 
 # ---- The other commands -----------------------------------------------------------------------------------------
