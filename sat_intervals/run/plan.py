@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Cluster, Config, load_config
+from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS
@@ -92,7 +92,7 @@ def plan(
     SatIntervalsError
         The pair cannot be matched, or not even the smallest tile fits in the memory.
     """
-    config = load_config(config)
+    config = resolved(load_config(config))
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
     left, right = checked_pair(left, right, config)
     workers = workers or tiles_at_once(config.cluster)
