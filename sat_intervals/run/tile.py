@@ -51,24 +51,22 @@ def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]])
 
 def match_tile(job: Job, tile: Tile) -> None:
     """Match one tile and write its intermediate products; runs on a worker."""
-    with _logged_failure(job, tile):
+    with _logged_failure(job, tile.name):
         _match_tile(job, tile)
 
 
 def trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[str, float]:
     """Write the path states that a tile hands on in a wavefront; return seconds by stage; runs on a worker."""
-    with _logged_failure(job, tile):
+    with _logged_failure(job, Step(tile, wavefront, mirrored).name):
         return _trace_tile(job, tile, wavefront, mirrored)
 
 
 @contextmanager
-def _logged_failure(job: Job, tile: Tile) -> Iterator[None]:
+def _logged_failure(job: Job, step: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        _LOG.info(
-            "tile %s failed; it is tried again at most %d times", tile.name, job.config.cluster.retries, exc_info=True
-        )
+        _LOG.info("tile %s failed; it is tried again at most %d times", step, job.config.cluster.retries, exc_info=True)
         if isinstance(error, SatIntervalsError):
             error.__cause__ = error.__context__ = None  # errors of GDAL cannot be pickled
         raise

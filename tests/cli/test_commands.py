@@ -159,6 +159,7 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
         (["--window", 0, 0, 0, 9], ["0 x 9 pixels: must be inside"]),
         (["--tile-size", 100], ["tiles.size is 100, allowed: integer >= 64, ", "multiple of 64"]),
         (["--overlap", 2], ["tiles.overlap is 2, allowed: >= 3 with cost.window 5"]),
+        (["--overlap", "exakt"], ["'exakt' is neither exact nor a number of pixels"]),
         (["--workers", 0], ["'--workers': 0 is not in the range x>=1"]),
         (["--workers", -2], ["'--workers': -2 is not in the range x>=1"]),
         (["--nodata", "none"], ["'--nodata': 'none' is not a valid float"]),
