@@ -36,7 +36,7 @@ def plot(
     \b
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
-    OUT/coverage.png   likewise: nominal and measured coverage, width; --beside adds runs at other coverages
+    OUT/coverage.png   likewise: nominal and measured coverage, width
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
     OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence

@@ -46,9 +46,12 @@ def test_packages__equal_the_folders() -> None:
         ".".join([package, *file.parent.relative_to(folder).parts])
         for package, folder in FOLDERS.items()
         for file in folder.rglob("*")
-        if file.suffix in {".py", ".yaml"}
+        if file.suffix == ".py" or (file.suffix == ".yaml" and file.parent == folder)
     }
     assert shipped == set(PYPROJECT["tool"]["setuptools"]["packages"])
+    patterns = PYPROJECT["tool"]["setuptools"]["package-data"]["sat_intervals.configs"]
+    configs = FOLDERS["sat_intervals.configs"]
+    assert set(configs.rglob("*.yaml")) == {file for pattern in patterns for file in configs.glob(pattern)}
 
 
 def test_entry_point__is_not_hidden_by_a_module() -> None:

@@ -1,6 +1,7 @@
 """Run the paper's ablation (table 2): the effect of each part of the method, from one matching pass per pair."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from decimal import Decimal
 from functools import partial
 from typing import Any
@@ -77,7 +78,8 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     criteria = criteria_of(config, tolerance)
     for method in METHODS:
         strips = partial(_final_strips, *_of_method(methods[method], method, config), scale, truth)
-        report[method] = evaluate(strips, criteria)["all"]
+        nominal = criteria.nominal if method == "baseline" else float(method.split()[0])
+        report[method] = evaluate(strips, replace(criteria, nominal=nominal))["all"]
     return report
 
 

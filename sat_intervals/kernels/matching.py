@@ -35,6 +35,7 @@ from sat_intervals.kernels.reading import (
     update_right,
 )
 from sat_intervals.kernels.sgm import (
+    LAST_WAVE,
     WALL,
     WAVEFRONTS,
     Borders,
@@ -215,8 +216,7 @@ def _prepare(
     inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
     cells = cells or one_cell(rows, columns, settings.count)
     k, slots = np.arange(size), 1 + 3 * columns
-    beyond = (k < cells.first[..., np.newaxis]) | (k > cells.last[..., np.newaxis])
-    walls = np.where(beyond.reshape(-1, size), np.uint16(WALL), np.uint16(0))
+    walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
     return _Buffers(
         Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
         cells,
@@ -331,7 +331,7 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             if keep:
                 copy_curve(curve, volume[i, j])
         if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, 1, False, leaving)
+            hand_on(paths, inside, r, falling, rising, LAST_WAVE, False, leaving)
 
 
 def _sweep(costs, gradients, settings, output, core, keep, borders, cells):

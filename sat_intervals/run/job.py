@@ -22,9 +22,10 @@ from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
+from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run, inputs_before, search_before
+from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run
 from sat_intervals.tiling import Grid, Tile, Window
 
 Search = Callable[[Image, Image, dict[str, dict[str, Any]]], Found]
@@ -78,6 +79,11 @@ class Job:
     def manifest(self) -> dict[str, Any]:
         """Return all that decides the bytes of a tile."""
         return _manifest(self.config, self.inputs, self.store.grid.region, self.grid)
+
+    @property
+    def hands_states_on(self) -> bool:
+        """Return whether tiles hand path states of SGM to their neighbours."""
+        return self.config.hands_states_on and len(self.store.grid) > 1
 
     @property
     def name(self) -> str:

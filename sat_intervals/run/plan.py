@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Cluster, Config, load_config
+from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
+from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image
@@ -22,7 +23,7 @@ from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.search_range import find_here
 from sat_intervals.run.submit import reason
-from sat_intervals.tiling import Grid, Window
+from sat_intervals.tiling import Grid, Tile, Window
 
 # Side of the sample, a window at the centre of the image.
 SAMPLE = 512
@@ -94,7 +95,7 @@ def plan(
     SatIntervalsError
         The pair cannot be matched, or not even the smallest tile fits in the memory.
     """
-    config = load_config(config)
+    config = resolved(load_config(config))
     left, right = checked_pair(left, right, config)
     config, _, _ = searched(config, left, lambda: find_here(left, right, progress))
     checked_pair(left, right, config)
@@ -134,18 +135,25 @@ def _handed_bytes(grid: Grid, config: Config) -> int:
     return (1 + config.matches_right_view) * (states + costs)
 
 
-def _traced(grid: Grid) -> int:
+def _traced(grid: Grid, whole: Window, config: Config) -> int:
     """Return the pixels of the tiles that hand on path states, summed over the wavefronts but the last.
 
     Tiles hand on the last one when they are matched. The tile in the corner where a wavefront ends hands nothing on.
     """
     ends = (grid.rows - 1, grid.columns - 1), (grid.rows - 1, 0), (0, 0)
-    corners = (grid.tile(*end).core for end in ends)
-    return len(ends) * grid.region.height * grid.region.width - sum(core.height * core.width for core in corners)
+    corners = sum(_path_pixels(grid, grid.tile(*end), whole, config) for end in ends)
+    return len(ends) * _work(grid, whole, config) - corners
 
 
-def _work(grid: Grid, config: Config) -> int:
+def _path_pixels(grid: Grid, tile: Tile, whole: Window, config: Config) -> int:
+    window = path_window(Frame(tile.core, grid.region, whole), config)
+    return window.height * window.width
+
+
+def _work(grid: Grid, whole: Window, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows behind its core."""
+    if config.tiles.overlap == "exact":
+        return sum(_path_pixels(grid, tile, whole, config) for tile in grid)
     overlap = config.tiles.margin
     total = 0
     for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
@@ -176,10 +184,12 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
         window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region)
     sample = Grid(window, one.tiles.size)
     pixels, sampled = (there.height * there.width for there in (grid.region, window))
-    work = _work(grid, config)
-    tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / _work(sample, one)
-    tiles += seconds.get("tiles.costs", 0.0) * pixels / sampled
-    paths = seconds.get("tiles.trace", 0.0) * _traced(grid) / max(1, _traced(sample))
+    whole = Window(0, 0, left.height, left.width)
+    work = _work(grid, whole, config)
+    of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "costs", "match", "write"))
+    tiles = of_tiles * work / _work(sample, whole, one)
+    traced = max(1, _traced(sample, whole, one))
+    paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
     files = (seconds["bands"] + seconds["files"]) * pixels / sampled
     images = seconds["tiles.images"]  # the sample already measures whole images
     parallel = (tiles + paths) / min(workers, len(grid))

@@ -25,6 +25,7 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, diges
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
+    COSTS,
     FAILURES,
     FOLDERS,
     NORMALIZATION,
@@ -35,6 +36,7 @@ from sat_intervals.store.removal import (
     final_name,
     is_of_run,
 )
+from sat_intervals.store.steps import read_step, write_step
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -221,6 +223,20 @@ class Store:
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
             self.folder.delete(name)
 
+    def write_step(self, kind: str, name: str, *arrays: np.ndarray) -> None:
+        """Write what a step hands to later ones, see `steps.write_step`."""
+        write_step(self.folder, self.run, kind, name, *arrays)
+        if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
+            self.folder.delete(f"{kind}/{name}")
+
+    def read_step(self, kind: str, name: str) -> list[np.ndarray] | None:
+        """Read what `write_step` wrote; None if it is missing or damaged."""
+        return read_step(self.folder, self.run, kind, name)
+
+    def drop_costs(self) -> None:
+        """Delete precomputed costs, which nothing needs once all tiles are matched."""
+        self.folder.delete_all([f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes()], [COSTS])
+
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Write the statistics of the whole images, so that all tiles use the same."""
         self.folder.write(NORMALIZATION, sealed(normalization, self.run))
@@ -230,7 +246,7 @@ class Store:
         return unsealed(self.folder.read(NORMALIZATION), self.run)
 
     def write_search(self, search: Mapping[str, Any], of: str) -> None:
-        """Write the search range that was found, so that it is not searched again, see `search_before`.
+        """Write the search range that was found, so that it is not searched again, see `before`.
 
         ``of`` names all that decides which range is found: not the run, which depends on the range.
         """
@@ -355,22 +371,6 @@ def replaceable_files(home: Path) -> dict[str, str]:
 def has_begun(home: Path) -> bool:
     """Return whether a run made this folder of tiles; a user's folder may have the same name."""
     return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
-
-
-def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
-    """Return the inputs in the manifest of existing tiles; empty if it cannot be read."""
-    try:
-        return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
-    except (OSError, TypeError, ValueError):
-        return {}
-
-
-def search_before(home: Path, store: str | None, of: str) -> dict[str, Any] | None:
-    """Return what `Store.write_search` wrote with existing tiles; None if it cannot be read or is of other images."""
-    try:
-        return unsealed(place_of(home, store).read(SEARCH), of)
-    except (OSError, ValueError):
-        return None
 
 
 def _checksums(records: Records) -> Checksums:

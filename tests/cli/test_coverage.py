@@ -77,4 +77,4 @@ def test_match__names_what_is_wrong_with_a_coverage(pair, tmp_path):
     own = "--calibration", pair / "own.yaml"
     assert "interval.coverage is 0.3, allowed: number >= 0.5, <= 0.99 or null" in says("--coverage", 0.3, *own)
     assert "calibration goes with coverage only" in says(*own)
-    assert "belongs to other settings, cost.method is census" in says("--coverage", 0.9, *own, "--cost", "mccnn")
+    assert "belongs to other settings, cost.window is 5" in says("--coverage", 0.9, *own, "--preset", "satellite")
