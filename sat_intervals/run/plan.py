@@ -23,7 +23,7 @@ from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.search_range import find_here
 from sat_intervals.run.submit import reason
-from sat_intervals.tiling import Grid, Tile, Window
+from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image.
 SAMPLE = 512
@@ -141,19 +141,19 @@ def _traced(grid: Grid, whole: Window, config: Config) -> int:
     Tiles hand on the last one when they are matched. The tile in the corner where a wavefront ends hands nothing on.
     """
     ends = (grid.rows - 1, grid.columns - 1), (grid.rows - 1, 0), (0, 0)
-    corners = sum(_path_pixels(grid, grid.tile(*end), whole, config) for end in ends)
+    corners = sum(_path_pixels(grid.tile(*end).core, grid.region, whole, config) for end in ends)
     return len(ends) * _work(grid, whole, config) - corners
 
 
-def _path_pixels(grid: Grid, tile: Tile, whole: Window, config: Config) -> int:
-    window = path_window(Frame(tile.core, grid.region, whole), config)
+def _path_pixels(core: Window, region: Window, whole: Window, config: Config) -> int:
+    window = path_window(Frame(core, region, whole), config)
     return window.height * window.width
 
 
 def _work(grid: Grid, whole: Window, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows behind its core."""
     if config.tiles.overlap == "exact":
-        return sum(_path_pixels(grid, tile, whole, config) for tile in grid)
+        return _path_pixels(grid.region, grid.region, whole, config)
     overlap = config.tiles.margin
     total = 0
     for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
