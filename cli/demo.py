@@ -68,7 +68,8 @@ def demo(
             f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
             f"at a mean width of {figures['mean_width']:.2f} px."
         )
-        _compare(config, out, figures, console)
+        if not quiet:
+            _compare(config, out, figures, console)
 
 
 def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Console") -> None:
@@ -77,14 +78,15 @@ def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Con
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.run.pair import match_pair
 
-    names = ["alpha 0.9", "coverage 0.9"]
-    interval = {"coverage": 0.9}
-    if config.interval is None or config.interval.coverage is not None:
-        names.reverse()
-        interval = {"alpha": 0.9}
+    own = config.interval
+    if own is None:
+        return
+    one, other_one = ("alpha", "coverage") if own.coverage is None else ("coverage", "alpha")
+    nominal = getattr(own, one)
+    names, interval = [f"{one} {nominal}", f"{other_one} {nominal}"], {other_one: nominal}
     try:
         other = resolved(load_config(config, {"interval": interval, "cluster": {"store": None}}))
-    except ConfigError:  # no built-in calibration
+    except ConfigError:  # no built-in calibration, or a coverage that none has
         return
     with TemporaryDirectory(prefix="sat-intervals-") as folder:
         match_pair(out / "left.tif", out / "right.tif", folder, other)

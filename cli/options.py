@@ -75,7 +75,10 @@ class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
     name = "exact|PIXELS"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
-        return "exact" if value == "exact" else int(click.INT.convert(value, param, ctx))
+        try:
+            return "exact" if value == "exact" else int(value)
+        except ValueError:
+            self.fail(f"{value!r} is neither exact nor a number of pixels", param, ctx)
 
 
 _OF_SETTINGS = ("preset", "cost", "coverage", "calibration", "tile_size", "overlap", "workers", "cluster", "store")

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 Progress = Callable[[str, int, int], None]
@@ -17,6 +17,12 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     started = time.perf_counter()
     yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
+
+
+def add_seconds(seconds: dict[str, float], more: Mapping[str, float]) -> None:
+    """Add seconds by stage."""
+    for stage, took in more.items():
+        seconds[stage] = seconds.get(stage, 0.0) + took
 
 
 @contextmanager

@@ -17,7 +17,7 @@ PATHS = [[(0, 1), (1, 1)], [(1, -1), (1, 0)], [(0, -1), (-1, -1)], [(-1, 1), (-1
 
 def earliest_turns():
     """The earliest turn of each step, where all steps that are ready are done together."""
-    schedule, turns, turn = Schedule(GRID, GRID, set()), {}, 1
+    schedule, turns, turn = Schedule(GRID, GRID, set().__contains__), {}, 1
     while schedule:
         together = []
         while (step := schedule.next()) is not None:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from sat_intervals.config.files import read_mapping
 from sat_intervals.config.sections import ConfigError
 from sat_intervals.config.weights import weights_file
+from sat_intervals.products import IMPOSSIBLE_COST
 
 if TYPE_CHECKING:
     from sat_intervals.config.settings import Config
@@ -37,8 +38,8 @@ class Levels(_Model):
     """
 
     coverage: float
-    high: float = Field(ge=0)
-    low: float = Field(ge=0)
+    high: float = Field(ge=0, le=IMPOSSIBLE_COST)
+    low: float = Field(ge=0, le=IMPOSSIBLE_COST)
     quantile: float | None = Field(ge=0.5, le=1)
 
 
@@ -190,15 +191,19 @@ def calibration_of(config: "Config") -> Calibration:
 def _difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """Return the first difference of two keys in words."""
     one, other = _flat(there), _flat(here)
-    name = next(name for name in {**other, **one} if one.get(name) != other.get(name))
-    words = ["null" if key.get(name) is None else key[name] for key in (one, other)]
-    return f"{name} is {words[0]} there and {words[1]} here"
+    for name in {**other, **one}:
+        if one.get(name) != other.get(name):
+            words = ["null" if key.get(name) is None else key[name] for key in (one, other)]
+            return f"{name} is {words[0]} there and {words[1]} here"
+    name = min(one.keys() ^ other.keys())  # a null that the other lacks
+    return f"{name} is only {'there' if name in one else 'here'}"
 
 
 def _flat(key: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in key.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+        is_section = isinstance(value, Mapping) and value
+        flat |= _flat(value, f"{prefix}{name}.") if is_section else {f"{prefix}{name}": value}
     return flat
 
 

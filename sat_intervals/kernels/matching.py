@@ -24,6 +24,7 @@ from sat_intervals.kernels.reading import (
     update_right,
 )
 from sat_intervals.kernels.sgm import (
+    LAST,
     WALL,
     WAVEFRONTS,
     Borders,
@@ -46,6 +47,8 @@ from sat_intervals.products import (
     NOT_REFINED,
 )
 from sat_intervals.tiling import Window
+
+_LAST_WAVE = WAVEFRONTS[LAST][1]
 
 
 class Settings(NamedTuple):
@@ -315,7 +318,7 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             if keep:
                 copy_curve(curve, volume[i, j])
         if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, 1, False, leaving)
+            hand_on(paths, inside, r, falling, rising, _LAST_WAVE, False, leaving)
 
 
 def _sweep(costs, gradients, settings, output, core, keep, borders):

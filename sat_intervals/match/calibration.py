@@ -18,6 +18,7 @@ from sat_intervals.config import Config
 # Quantiles of the regularisation that are tried; None: no regularisation.
 QUANTILES = (None, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 HIGH, SCHEMES = 0, 1 + len(QUANTILES)
+_USUAL_QUANTILE = 0.9
 FEWEST = 1000  # pixels with truth, of all pairs
 
 # Rungs: level 0, and from a fraction of the span to the level that holds every candidate, a third of an octave apart.
@@ -137,23 +138,24 @@ def choose(pool: Pool, levels: np.ndarray, coverage: float) -> Choice:
     """Choose the levels with which each class reaches a coverage.
 
     Of the quantiles whose interval score is nearly the best, the one with the narrowest intervals is chosen. A class
-    with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class
-    without regularisation.
+    with fewer pixels than the larger of 200 and ``10 / (1 - coverage)`` takes the level of the other class: high
+    confidence that of low confidence without regularisation, low confidence that of high with the usual quantile. If
+    both have few, each keeps its own.
     """
     (table, pixels), notes = pool, []
     needed = ceil(max(200, 10 / (1 - coverage)) - 1e-9)
     few = [number < needed for number in pixels]
+    for name, other, number in zip(("high", "low"), ("low", "high"), pixels, strict=True):
+        if number < needed:
+            borrowed = "" if all(few) else f": the level of {other} confidence is used"
+            notes.append(f"{number} pixels of {name} confidence, {needed} are needed{borrowed}")
     reached = [_level(table[:, scheme], levels, coverage) for scheme in range(SCHEMES)]
-    if few[0] or few[1]:
-        scheme, name, other = (HIGH + 1, "high", "low") if few[0] else (HIGH, "low", "high")
-        level = reached[scheme]
-        level = float(levels[-1]) if level is None else level
-        number = pixels[0 if few[0] else 1]
-        notes.append(f"{number} pixels of {name} confidence, {needed} are needed: they take the level of {other}")
-        return Choice(level, level, None, tuple(notes))
-    if (high := reached[HIGH]) is None:
+    borrows = [number < needed <= beside for number, beside in zip(pixels, pixels[::-1], strict=True)]
+    if (high := reached[HIGH + borrows[0]]) is None:
         high = float(levels[-1])
         notes.append("high confidence does not reach it at any level")
+    if borrows[1]:
+        return Choice(high, high, _USUAL_QUANTILE, tuple(notes))
     # level, interval score and sum of widths of each quantile that reaches it
     found = {}
     for scheme, quantile in enumerate(QUANTILES, start=HIGH + 1):
@@ -168,6 +170,14 @@ def choose(pool: Pool, levels: np.ndarray, coverage: float) -> Choice:
     good = {quantile: width for quantile, (_, score, width) in found.items() if score <= _SAME_SCORE * best}
     quantile = min(good, key=lambda quantile: good[quantile])
     return Choice(high, found[quantile][0], quantile, tuple(notes))
+
+
+def not_below(choice: Choice, before: Choice | None) -> Choice:
+    """Raise levels to those of a smaller coverage: the level of another class may be lower than the class's own."""
+    if before is None:
+        return choice
+    low = max(choice.low, before.low) if choice.quantile == before.quantile else choice.low
+    return choice._replace(high=max(choice.high, before.high), low=low)
 
 
 def _level(fields: np.ndarray, levels: np.ndarray, coverage: float) -> float | None:

@@ -17,7 +17,7 @@ from sat_intervals.config import Cluster, Config, load_config
 from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
-from sat_intervals.progress import Progress
+from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.results import open_run
@@ -241,6 +241,7 @@ def _assembled(client: Client, matched: Matched, keep_tiles: bool, progress: Pro
         measure_images(client, job, progress)
         for again in match_jobs(client, [job], progress):
             check_failures(job, again.failures)
+            add_seconds(seconds, again.seconds)
 
     try:
         with job.store.needed(job.manifest):

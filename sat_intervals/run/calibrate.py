@@ -23,12 +23,14 @@ from sat_intervals.match.calibration import (
     HIGH,
     QUANTILES,
     SCHEMES,
+    Choice,
     Measured,
     choose,
     ladder,
     left_out,
     means,
     measure,
+    not_below,
     pooled,
 )
 from sat_intervals.match.histogram import bias_histogram
@@ -240,8 +242,9 @@ def calibration_from(
     """
     config = subjects[0].config
     levels, pool, rows, expected, notes = ladder(config), pooled(parts), [], [], []
+    choice: Choice | None = None
     for coverage, groups in zip(COVERAGES, left_out(parts, levels, COVERAGES), strict=True):
-        choice = choose(pool, levels, coverage)
+        choice = not_below(choose(pool, levels, coverage), choice)
         levels_of = {"high": round(choice.high, 4), "low": round(choice.low, 4), "quantile": choice.quantile}
         rows.append({"coverage": coverage, **levels_of})
         notes += [f"coverage {coverage:g}: {note}" for note in choice.notes]

@@ -62,6 +62,11 @@ class Job:
         return _manifest(self.config, self.inputs, self.store.grid.region)
 
     @property
+    def hands_states_on(self) -> bool:
+        """Return whether tiles hand path states of SGM to their neighbours."""
+        return self.config.hands_states_on and len(self.store.grid) > 1
+
+    @property
     def name(self) -> str:
         """Return a unique name of the run: a digest of all that decides the bytes of its files."""
         return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster", "preset"})})

@@ -3,17 +3,15 @@
 import errno
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from distributed import Client
 
 from sat_intervals.errors import RunError
-from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.match.warm_up import compile_kernels
-from sat_intervals.progress import Progress, logged_stage
+from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
@@ -21,11 +19,12 @@ from sat_intervals.run.assemble import assemble
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
-from sat_intervals.run.schedule import Schedule, Step
+from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_tile, measure_block, trace_tile
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.steps import BORDERS, whole_steps
+from sat_intervals.store.removal import BORDERS
+from sat_intervals.store.steps import intact_steps
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Tile, Window
 
@@ -91,7 +90,7 @@ def match_pair(
                         measure_images(client, job, progress)
                     for matched in match_jobs(client, [job], progress):
                         check_failures(job, matched.failures)
-                        seconds.update(matched.seconds)
+                        add_seconds(seconds, matched.seconds)
 
     with LocalFolder(job.store.home).locked():
         if not overwrite and job.is_finished():
@@ -172,7 +171,7 @@ def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
             raise error
     if failures:
         lines = "\n".join(f"  tile {name}: {reason(error)}" for name, error in sorted(failures.items()))
-        waiting = " or wait for their path states" if job.config.hands_states_on else ""
+        waiting = " or wait for their path states" if job.hands_states_on else ""
         raise RunError(
             f"{len(failures)} of {len(job.store.grid)} tiles failed, the others are kept{waiting}; fix the cause and "
             f"rerun the same command: it resumes; add --overwrite if an input changed:\n{lines}"
@@ -212,8 +211,7 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
             ) from error
         if error is None:
             schedules[i].ended(step)
-            for stage, took in (seconds or {}).items():  # of tracing; a tile keeps its own in its record
-                matched[i].seconds[f"tiles.{stage}"] = matched[i].seconds.get(f"tiles.{stage}", 0.0) + took
+            add_seconds(matched[i].seconds, seconds or {})  # of tracing; a tile keeps its own in its record
         else:
             matched[i].failures.setdefault(step.tile.name, error)
             schedules[i].failed(step)
@@ -222,23 +220,25 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
         done = total - sum(map(len, schedules))
         progress("tiles", done, total)
         if not schedules[i]:
+            if not matched[i].failures:
+                jobs[i].store.drop_costs()
             yield matched[i]
+    assert not any(schedules)  # else steps would wait for each other
 
 
 def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:
-    grid, borders, views = job.store.grid, None, 1 + job.config.matches_right_view
-    if job.config.hands_states_on:
-        steps = (Step(*of) for of in product(grid, range(len(WAVEFRONTS)), [False, True][:views]))
-        borders = whole_steps(job.store.folder, job.store.run, BORDERS, (step.name for step in steps))
-    return Schedule(grid, tiles, borders, views)
+    store = job.store
+    is_done = intact_steps(store.folder, store.run, BORDERS) if job.hands_states_on else None
+    return Schedule(store.grid, tiles, is_done, 1 + job.config.matches_right_view)
 
 
 def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task | None]:
-    """Tasks of all jobs as they become ready; None while none is."""
+    """Tasks of all jobs as they become ready, those of the first jobs first; None while none is."""
     while any(schedules):
-        ready = [(i, step) for i, schedule in enumerate(schedules) if (step := schedule.next())]
-        for i, step in ready:
+        ready = ((i, step) for i, schedule in enumerate(schedules) if (step := schedule.next()))
+        i, step = next(ready, (0, None))
+        if step is None:
+            yield None
+        else:
             function, rest = (match_tile, ()) if step.wavefront is None else (trace_tile, step[1:])
             yield Task((i, step), function, (jobs[i], step.tile, *rest), jobs[i].config.cluster.retries)
-        if not ready:
-            yield None

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Cluster, Config, load_config
+from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
+from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image
@@ -91,7 +92,7 @@ def plan(
     SatIntervalsError
         The pair cannot be matched, or not even the smallest tile fits in the memory.
     """
-    config = load_config(config)
+    config = resolved(load_config(config))
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
     left, right = checked_pair(left, right, config)
     workers = workers or tiles_at_once(config.cluster)
@@ -129,18 +130,25 @@ def _handed_bytes(grid: Grid, config: Config) -> int:
     return (1 + config.matches_right_view) * (states + costs)
 
 
-def _traced(grid: Grid) -> int:
+def _traced(grid: Grid, whole: Window, config: Config) -> int:
     """Return the pixels of the tiles that hand on path states, summed over the wavefronts but the last.
 
     Tiles hand on the last one when they are matched. The tile in the corner where a wavefront ends hands nothing on.
     """
     ends = (grid.rows - 1, grid.columns - 1), (grid.rows - 1, 0), (0, 0)
-    corners = (grid.tile(*end).core for end in ends)
-    return len(ends) * grid.region.height * grid.region.width - sum(core.height * core.width for core in corners)
+    corners = sum(_path_pixels(grid.tile(*end).core, grid.region, whole, config) for end in ends)
+    return len(ends) * _work(grid, whole, config) - corners
 
 
-def _work(grid: Grid, config: Config) -> int:
+def _path_pixels(core: Window, region: Window, whole: Window, config: Config) -> int:
+    window = path_window(Frame(core, region, whole), config)
+    return window.height * window.width
+
+
+def _work(grid: Grid, whole: Window, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows behind its core."""
+    if config.tiles.overlap == "exact":
+        return _path_pixels(grid.region, grid.region, whole, config)
     overlap = config.tiles.margin
     total = 0
     for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
@@ -171,10 +179,12 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
         window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region)
     sample = Grid(window, one.tiles.size)
     pixels, sampled = (there.height * there.width for there in (grid.region, window))
-    work = _work(grid, config)
-    tiles = sum(seconds[f"tiles.{stage}"] for stage in ("read", "match", "write")) * work / _work(sample, one)
-    tiles += seconds.get("tiles.costs", 0.0) * pixels / sampled
-    paths = seconds.get("tiles.trace", 0.0) * _traced(grid) / max(1, _traced(sample))
+    whole = Window(0, 0, left.height, left.width)
+    work = _work(grid, whole, config)
+    of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "costs", "match", "write"))
+    tiles = of_tiles * work / _work(sample, whole, one)
+    traced = max(1, _traced(sample, whole, one))
+    paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
     files = (seconds["bands"] + seconds["files"]) * pixels / sampled
     images = seconds["tiles.images"]  # the sample already measures whole images
     parallel = (tiles + paths) / min(workers, len(grid))

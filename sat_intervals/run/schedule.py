@@ -1,15 +1,12 @@
 """Order of the steps of a job: tiles and, with exact seams, the borders that they take over from their neighbours."""
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from sat_intervals.kernels.sgm import WAVEFRONTS
+from sat_intervals.kernels.sgm import LAST, WAVEFRONTS
 from sat_intervals.match.borders import sources
 from sat_intervals.tiling import Grid, Tile
-
-# The wavefront whose states a tile also hands on when it is matched.
-LAST = len(WAVEFRONTS) - 1
 
 
 class Step(NamedTuple):
@@ -49,8 +46,10 @@ class Schedule:
     worker hardly ever traces them, many workers need not wait.
     """
 
-    def __init__(self, grid: Grid, tiles: Iterable[Tile], borders: set[str] | None, views: int = 1) -> None:
-        """``borders`` are the names of those that are done; None: tiles are independent of each other."""
+    def __init__(
+        self, grid: Grid, tiles: Iterable[Tile], is_done: Callable[[str], bool] | None, views: int = 1
+    ) -> None:
+        """``is_done`` tells by their names which borders are done; None: tiles are independent of each other."""
         self._views = views
         self._open: dict[Step, int] = {}  # number of unfinished steps that each needs
         self._dependents: dict[Step, list[Step]] = {}
@@ -59,15 +58,14 @@ class Schedule:
             step = waiting.pop()
             if step in self._open:
                 continue
-            needed = (
-                [] if borders is None else [other for other in needs(grid, step, views) if other.name not in borders]
-            )
+            others = needs(grid, step, views) if is_done else []
+            needed = [other for other in others if not (is_done and is_done(other.name))]
             self._open[step] = len(needed)
             for other in needed:
                 self._dependents.setdefault(other, []).append(step)
             waiting += needed
         self._taken: set[Step] = set()  # started, or given by a tile that is
-        self._gifts: dict[Step, list[Step]] = {}
+        self._also_done: dict[Step, list[Step]] = {}
         self._under_way = 0
         self._traces, self._tiles, self._last = deque[Step](), deque[Step](), deque[Step]()
         for step in sorted((step for step, count in self._open.items() if not count), key=_order):
@@ -99,13 +97,13 @@ class Schedule:
         self._under_way += 1
         if step.wavefront is None:
             borders = (Step(step.tile, LAST, mirrored) for mirrored in [False, True][: self._views])
-            self._gifts[step] = [border for border in borders if border in self._open and border not in self._taken]
-            self._taken.update(self._gifts[step])
+            self._also_done[step] = [border for border in borders if border in self._open and border not in self._taken]
+            self._taken.update(self._also_done[step])
 
     def ended(self, step: Step) -> None:
         """Note that a step has been done."""
         self._under_way -= 1
-        for done in (*self._gifts.pop(step, ()), step):
+        for done in (*self._also_done.pop(step, ()), step):
             del self._open[done]
             for other in self._dependents.pop(done, ()):
                 if other in self._open:  # else another step that it needs has failed
@@ -116,7 +114,7 @@ class Schedule:
     def failed(self, step: Step) -> None:
         """Note that a step cannot be done, nor those that need it; what a tile would have given is traced."""
         self._under_way -= 1
-        for border in self._gifts.pop(step, ()):
+        for border in self._also_done.pop(step, ()):
             self._taken.discard(border)
             self._last.append(border)
         lost = [step]

@@ -10,7 +10,7 @@ import numpy as np
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.cost import padded_to_lanes
-from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
+from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Ring
 from sat_intervals.match.borders import Border, Place, borders_of, trace_area
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
@@ -29,9 +29,9 @@ from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_views, read_window
 from sat_intervals.raster.identity import check_unchanged
 from sat_intervals.run.job import Job
-from sat_intervals.run.schedule import LAST, Step, needs
+from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
-from sat_intervals.store.steps import BORDERS, COSTS, read_step, write_step
+from sat_intervals.store.removal import BORDERS, COSTS
 from sat_intervals.tiling import Tile, Views, Window
 
 _LOG = logging.getLogger(__name__)
@@ -51,24 +51,22 @@ def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]])
 
 def match_tile(job: Job, tile: Tile) -> None:
     """Match one tile and write its intermediate products; runs on a worker."""
-    with _logged_failure(job, tile):
+    with _logged_failure(job, tile.name):
         _match_tile(job, tile)
 
 
 def trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[str, float]:
     """Write the path states that a tile hands on in a wavefront; return seconds by stage; runs on a worker."""
-    with _logged_failure(job, tile):
+    with _logged_failure(job, Step(tile, wavefront, mirrored).name):
         return _trace_tile(job, tile, wavefront, mirrored)
 
 
 @contextmanager
-def _logged_failure(job: Job, tile: Tile) -> Iterator[None]:
+def _logged_failure(job: Job, step: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        _LOG.info(
-            "tile %s failed; it is tried again at most %d times", tile.name, job.config.cluster.retries, exc_info=True
-        )
+        _LOG.info("tile %s failed; it is tried again at most %d times", step, job.config.cluster.retries, exc_info=True)
         if isinstance(error, SatIntervalsError):
             error.__cause__ = error.__context__ = None  # errors of GDAL cannot be pickled
         raise
@@ -79,7 +77,7 @@ def _match_tile(job: Job, tile: Tile) -> None:
     frame, borders = _frame(job, tile), None
     seconds: dict[str, float] = {}
     costed = _costs(job, patch_areas(*frame[:3], job.config), tile, seconds)
-    if job.config.hands_states_on:
+    if job.hands_states_on:
         with timed(seconds, "read"):
             frames = frames_of(*frame[:3], job.config)
             borders = [_borders(job, tile, of_view, range(len(WAVEFRONTS))) for of_view in frames]
@@ -88,9 +86,9 @@ def _match_tile(job: Job, tile: Tile) -> None:
         patch = match_costed(costed.views, frame, costed.made, job.config, borders)
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), costed.views, strict=True)}
     with timed(seconds, "write"):
-        if job.config.hands_states_on:
+        if job.hands_states_on:
             for mirrored, ring in enumerate(patch.leaving):
-                write_step(job.store.folder, job.store.run, BORDERS, Step(tile, LAST, bool(mirrored)).name, *ring)
+                job.store.write_step(BORDERS, Step(tile, LAST, bool(mirrored)).name, *ring)
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
@@ -105,9 +103,9 @@ def _trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[st
         (cost,) = _costs(job, [frame_area(frame, job.config)], tile, seconds).made
         borders = _borders(job, tile, frame, [wavefront])
         ring = trace_area(cost, borders, wavefront, mirrored, job.config)
-        write_step(job.store.folder, job.store.run, BORDERS, Step(tile, wavefront, mirrored).name, *ring)
+        job.store.write_step(BORDERS, Step(tile, wavefront, mirrored).name, *ring)
     costs = seconds.get("costs", 0.0)
-    return {"costs": costs, "trace": seconds["trace"] - costs}
+    return {"tiles.costs": costs, "tiles.trace": seconds["trace"] - costs}
 
 
 def _frame(job: Job, tile: Tile) -> Frame:
@@ -141,13 +139,13 @@ def _costs(job: Job, areas: Sequence[Area], tile: Tile, seconds: dict[str, float
     those of noisy images do not shrink.
     """
     views, statistics = _read(job, view_windows(areas, job.config), seconds)
-    if not (job.config.cost.precomputed and job.config.hands_states_on):
+    if not (job.config.cost.precomputed and job.hands_states_on):
         with timed(seconds, "match"):
             return _Costed(views, cost_areas(views, areas, job.config, statistics))
-    folder, size = job.store.folder, padded_to_lanes(job.config.disparity.count)
+    size = padded_to_lanes(job.config.disparity.count)
     names = [f"{tile.name}_right" if area.mirrored else tile.name for area in areas]
     with timed(seconds, "read"):
-        kept = [costs for name in names for costs in read_step(folder, job.store.run, COSTS, name) or ()]
+        kept = [costs for name in names for costs in job.store.read_step(COSTS, name) or ()]
     if len(kept) == len(names):
         made = [np.pad(costs, [(0, 0), (0, 0), (0, size - costs.shape[2])]) for costs in kept]
         with timed(seconds, "match"):
@@ -155,7 +153,7 @@ def _costs(job: Job, areas: Sequence[Area], tile: Tile, seconds: dict[str, float
     with timed(seconds, "costs"):
         costed = cost_areas(views, areas, job.config, statistics)
         for name, cost in zip(names, costed, strict=True):
-            write_step(folder, job.store.run, COSTS, name, cost.costs.left[:, :, : job.config.disparity.count])
+            job.store.write_step(COSTS, name, cost.costs.left[:, :, : job.config.disparity.count])
     return _Costed(views, costed)
 
 
@@ -164,7 +162,7 @@ def _borders(job: Job, tile: Tile, frame: Frame, wavefronts: Iterable[int]) -> B
     found: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
     for wavefront in wavefronts:
         for step in needs(job.store.grid, Step(tile, wavefront, frame.mirrored)):
-            states = read_step(job.store.folder, job.store.run, BORDERS, step.name)
+            states = job.store.read_step(BORDERS, step.name)
             if states is None:
                 raise RunError(
                     f"the path states of tile {step.tile.name} in {job.store.folder} are missing or damaged: rerun the "

@@ -48,7 +48,7 @@ class Curve(NamedTuple):
 
 
 def read_curve(results: Results, row: int, column: int) -> Curve:
-    """Match a pixel again with the run's overlap around it.
+    """Match a pixel again with the pixels around it that support it.
 
     SGM's aggregation reaches beyond the overlap, so the curve may differ slightly from that of the run.
 

@@ -3,20 +3,18 @@
 import io
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
 from sat_intervals.store.folder import Folder
-from sat_intervals.store.removal import BORDERS, COSTS
-
-__all__ = ["BORDERS", "COSTS", "read_step", "whole_steps", "write_step"]
 
 _CHECKSUM = struct.Struct("<I")
 
 
 def write_step(folder: Folder, run: str, kind: str, name: str, *arrays: np.ndarray) -> None:
-    """Write arrays as a whole; ``kind`` is BORDERS or COSTS, and ``run`` names the run that they belong to."""
+    """Write arrays as a whole; ``kind`` is their folder, BORDERS or COSTS, and ``run`` the run that they belong to."""
     content = io.BytesIO()
     content.write(_CHECKSUM.pack(0))
     for array in arrays:
@@ -48,7 +46,12 @@ def _checksum(payload: memoryview, *of: str) -> int:
     return zlib.crc32(payload, zlib.crc32("/".join(of).encode()))
 
 
-def whole_steps(folder: Folder, run: str, kind: str, names: Iterable[str]) -> set[str]:
-    """Which files were written and are not damaged; damaged ones are removed."""
+def intact_steps(folder: Folder, run: str, kind: str) -> Callable[[str], bool]:
+    """Return a function that tells whether a file was written and is not damaged; a damaged one is removed."""
     there = folder.inside(kind).sizes().keys()
-    return {name for name in names if name in there and read_step(folder, run, kind, name) is not None}
+
+    @cache
+    def is_intact(name: str) -> bool:
+        return name in there and read_step(folder, run, kind, name) is not None
+
+    return is_intact

@@ -35,6 +35,7 @@ from sat_intervals.store.removal import (
     final_name,
     is_of_run,
 )
+from sat_intervals.store.steps import read_step, write_step
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -222,6 +223,20 @@ class Store:
         self.folder.write(name, sealed(record, f"{self.run}/{tile.name}"))
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
             self.folder.delete(name)
+
+    def write_step(self, kind: str, name: str, *arrays: np.ndarray) -> None:
+        """Write what a step hands to later ones, see `steps.write_step`."""
+        write_step(self.folder, self.run, kind, name, *arrays)
+        if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
+            self.folder.delete(f"{kind}/{name}")
+
+    def read_step(self, kind: str, name: str) -> list[np.ndarray] | None:
+        """Read what `write_step` wrote; None if it is missing or damaged."""
+        return read_step(self.folder, self.run, kind, name)
+
+    def drop_costs(self) -> None:
+        """Delete precomputed costs, which nothing needs once all tiles are matched."""
+        self.folder.delete_all([f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes()], [COSTS])
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Write the statistics of the whole images, so that all tiles use the same."""

@@ -75,7 +75,7 @@ def measured(folder):
 
 def idle(grid, workers, trace, match):
     """Share of the workers' time without work; as in a run, two steps per worker are submitted."""
-    schedule, now, busy = Schedule(grid, grid, set()), 0.0, 0.0
+    schedule, now, busy = Schedule(grid, grid, set().__contains__), 0.0, 0.0
     queue, running, number = deque(), [], count()
     while schedule:
         while len(queue) + len(running) < 2 * workers and (step := schedule.next()) is not None:

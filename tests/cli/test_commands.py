@@ -159,6 +159,7 @@ def test_match__refuses_images_that_are_no_pair(folder, tmp_path, arguments, say
         (["--window", 0, 0, 0, 9], ["0 x 9 pixels: must be inside"]),
         (["--tile-size", 100], ["tiles.size is 100, allowed: integer >= 64, ", "multiple of 64"]),
         (["--overlap", 2], ["tiles.overlap is 2, allowed: >= 3 with cost.window 5"]),
+        (["--overlap", "exakt"], ["'exakt' is neither exact nor a number of pixels"]),
         (["--workers", 0], ["'--workers': 0 is not in the range x>=1"]),
         (["--workers", -2], ["'--workers': -2 is not in the range x>=1"]),
         (["--nodata", "none"], ["'--nodata': 'none' is not a valid float"]),
@@ -370,7 +371,9 @@ def test_debug__shows_stages_tiles_and_workers_and_what_dask_says(folder, tmp_pa
         assert [message for _, message in words if re.fullmatch(rf"stage {stage} ended after \d+\.\d s", message)]
     tiles = [f"{row}_{column}" for row in range(2) for column in range(3)]
     done = [message for name, message in words if name == "sat_intervals.run.pair"]
-    assert sorted(done) == [f"{tmp_path / 'out'}: tile {tile} done" for tile in tiles]
+    of_tiles = [message for message in done if re.search(r"tile \d_\d done$", message)]
+    assert sorted(of_tiles) == [f"{tmp_path / 'out'}: tile {tile} done" for tile in tiles]
+    assert len(done) >= 6 + 3 * 5  # three wavefronts, each without the tile where it ends
     took = [re.match(r"tile (\d_\d): read \d+\.\d\d s, match \d+\.\d\d s", message) for _, message in words]
     assert sorted(match[1] for match in took if match) == tiles
     joined = [message for name, message in words if re.fullmatch(r"worker \S+ joined", message)]

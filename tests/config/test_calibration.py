@@ -96,6 +96,14 @@ def test_calibration_of__refuses_one_of_other_settings(settings, difference) -> 
     )
 
 
+@pytest.mark.parametrize(("more", "difference"), [({"extra": None}, "extra"), ({"extra": {}}, "extra")])
+def test_calibration_of__names_an_edited_key(more, difference) -> None:
+    content = rising()
+    content["key"] = key_of(load_config(RANGE)) | more
+    with pytest.raises(ConfigError, match=f"belongs to other settings, {difference} is "):
+        resolved(load_config(RANGE, {"interval": {"coverage": 0.9, "calibration": content}}))
+
+
 def test_key_of__leaves_out_what_levels_do_not_depend_on() -> None:
     one = load_config(RANGE)
     other = load_config(

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals.config import load_config
+from sat_intervals.config.calibration import COVERAGES, Calibration
 from sat_intervals.match.calibration import (
     COUNTS,
     FIELDS,
@@ -22,6 +23,7 @@ from sat_intervals.match.calibration import (
     left_out,
     means,
     measure,
+    not_below,
     pooled,
 )
 
@@ -88,13 +90,28 @@ def test_choose__a_class_with_few_pixels_takes_the_level_of_the_other():
     pool = pooled([part([4] * 2000, [20] * 190)])
     choice = choose(pool, LEVELS, 0.9)
     assert choice.high == choice.low <= 4
-    assert choice.quantile is None
-    assert "190 pixels of low confidence, 200 are needed" in choice.notes[0]
+    assert choice.quantile == 0.9
+    assert choice.notes == ("190 pixels of low confidence, 200 are needed: the level of high confidence is used",)
     pool = pooled([part([4] * 900, [20] * 1200)])
     assert not choose(pool, LEVELS, 0.975).notes
     choice = choose(pool, LEVELS, 0.99)
-    assert choice.high == choice.low > 16
-    assert "900 pixels of high" in choice.notes[0]
+    assert choice.high > 16
+    assert choice.low > choose(pool, LEVELS, 0.975).low > 31  # its own
+    assert choice.notes == ("900 pixels of high confidence, 1000 are needed: the level of low confidence is used",)
+    both = choose(pooled([part([4] * 900, [20] * 900)]), LEVELS, 0.99)
+    assert both.high <= 4
+    assert [note.split()[:4] for note in both.notes] == [["900", "pixels", "of", name] for name in ("high", "low")]
+
+
+@pytest.mark.parametrize("pixels", [(300, 5000), (5000, 300)])
+def test_not_below__levels_of_a_class_with_few_pixels_do_not_fall(pixels):
+    random = np.random.default_rng(0)
+    pool = pooled([part(random.exponential(40, pixels[0]), random.exponential(8, pixels[1]))])
+    choice, chosen = None, []
+    for coverage in COVERAGES:
+        choice = not_below(choose(pool, LEVELS, coverage), choice)
+        chosen.append({"coverage": coverage, "high": choice.high, "low": choice.low, "quantile": choice.quantile})
+    Calibration.model_validate({"name": "few", "key": {}, "levels": chosen})
 
 
 def test_choose__says_what_no_level_reaches():

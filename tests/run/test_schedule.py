@@ -2,7 +2,8 @@
 
 import pytest
 
-from sat_intervals.run.schedule import LAST, Schedule, Step, needs
+from sat_intervals.kernels.sgm import LAST
+from sat_intervals.run.schedule import Schedule, Step, needs
 from sat_intervals.tiling import Grid, Window
 
 GRID = Grid(Window(10, 20, 4 * 64, 5 * 64 - 7), 64)
@@ -21,7 +22,9 @@ def in_turn(schedule):
 
 def test_schedule__draws_the_order_of_a_grid():
     # The turn in which each of 4 x 5 tiles hands on its states, by wavefront: from the four corners.
-    turns = {step: turn for turn, steps in enumerate(in_turn(Schedule(GRID, GRID, set()))) for step in steps}
+    turns = {
+        step: turn for turn, steps in enumerate(in_turn(Schedule(GRID, GRID, set().__contains__))) for step in steps
+    }
     drawn = [
         [[turns.get(Step(GRID.tile(row, column), wavefront)) for column in range(5)] for row in range(4)]
         for wavefront in range(4)
@@ -34,7 +37,7 @@ def test_schedule__draws_the_order_of_a_grid():
 
 
 def test_schedule__of_one_worker_leaves_the_last_wavefront_to_the_tiles():
-    schedule, done = Schedule(GRID, GRID, set(), views=2), []
+    schedule, done = Schedule(GRID, GRID, set().__contains__, views=2), []
     while (step := schedule.next()) is not None:
         done.append(step)
         schedule.ended(step)
@@ -47,7 +50,7 @@ def test_schedule__of_one_worker_leaves_the_last_wavefront_to_the_tiles():
 @pytest.mark.parametrize("borders", [set(), {"0_0_0", "1_1_2"}])
 def test_schedule__comes_after_what_it_needs_and_does_nothing_twice(borders):
     done = []
-    for steps in in_turn(Schedule(GRID, GRID, borders)):
+    for steps in in_turn(Schedule(GRID, GRID, borders.__contains__)):
         for step in steps:
             for other in needs(GRID, step):
                 is_given = other.wavefront == LAST and Step(other.tile) in done
@@ -60,13 +63,13 @@ def test_schedule__comes_after_what_it_needs_and_does_nothing_twice(borders):
 
 def test_schedule__of_one_tile_asks_for_its_neighbours_only_as_far_as_it_must():
     (corner,) = in_turn(
-        Schedule(GRID, [GRID.tile(0, 0)], {"0_1_3", "1_0_1", "0_1_1", "1_0_3", "1_0_2", "1_1_2", "0_1_2"})
+        Schedule(GRID, [GRID.tile(0, 0)], {"0_1_3", "1_0_1", "0_1_1", "1_0_3", "1_0_2", "1_1_2", "0_1_2"}.__contains__)
     )
     assert [step.name for step in corner] == ["0_0"]
 
 
 def test_schedule__drops_what_needs_a_failed_step():
-    schedule = Schedule(GRID, GRID, set())
+    schedule = Schedule(GRID, GRID, set().__contains__)
     while (step := schedule.next()) is not None:
         if step.name == "0_0_0":
             schedule.failed(step)
@@ -76,7 +79,7 @@ def test_schedule__drops_what_needs_a_failed_step():
 
 
 def test_schedule__traces_what_a_failed_tile_would_have_given():
-    schedule, failed = Schedule(GRID, GRID, set()), Step(GRID.tile(2, 2))
+    schedule, failed = Schedule(GRID, GRID, set().__contains__), Step(GRID.tile(2, 2))
     done = set()
     while (step := schedule.next()) is not None:
         if step == failed:

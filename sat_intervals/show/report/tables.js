@@ -122,6 +122,14 @@ function showTiles() {
     place.append(element("p", {}, `One tile of at most ${size} x ${size} pixels: no seams.`));
     return;
   }
+  if (seams === null) {
+    place.append(element("p", {},
+      `${grouped(rows * columns)} tiles of ${size} x ${size} pixels, which hand path states to their neighbours: no seams.`));
+    const grid = element("figure", { style: "max-width: 420px" });
+    place.append(grid);
+    drawing(grid, tilesHeight(420), "Grid of tiles", (width) => drawTiles(width, null));
+    return;
+  }
   place.append(element("p", {},
     `${grouped(rows * columns)} tiles of ${size} x ${size} pixels, read with an overlap of ${overlap} px. Adjacent tiles both match ` +
     `the pixels along their ${grouped(seams.borders)} common borders. Of these ${grouped(seams.pixels)} pixels, before filters, ` +
