@@ -16,7 +16,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo test test-all lint bench bench-seams tune calibration coverage pictures clean
 
 demo: $(VENV)/.has-plot
-	$(BIN)/sat-intervals demo demo-out --overwrite
+	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
 	$(BIN)/sat-intervals plot demo-out & $(BIN)/sat-intervals report demo-out && wait $$!
 	@echo 'Open demo-out/overview.png and demo-out/report.html'
 

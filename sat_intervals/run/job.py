@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -224,7 +225,7 @@ def _find(find: Search | None, left: Image, right: Image, files: dict[str, dict[
 def _origin(inputs: Mapping[str, Any]) -> str:
     """Return a digest of all that decides which search range is found."""
     images = {side: inputs[side] for side in ("left", "right")}
-    return digest({"version": version("sat-intervals"), "kernels": FINGERPRINT, "inputs": images})
+    return digest({"version": _version(), "kernels": FINGERPRINT, "inputs": images})
 
 
 def _found_before(home: Path, store: str | None, inputs: Mapping[str, Any]) -> Found | None:
@@ -233,11 +234,17 @@ def _found_before(home: Path, store: str | None, inputs: Mapping[str, Any]) -> F
     return Found.of_report(search["found"]) if search and search["found"] else None
 
 
+@cache
+def _version() -> str:
+    """Return the version of this package; reading it takes 2 ms, and each tile compares manifests."""
+    return version("sat-intervals")
+
+
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
     """Return all that decides the bytes of a tile."""
     return {
         **({"local_ranges": grid} if grid else {}),
-        "version": version("sat-intervals"),
+        "version": _version(),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,
         "settings": config.model_dump(mode="json", exclude=_NOT_OF_TILES),

@@ -25,7 +25,7 @@ from sat_intervals.run.search_range import find_here
 from sat_intervals.run.submit import reason
 from sat_intervals.tiling import Grid, Window
 
-# Side of the sample, a window at the centre of the image.
+# Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.
 SAMPLE = 512
 # Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each sub-pixel level),
 # strips of the final bands, files.
@@ -177,18 +177,21 @@ def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
 def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
     """Estimate the seconds of a run from a sample, and its extra work: tiles scaled by work, the rest by pixels."""
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
-    if config.hands_states_on:  # the sample needs seams
-        size = min(SAMPLE // 2, config.tiles.size)
+    shape = SAMPLE, SAMPLE
+    if config.hands_states_on:  # two tiles, since the sample needs a seam; whole ones, since each takes time of its own
+        size = min(SAMPLE if config.cost.precomputed else 2 * SAMPLE, config.tiles.size)
         one = one.model_copy(update={"tiles": config.tiles.model_copy(update={"size": size})})
+        shape = size, 2 * size
     with tempfile.TemporaryDirectory() as folder:
-        window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region)
+        window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region, shape)
     sample = Grid(window, one.tiles.size)
     pixels, sampled = (there.height * there.width for there in (grid.region, window))
     whole = Window(0, 0, left.height, left.width)
     work = _work(grid, whole, config)
     of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "costs", "match", "write"))
     tiles = of_tiles * work / _work(sample, whole, one)
-    traced = max(1, _traced(sample, whole, one))
+    # Of two tiles the first one's states of the last wavefront are traced, too: no tile is ready before.
+    traced = max(1, 4 * _traced(sample, whole, one) // 3)
     paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
     files = (seconds["bands"] + seconds["files"]) * pixels / sampled
     images = seconds["tiles.images"]  # the sample already measures whole images
@@ -197,9 +200,11 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     return float(seconds["start"] + seconds["kernels"] + images + parallel + files), extra
 
 
-def _sampled(left: Image, right: Image, out: Path, config: Config, region: Window) -> tuple[Window, dict[str, float]]:
+def _sampled(
+    left: Image, right: Image, out: Path, config: Config, region: Window, shape: tuple[int, int]
+) -> tuple[Window, dict[str, float]]:
     """Match a sample at the centre, or elsewhere if that has no data; return its window and the seconds."""
-    height, width = min(SAMPLE, region.height), min(SAMPLE, region.width)
+    height, width = min(shape[0], region.height), min(shape[1], region.width)
     for share in (0.5, 0.25, 0.75, 0.0, 1.0):
         row = region.row + round(share * (region.height - height))
         column = region.column + round(share * (region.width - width))
