@@ -17,7 +17,7 @@ from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.config.weights import weights_file
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.in_memory import _view
+from sat_intervals.match.whole import _view
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
