@@ -25,6 +25,7 @@ from sat_intervals.cli.match import match
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
+from sat_intervals.cli.range import search_range
 from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
@@ -146,6 +147,7 @@ main.add_command(match)
 main.add_command(config)
 main.add_command(demo)
 main.add_command(batch)
+main.add_command(search_range)
 main.add_command(plan)
 main.add_command(status)
 main.add_command(plot)

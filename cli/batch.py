@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import path, run_options, settings_options
+from sat_intervals.cli.options import check_strict, path, run_options, settings_options
 
 
 @click.command(short_help="Match many pairs; a rerun does what is missing.")
@@ -20,12 +20,14 @@ def batch(
     given: dict[str, Any],
     keep_tiles: bool,
     overwrite: bool,
+    strict: bool,
     quiet: bool,
 ) -> None:
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
-    Columns: name, left, right, minimum, maximum, left_mask, right_mask, and any setting such as sgm.p2. A failed pair
-    does not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if any failed.
+    Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
+    sgm.p2. A failed pair does not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if
+    any failed.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.config.pairs import REPORT, read_batch
@@ -54,3 +56,4 @@ def batch(
         raise RunError(
             f"{len(failed)} of {len(report)} pairs failed; rerun the same command: it does what is missing:\n{lines}"
         )
+    check_strict(strict, [line for end in report.values() for line in end.get("warnings", ())])

@@ -17,6 +17,7 @@ STAGES = {
     "pairs.files": "writing files of pairs",
     "subjects": "measuring pairs",
     "kernels": "preparing kernels (compiled once per machine, then about a second)",
+    "range": "finding the search range",
     "images": "measuring images",
     "tiles": "matching tiles",
     "bands": "postprocessing rows",
@@ -102,6 +103,10 @@ class Console:
         table.add_column(style="bold")
         table.add_column(justify="right")
         pixels = counts["pixels"]
+        if report.get("search") and report["requested"]["disparity"]["minimum"] == "auto":
+            table.add_row("search range, found", f"{report['search']['minimum']} to {report['search']['maximum']} px")
+        if report.get("local_ranges"):
+            table.add_row("local ranges, of the whole", f"{100 * report['local_ranges']['share']:.0f} %")
         table.add_row("valid pixels", _share(counts["valid"], pixels))
         for flag, count in counts["causes"].items():
             if count:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import path, run_options, settings_options, with_range
+from sat_intervals.cli.options import check_strict, path, run_options, settings_options, with_range
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -27,6 +27,7 @@ def demo(
     seed: int,
     config_file: Path | None,
     given: dict[str, Any],
+    strict: bool,
     quiet: bool,
     **run: Any,
 ) -> None:
@@ -54,7 +55,7 @@ def demo(
     with Console(quiet) as console, put_back(layers if overwrite else (), out / "run.json"):
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed)
-        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum), config_file))
+        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum)))
         check_not_replaced([config_file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         nodata = 0, 0, float("nan")
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
@@ -70,6 +71,7 @@ def demo(
         )
         if not quiet:
             _compare(config, out, figures, console)
+    check_strict(strict, report["warnings"])
 
 
 def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Console") -> None:

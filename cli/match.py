@@ -1,4 +1,4 @@
-"""``sat-intervals match``: match two epipolar GeoTIFFs over a search range."""
+"""``sat-intervals match``: match two epipolar GeoTIFFs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.options import (
+    check_strict,
     disparity_option,
+    grid_option,
     image_options,
+    local_option,
     named,
     path,
     run_options,
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 @click.argument("right", callback=named)
 @click.argument("out", callback=path)
 @disparity_option
+@local_option
+@grid_option
 @image_options
 @click.option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
 @settings_options
@@ -35,6 +40,8 @@ def match(
     right: str,
     out: Path,
     disparity: tuple[int, int] | None,
+    local_range: bool,
+    range_grid: str | None,
     open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     dry_run: bool,
@@ -42,21 +49,23 @@ def match(
     given: dict[str, Any],
     keep_tiles: bool,
     overwrite: bool,
+    strict: bool,
     quiet: bool,
 ) -> None:
-    """Match the epipolar images LEFT and RIGHT over a search range and write to the folder OUT.
+    """Match the epipolar images LEFT and RIGHT and write to the folder OUT.
 
     \b
     OUT/intervals.tif   disparity, lower and upper bound (pixels), confidence
     OUT/validity.tif    flags: why a pixel is invalid, how it was processed
     OUT/run.json        settings, inputs, statistics
 
-    The disparity is x_right - x_left. To resume an interrupted run, rerun the same command.
+    The disparity is x_right - x_left; its search range is found unless it is given. To resume an interrupted run,
+    rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
 
-    config = load_config(config_file, with_range(given, disparity, config_file))
+    config = load_config(config_file, with_range(given, disparity, local_range, range_grid))
     if dry_run:
         from sat_intervals.run.batch_system import job_script
 
@@ -78,3 +87,4 @@ def match(
             progress=console.progress,
         )
     console.summary(report, out)
+    check_strict(strict, report["warnings"])

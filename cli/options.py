@@ -1,6 +1,6 @@
 """Options shared by commands, and checks of file names."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,8 +46,18 @@ cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching co
 store_option = click.option(
     "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles during the run."
 )
+local_option = click.option(
+    "--local-range", is_flag=True, help="Search a range of its own in each cell of the image, found from the images."
+)
+grid_option = click.option(
+    "--range-grid", callback=named, metavar="FILE", help="Raster of two bands, minimum and maximum of each pixel."
+)
 disparity_option = click.option(
-    "--disparity", type=int, nargs=2, metavar="MIN MAX", help="Search range in pixels, both ends searched."
+    "--disparity",
+    type=int,
+    nargs=2,
+    metavar="MIN MAX",
+    help="Search range in pixels, both ends searched; default: found from the images.",
 )
 
 
@@ -174,6 +184,7 @@ def run_options(command: Command) -> Command:
     """Add options of commands that match pairs."""
     return _with(
         command,
+        click.option("--strict", is_flag=True, help="End with status 1 if the run warns, as of a narrow search range."),
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
         click.option("--overwrite", is_flag=True, help="Replace the run in OUT and delete its tiles."),
         quiet_option,
@@ -196,13 +207,31 @@ def log_options(command: Command) -> Command:
     )
 
 
-def with_range(given: dict[str, Any], disparity: tuple[int, int] | None, config_file: Path | None) -> dict[str, Any]:
-    """Add the search range of the command line to its sections; without one, a file of settings must have it."""
-    if disparity is not None:
-        return {**given, "disparity": dict(zip(("minimum", "maximum"), disparity, strict=True))}
-    if config_file is None:
-        raise click.UsageError("Missing search range: give --disparity MIN MAX, or --config with a file that has it.")
-    return given
+def with_range(
+    given: dict[str, Any], disparity: tuple[int, int] | None, local_range: bool = False, range_grid: str | None = None
+) -> dict[str, Any]:
+    """Add the search range and the local ranges of the command line to its sections."""
+    section: dict[str, Any] = dict(zip(("minimum", "maximum"), disparity or (), strict=False))
+    if local_range:
+        section["local"] = True
+    if range_grid is not None:
+        section["grid"] = range_grid
+    return {**given, "disparity": section} if section else given
+
+
+def check_strict(strict: bool, warnings: Sequence[str]) -> None:
+    """Raise if a run has warned and must not.
+
+    Raises
+    ------
+    RunError
+        With the number of warnings; their lines have been printed.
+    """
+    if strict and warnings:
+        from sat_intervals.errors import RunError
+
+        count = "1 warning" if len(warnings) == 1 else f"{len(warnings)} warnings"
+        raise RunError(f"{count}, see above, and --strict is given; the files are written")
 
 
 def _with(command: Command, *options: Callable[[Command], Command]) -> Command:

@@ -7,7 +7,9 @@ import click
 
 from sat_intervals.cli.options import (
     disparity_option,
+    grid_option,
     image_options,
+    local_option,
     log_options,
     named,
     settings_options,
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 @click.argument("left", callback=named)
 @click.argument("right", callback=named)
 @disparity_option
+@local_option
+@grid_option
 @image_options
 @click.option(
     "--memory", metavar="SIZE", help="Memory of a worker, such as 4GB: tiles are made smaller until one fits."
@@ -36,6 +40,8 @@ def plan(
     left: str,
     right: str,
     disparity: tuple[int, int] | None,
+    local_range: bool,
+    range_grid: str | None,
     open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     memory: str | None,
@@ -51,7 +57,7 @@ def plan(
     from sat_intervals.run.cluster import parse_memory
     from sat_intervals.run.plan import plan as make_plan
 
-    config = load_config(config_file, with_range(given, disparity, config_file))
+    config = load_config(config_file, with_range(given, disparity, local_range, range_grid))
     limit = parse_memory(memory) if memory else None
     with Console(quiet=False) as console:
         made = make_plan(*open_images(left, right), config, window=window, memory=limit, progress=console.progress)

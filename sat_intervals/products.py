@@ -30,6 +30,10 @@ RIGHT_MASKED = 1 << 7
 OCCLUSION = 1 << 8
 MISMATCH = 1 << 9
 REGULARIZED = 1 << 11
+# Beyond Pandora's 0 to 12.
+RANGE_END = 1 << 13
+OPEN_BELOW = 1 << 14
+OPEN_ABOVE = 1 << 15
 
 REJECTED = OCCLUSION | MISMATCH
 UNMATCHED = LEFT_WINDOW | NO_CANDIDATE | LEFT_MASKED | RIGHT_MASKED
@@ -61,6 +65,9 @@ FLAGS = (
     Flag(8, "occlusion", "rejected by cross-checking: occlusion", True),
     Flag(9, "mismatch", "rejected by cross-checking: mismatch", True),
     Flag(11, "regularized", "interval regularised in a low-confidence area", False),
+    Flag(13, "range_end", "best candidate at an end of the search range, or next to it", False),
+    Flag(14, "open_below", "interval open below: the disparity may lie before the search range", False),
+    Flag(15, "open_above", "interval open above: the disparity may lie behind the search range", False),
 )
 
 

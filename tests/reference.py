@@ -29,6 +29,9 @@ from sat_intervals.products import (
     NO_DISPARITY,
     NOT_REFINED,
     OCCLUSION,
+    OPEN_ABOVE,
+    OPEN_BELOW,
+    RANGE_END,
     RANGE_INCOMPLETE,
     REGULARIZED,
     REJECTED,
@@ -537,6 +540,10 @@ def match_arrays(left, right, left_state, right_state, config):
             lower[untextured], upper[untextured] = minimum, maximum
             of_levels.append((lower, upper))
         lower, upper = of_levels[0]
+    count = maximum - minimum + 1
+    below, above = (searched & ~untextured & end for end in (winner <= 1, winner >= count - 2))
+    if count > 8:
+        flags[below | above] |= RANGE_END
     raw = SimpleNamespace(volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags)
 
     flags = flags.copy()
@@ -550,6 +557,11 @@ def match_arrays(left, right, left_state, right_state, config):
         amounts = ambiguity(volume, config.ambiguity.eta_max, config.ambiguity.eta_step, cost_span)
         amounts[untextured] = len(etas(config.ambiguity.eta_max, config.ambiguity.eta_step)) * config.disparity.count
         confidence = normalize(amounts, searched, *percentiles_of(amounts, searched, config))
+    has_coverage = config.interval is not None and config.interval.coverage is not None
+    if (config.disparity.open_ends or has_coverage) and count > 8:
+        confidence[below | above] = 0
+        flags[below] |= OPEN_BELOW
+        flags[above] |= OPEN_ABOVE
 
     if config.regularization is not None:
         low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)

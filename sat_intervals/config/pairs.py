@@ -26,6 +26,7 @@ _RESERVED = (REPORT, "logs")
 # Bytes of a pair's name: a folder's name has at most 255, and a store adds a digest.
 _LONGEST_NAME = 200
 _IMAGES = ("left", "right", "left_mask", "right_mask")
+_READING = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
 # YAML nodes allowed in a list of pairs, which may have thousands of rows.
 _NODES = 200_000
 
@@ -50,7 +51,11 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairOfBatch:
-    """One row of a batch: name, images, and the pair's own settings as nested sections."""
+    """One row of a batch: name, images, and the pair's own settings as nested sections.
+
+    ``reading`` may have ``nodata`` and ``band`` for both images, ``left_nodata`` and so on for one; ``window`` is the
+    region of the left image to match: row, column, height, width.
+    """
 
     name: str
     left: str
@@ -58,6 +63,8 @@ class PairOfBatch:
     left_mask: str | None = None
     right_mask: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    reading: Mapping[str, Any] = field(default_factory=dict)
+    window: tuple[int, int, int, int] | None = None
 
 
 def is_pair(path: Path) -> bool:
@@ -91,8 +98,9 @@ def read_batch(file: Path) -> list[PairOfBatch]:
     """Read the pairs of a batch from a CSV, YAML or JSON file.
 
     A row has ``name``, ``left`` and ``right``; ``minimum`` and ``maximum``, the search range; ``left_mask`` and
-    ``right_mask``; and any setting under its dotted name, such as ``sgm.p2``. YAML and JSON hold a list of such rows,
-    in which a setting may also be a section. Paths are relative to the file.
+    ``right_mask``; ``nodata`` and ``band``, or ``left_nodata`` and so on; ``window``; and any setting under its dotted
+    name, such as ``sgm.p2``. YAML and JSON hold a list of such rows, in which a setting may also be a section. Paths
+    are relative to the file.
 
     Raises
     ------
@@ -188,13 +196,35 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
             f"{place}: name {name!r} cannot be a folder's name: choose another of at most {_LONGEST_NAME} bytes"
         )
     images = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
+    reading = {key: _number(place, key, row.pop(key)) for key in _READING if key in row}
+    window = _window(place, row.pop("window")) if "window" in row else None
     settings: dict[str, Any] = {}
     for key, value in row.items():
         try:
             _set(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
         except (ValueError, RecursionError, yaml.YAMLError) as error:
             raise SatIntervalsError(f"{place}: {key} is {value!r}: {' '.join(str(error).split())}") from error
-    return PairOfBatch(name, settings=settings, **images)
+    return PairOfBatch(name, settings=settings, reading=reading, window=window, **images)
+
+
+def _number(place: str, key: str, value: Any) -> int | float:
+    """Return the number of a band or a no-data value, which is a number or the text of one."""
+    kind, needed = (int, "an integer") if key.endswith("band") else (float, "a number")
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        return kind(value)
+    except (TypeError, ValueError) as error:
+        raise SatIntervalsError(f"{place}: {key} is {value!r}, needed: {needed}") from error
+
+
+def _window(place: str, value: Any) -> tuple[int, int, int, int]:
+    """Return the window of a list of four integers, or of text with them."""
+    try:
+        row, column, height, width = (int(part) for part in (value.split() if isinstance(value, str) else value))
+    except (TypeError, ValueError) as error:
+        raise SatIntervalsError(f"{place}: window is {value!r}, needed: row, column, height and width") from error
+    return row, column, height, width
 
 
 def _set(settings: dict[str, Any], key: str, value: Any) -> None:

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from decimal import Decimal
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -43,7 +43,12 @@ Odd = Annotated[int, AfterValidator(check_odd)]
 # A number whose thresholds must be exact; a plain number in JSON, so that settings of a run can be read back.
 Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(float, when_used="json")]
 # Disparities are stored as int16; within this limit the difference of any two also fits.
-Pixels = Annotated[int, Field(ge=-16000, le=16000)]
+# The engine and so mypy only see numbers: auto is replaced before a pair is matched, see `Disparity.is_auto`.
+AUTO: Any = "auto"
+if TYPE_CHECKING:
+    Pixels = int
+else:
+    Pixels = Annotated[int, Field(ge=-16000, le=16000)] | Literal["auto"]
 
 
 class Section(BaseModel):
@@ -62,8 +67,33 @@ class Section(BaseModel):
 class Disparity(Section):
     """Search range; both ends are searched."""
 
-    minimum: Pixels = Field(description="smallest disparity searched, in pixels")
-    maximum: Pixels = Field(description="largest disparity searched, in pixels")
+    minimum: Pixels = Field(AUTO, description="smallest disparity searched, in pixels; auto: found from the images")
+    maximum: Pixels = Field(AUTO, description="largest disparity searched, in pixels; auto: found from the images")
+
+    open_ends: bool = Field(
+        False,
+        description="confidence 0 and open intervals at the ends of the range, as where it is found or with a coverage",
+    )
+
+    local: bool = Field(False, description="search a range of its own in each cell of the image, found from the images")
+    grid: str | None = Field(
+        None, description="raster of two bands, minimum and maximum, for local ranges; null: found from the images"
+    )
+
+    @field_validator("grid")
+    @classmethod
+    def _make_absolute(cls, value: str | None) -> str | None:
+        return None if value is None else os.path.abspath(value)
+
+    @property
+    def is_local(self) -> bool:
+        """Return whether cells have ranges of their own."""
+        return self.local or self.grid is not None
+
+    @property
+    def is_auto(self) -> bool:
+        """Return whether the range is to be found from the images."""
+        return isinstance(self.minimum, str)
 
     @property
     def count(self) -> int:
@@ -93,7 +123,9 @@ class Disparity(Section):
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        if self.minimum > self.maximum:
+        if isinstance(self.minimum, str) != isinstance(self.maximum, str):
+            raise ValueError(f"minimum is {self.minimum}, maximum is {self.maximum}: give two numbers, or auto twice")
+        if not self.is_auto and self.minimum > self.maximum:
             raise ValueError(f"minimum {self.minimum} is above maximum {self.maximum}, swap them")
         return self
 

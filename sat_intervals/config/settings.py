@@ -37,7 +37,7 @@ class Config(Section):
     """All settings of a run; None in place of a section switches its step off."""
 
     preset: Literal[PRESETS] = Field(PRESETS[0], description="settings for keys that are left out")  # type: ignore[valid-type]
-    disparity: Disparity
+    disparity: Disparity = Disparity()
     cost: Census | Mccnn = Field(Census(), discriminator="method")
     sgm: AnySgm | None = Sgm()
     ambiguity: Ambiguity | None = Ambiguity()
@@ -85,6 +85,10 @@ class Config(Section):
                 f"regularization needs {' and '.join(off)}, set to null: give {' and '.join(off)} or set "
                 "regularization to null too"
             )
+        if self.disparity.is_local and self.cross_check and self.cross_check.method == "accurate":
+            raise ValueError(
+                "disparity has local ranges, which cross_check.method accurate does not know: use fast, or one range"
+            )
         # Neighbouring tiles are compared on a ring of one pixel around the core, which needs complete windows.
         smallest = self.cost.window // 2 + 1
         if self.tiles.overlap != "exact" and self.tiles.overlap < smallest:
@@ -110,7 +114,7 @@ class Config(Section):
                 f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
             )
         is_raw = isinstance(sgm, MccnnSgm) and sgm.gradients == "raw"
-        if is_raw and not self.disparity.minimum <= 0 <= self.disparity.maximum:
+        if is_raw and not self.disparity.is_auto and not self.disparity.minimum <= 0 <= self.disparity.maximum:
             raise ValueError("sgm.gradients raw reads the right image at disparity 0: search a range with 0")
 
     @property
@@ -130,6 +134,11 @@ class Config(Section):
     def hands_states_on(self) -> bool:
         """Return whether tiles hand path states of SGM to their neighbours."""
         return self.tiles.overlap == "exact" and self.sgm is not None
+
+    @property
+    def opens_ends(self) -> bool:
+        """Return whether intervals at the ends of the search range are open, with confidence 0."""
+        return self.disparity.open_ends or (self.interval is not None and self.interval.coverage is not None)
 
     @property
     def largest_p2(self) -> int:

@@ -62,7 +62,7 @@ def _name(kind: type[Section]) -> tuple[str, str]:
 def explained(problem: ErrorDetails) -> str:
     """Describe one problem of settings: the key, its value and the allowed values."""
     path = [str(key) for key in problem["loc"]]
-    if path[:1] == ["tiles"]:
+    if path[:1] in (["tiles"], ["disparity"]):
         del path[2:]  # pydantic adds the kind
     while len(path) > 1 and path[-1].isdecimal():
         path.pop()  # an index into a list

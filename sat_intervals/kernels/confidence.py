@@ -10,14 +10,14 @@ from sat_intervals.products import IMPOSSIBLE_COST
 
 
 @inlined
-def ambiguity(curve, count, lowest, weights):
+def ambiguity(curve, first, stop, lowest, weights):
     """Ambiguity of one pixel: the number of disparities that cost at most ``lowest + eta * span``, summed over etas.
 
-    ``curve`` is uint16. ``weights[x]``, uint16, is the number of etas that count a cost ``x`` above the lowest. An
-    impossible candidate counts for every eta.
+    ``curve`` is uint16; the candidates ``first .. stop - 1`` count. ``weights[x]``, uint16, is the number of etas that
+    count a cost ``x`` above the lowest. An impossible candidate counts for every eta.
     """
     total = 0
-    for k in range(count):
+    for k in range(first, stop):
         if curve[k] == IMPOSSIBLE_COST:
             total += weights[0]
         else:

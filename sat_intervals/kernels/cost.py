@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.kernels.compiled import cached, inlined
+from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, load_bytes, store
 
 
@@ -161,19 +161,66 @@ class Candidates(NamedTuple):
     barrier
         ``(columns + size,)`` uint16: ``barrier[c + k]`` is the cost of an impossible candidate, or 0.
     beyond
-        ``(size,)`` uint16: 0 in the search range, above every cost in the lanes behind it.
+        ``(cells, size)`` uint16: 0 in the search range of a cell, above every cost before and behind it.
+    walls
+        ``(columns,)`` int64: where the row of ``beyond`` that applies to each pixel begins in ``beyond.ravel()``.
     """
 
     costs: Costs
     barrier: np.ndarray
     beyond: np.ndarray
+    walls: np.ndarray
+
+
+class Cells(NamedTuple):
+    """Search ranges of the cells of a patch.
+
+    Attributes
+    ----------
+    first, last
+        ``(rows, columns)`` int64: first and last candidate k of each cell.
+    height, width
+        Pixels of a cell.
+    row, column
+        First pixel of the patch, counted from the first pixel of the first cell.
+    """
+
+    first: np.ndarray
+    last: np.ndarray
+    height: int
+    width: int
+    row: int
+    column: int
+
+
+def one_cell(rows: int, columns: int, count: int) -> Cells:
+    """Cells of a patch of which every pixel has all ``count`` candidates."""
+    return Cells(np.zeros((1, 1), np.int64), np.full((1, 1), count - 1, np.int64), rows, columns, 0, 0)
+
+
+class Ranges(NamedTuple):
+    """Search range of each pixel of a row: first and last candidate, ``(columns,)`` int64."""
+
+    first: np.ndarray
+    last: np.ndarray
+
+
+@part
+def enter_cells(candidates, cells, ranges, r):
+    """Set the search ranges of the pixels of a row, and where their walls are."""
+    i, number = (r + cells.row) // cells.height, cells.first.shape[1]
+    for j in range(number):
+        start, stop = max(0, j * cells.width - cells.column), (j + 1) * cells.width - cells.column
+        ranges.first[start:stop] = cells.first[i, j]
+        ranges.last[start:stop] = cells.last[i, j]
+        candidates.walls[start:stop] = (i * number + j) * candidates.beyond.shape[1]
 
 
 @inlined
 def candidate_costs(candidates, r, c, k):
-    """Costs of the candidates ``k .. k + 31`` of a pixel, raised where they are impossible."""
+    """Costs of the candidates ``k .. k + 31`` of a pixel, raised where they are impossible or not searched."""
     costs = _matching_costs(candidates.costs.left, candidates.costs.right, r, c, k)
-    return larger(larger(costs, load(candidates.barrier, c + k)), load(candidates.beyond, k))
+    return larger(larger(costs, load(candidates.barrier, c + k)), load(candidates.beyond, candidates.walls[c] + k))
 
 
 @inlined

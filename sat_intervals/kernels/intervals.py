@@ -78,11 +78,14 @@ def _whole_cuts(curve, one, other):
 
 @inlined
 def _subpixel_cut(curve, limit, cut, winner, settings):
-    """Bounds in steps where the curve crosses ``limit`` outside the whole cut, widened to hold ``winner``."""
-    first, last = cut
+    """Bounds in steps where the curve crosses ``limit`` outside the whole cut, widened to hold ``winner``.
+
+    They count from the first disparity of the whole search range, of which this curve may be a part.
+    """
+    (first, last), origin = cut, settings.offset * settings.steps
     lower = first * settings.steps - _crossing(curve, first, first - 1, limit, settings)
     upper = last * settings.steps + _crossing(curve, last, last + 1, limit, settings)
-    return min(lower, np.int64(winner)), max(upper, _ceil(winner))
+    return origin + min(lower, np.int64(winner)), origin + max(upper, _ceil(winner))
 
 
 @inlined

@@ -11,20 +11,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.kernels.compiled import cached, inlined, part
-from sat_intervals.kernels.cost import Candidates, Costs, cost_curve, padded_to_lanes
+from sat_intervals.kernels.compiled import cached, part
+from sat_intervals.kernels.cost import (
+    Candidates,
+    Cells,
+    Costs,
+    Ranges,
+    cost_curve,
+    enter_cells,
+    one_cell,
+    padded_to_lanes,
+)
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
 from sat_intervals.kernels.reading import (
     Rectangle,
     RightPixels,
     close_impossible,
+    columns_of,
     contains,
     read_curve,
+    rectangle_of,
     search_flags,
     update_right,
 )
 from sat_intervals.kernels.sgm import (
-    LAST,
+    LAST_WAVE,
     WALL,
     WAVEFRONTS,
     Borders,
@@ -41,14 +52,8 @@ from sat_intervals.kernels.sgm import (
     restart,
     take_over,
 )
-from sat_intervals.products import (
-    IMPOSSIBLE_COST,
-    NO_DISPARITY,
-    NOT_REFINED,
-)
+from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY, NOT_REFINED
 from sat_intervals.tiling import Window
-
-_LAST_WAVE = WAVEFRONTS[LAST][1]
 
 
 class Settings(NamedTuple):
@@ -71,6 +76,9 @@ class Settings(NamedTuple):
         uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine
         Whether winners are refined, and bounds extended by one for it.
+    offset, total
+        First disparity, and number of disparities, of the whole search range that this one is a part of: ``minimum -
+        offset`` is the first. 0: this is the whole range.
     """
 
     minimum: int
@@ -85,6 +93,8 @@ class Settings(NamedTuple):
     high: float = -1.0
     low: float = -1.0
     steps: int = 0
+    offset: int = 0
+    total: int = 0
 
 
 class Raw(NamedTuple):
@@ -94,7 +104,7 @@ class Raw(NamedTuple):
     ----------
     winner, lower, upper
         int16 disparities in pixels, NO_DISPARITY for none. Sub-pixel bounds are uint16, in steps above the first
-        disparity, without meaning where there is no winner.
+        disparity of the whole search range, without meaning where there is no winner.
     disparity
         float32 refined disparity in pixels, NaN for none.
     cost
@@ -161,6 +171,10 @@ class _Buffers(NamedTuple):
 
     Attributes
     ----------
+    ranges
+        Those of the pixels of the row.
+    usable
+        ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
     possible
         ``(columns,)`` int64: number of possible candidates of each pixel of the row.
     curve
@@ -176,6 +190,9 @@ class _Buffers(NamedTuple):
     """
 
     candidates: Candidates
+    cells: Cells
+    ranges: Ranges
+    usable: np.ndarray
     possible: np.ndarray
     penalties: Penalties
     paths: Paths
@@ -186,26 +203,30 @@ class _Buffers(NamedTuple):
     down: bool
 
 
-def _rectangle(window: Window) -> Rectangle:
-    return Rectangle(window.row, window.column, window.row_stop, window.column_stop)
-
-
 def _prepare(
-    costs: Costs, gradients: Gradients | None, settings: Settings, borders: Borders | None, down: bool = True
+    costs: Costs,
+    gradients: Gradients | None,
+    settings: Settings,
+    borders: Borders | None,
+    cells: Cells | None,
+    down: bool = True,
 ) -> _Buffers:
-    columns, size = costs.left_state.shape[1], padded_to_lanes(settings.count)
+    (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
     left = borders.inside if borders else Window(0, 0, 0, 0)
-    inside, rings = borders or no_borders(Window(0, 0, *costs.left_state.shape), size)
-    beyond = np.zeros(size, np.uint16)
-    beyond[settings.count :] = WALL
-    slots = 1 + 3 * columns
+    inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
+    cells = cells or one_cell(rows, columns, settings.count)
+    k, slots = np.arange(size), 1 + 3 * columns
+    walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
     return _Buffers(
-        Candidates(costs, np.zeros(columns + size, np.uint16), beyond),
+        Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
+        cells,
+        Ranges(np.zeros(columns, np.int64), np.zeros(columns, np.int64)),
+        np.zeros(columns + settings.count, np.int64),
         np.zeros(columns, np.int64),
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
         Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
         np.zeros(size, np.uint16),
-        _rectangle(inside),
+        rectangle_of(inside),
         rings[:2] if down else rings[2:],
         Ring(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
         down,
@@ -218,16 +239,15 @@ def _enter_row(buffers, gradients, settings, r):
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    (costs, barrier, _), possible, penalties, paths, _, inside, rings, _, down = buffers
+    candidates, cells, ranges, usable, possible, penalties, paths, _, inside, rings, _, down = buffers
+    costs, barrier = candidates.costs, candidates.barrier
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
-    usable = 0
-    for x in range(settings.count - 1):
-        usable += costs.right_state[r, x] == 0
+        usable[x + 1] = usable[x] + (costs.right_state[r, x] == 0)
+    enter_cells(candidates, cells, ranges, r)
     for c in range(possible.size):
-        usable += costs.right_state[r, c + settings.count - 1] == 0
-        possible[c] = usable if costs.left_state[r, c] == 0 else 0
-        usable -= costs.right_state[r, c] == 0
+        inner = usable[c + ranges.last[c] + 1] - usable[c + ranges.first[c]]
+        possible[c] = inner if costs.left_state[r, c] == 0 else 0
     falling, rising = -r % possible.size, r % possible.size
     enter_row(paths, possible.size, falling, rising, down)
     take_over(paths, rings, inside, r, falling, rising, down)
@@ -235,23 +255,15 @@ def _enter_row(buffers, gradients, settings, r):
     return falling, rising
 
 
-@inlined
-def _columns(inside, r, down):
-    """Columns of row ``r`` that lie inside, in the order of the sweep."""
-    if not inside.row <= r < inside.row_stop:
-        return range(0, 0, 1)
-    return range(inside.column, inside.column_stop, 1) if down else range(inside.column_stop - 1, inside.column - 1, -1)
-
-
 @cached
 def _trace(buffers, gradients, settings, wave):
     """Advance the paths of one wave through a patch and copy the states that leave it."""
-    candidates, possible, penalties, paths, _, inside, _, leaving, down = buffers
+    candidates, _, _, _, possible, penalties, paths, _, inside, _, leaving, down = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
         falling, rising = _enter_row(buffers, gradients, settings, r)
-        for c in _columns(inside, r, down):
+        for c in columns_of(inside, r, down):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
@@ -264,10 +276,10 @@ def _trace(buffers, gradients, settings, wave):
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, possible, penalties, paths, curve, inside, _, _, _ = buffers
+    candidates, _, _, _, possible, penalties, paths, curve, inside, _, _, _ = buffers
     for r in range(output.row_stop):
         falling, rising = _enter_row(buffers, gradients, settings, r)
-        for c in _columns(inside, r, True):
+        for c in columns_of(inside, r, True):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
@@ -281,12 +293,12 @@ def _sweep_down(buffers, gradients, settings, output, volume):
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
     """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
-    candidates, possible, penalties, paths, curve, inside, _, leaving, _ = buffers
+    candidates, _, ranges, _, possible, penalties, paths, curve, inside, _, leaving, _ = buffers
     winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
         falling, rising = _enter_row(buffers, gradients, settings, r)
-        for c in _columns(inside, r, False):
+        for c in columns_of(inside, r, False):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
@@ -295,8 +307,9 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             if not contains(output, r, c):
                 continue
             i, j = r - output.row, c - output.column
-            if possible[c] < settings.count:
-                validity[i, j] = search_flags(costs, r, c, settings.count, possible[c])
+            least, most = ranges.first[c], ranges.last[c]
+            if possible[c] < most + 1 - least:
+                validity[i, j] = search_flags(costs, r, c, least, most, possible[c])
             if possible[c] == 0:
                 if keep:
                     volume[i, j] = IMPOSSIBLE_COST
@@ -306,7 +319,7 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             else:
                 cost_curve(candidates, r, c, curve)
             lowest = close_impossible(curve, candidates, c)
-            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, lowest, settings)
+            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, lowest, settings, least, most)
             lower[i, j], upper[i, j] = high
             if settings.low >= 0:
                 lower_low[i, j], upper_low[i, j] = low
@@ -318,13 +331,13 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             if keep:
                 copy_curve(curve, volume[i, j])
         if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, _LAST_WAVE, False, leaving)
+            hand_on(paths, inside, r, falling, rising, LAST_WAVE, False, leaving)
 
 
-def _sweep(costs, gradients, settings, output, core, keep, borders):
+def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    buffers = _prepare(costs, gradients, settings, borders)
+    buffers = _prepare(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
@@ -340,12 +353,12 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
         lower_low=np.full(of_low, NO_DISPARITY, np.int16),
         upper_low=np.full(of_low, NO_DISPARITY, np.int16),
     )
-    wanted, cores = _rectangle(output), _rectangle(core)
+    wanted, cores = rectangle_of(output), rectangle_of(core)
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         _sweep_down(buffers, gradients, settings, wanted, volume)
-        buffers = _prepare(costs, gradients, settings, borders, down=False)
+        buffers = _prepare(costs, gradients, settings, borders, cells, down=False)
     _sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
@@ -356,7 +369,12 @@ def _sweep(costs, gradients, settings, output, core, keep, borders):
 
 
 def trace(
-    costs: Costs, settings: Settings, borders: Borders, wavefront: int, gradients: Gradients | None = None
+    costs: Costs,
+    settings: Settings,
+    borders: Borders,
+    wavefront: int,
+    gradients: Gradients | None = None,
+    cells: Cells | None = None,
 ) -> Ring:
     """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
 
@@ -364,7 +382,7 @@ def trace(
     Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]
-    buffers = _prepare(costs, gradients, settings, borders, down)
+    buffers = _prepare(costs, gradients, settings, borders, cells, down)
     _trace(buffers, gradients, settings, wave)
     return buffers.leaving
 
@@ -376,6 +394,7 @@ def match_costs(
     core: Window | None = None,
     gradients: Gradients | None = None,
     borders: Borders | None = None,
+    cells: Cells | None = None,
 ) -> Matched:
     """Match a patch: matching costs in, raw products and the right view's winners out.
 
@@ -393,12 +412,14 @@ def match_costs(
         Gradients that P1 and P2 follow; by default P1 and P2 are those of ``settings``.
     borders
         Path states around the patch; by default every path starts at the edge of the patch.
+    cells
+        Search ranges of the pixels within that of ``settings``; by default all search all of it.
 
     Returns
     -------
     ``raw`` of the shape of ``output``, ``right`` of ``core.height`` rows and ``core.width + count - 1`` columns.
     """
-    return _sweep(costs, gradients, settings, output, core or output, False, borders)[0]
+    return _sweep(costs, gradients, settings, output, core or output, False, borders, cells)[0]
 
 
 def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = None) -> np.ndarray:
@@ -407,4 +428,4 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True, None)[1][:, :, : settings.count]
+    return _sweep(costs, gradients, settings, whole, whole, True, None, None)[1][:, :, : settings.count]

@@ -33,6 +33,7 @@ from sat_intervals.products import (
     RANGE_INCOMPLETE,
     RIGHT_MASKED,
 )
+from sat_intervals.tiling import Window
 
 
 class Rectangle(NamedTuple):
@@ -44,6 +45,11 @@ class Rectangle(NamedTuple):
     column_stop: int
 
 
+def rectangle_of(window: Window) -> Rectangle:
+    """Convert a window."""
+    return Rectangle(window.row, window.column, window.row_stop, window.column_stop)
+
+
 @inlined
 def contains(rectangle, r, c):
     """Whether a rectangle contains the pixel ``(r, c)``."""
@@ -51,11 +57,20 @@ def contains(rectangle, r, c):
 
 
 @inlined
+def columns_of(inside, r, down):
+    """Columns of row ``r`` that lie inside, in the order of the sweep."""
+    if not inside.row <= r < inside.row_stop:
+        return range(0, 0, 1)
+    return range(inside.column, inside.column_stop, 1) if down else range(inside.column_stop - 1, inside.column - 1, -1)
+
+
+@inlined
 def close_impossible(curve, candidates, c):
-    """Set impossible candidates and lanes behind the range to IMPOSSIBLE_COST; return the lowest cost."""
+    """Set impossible candidates and those that are not searched to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
     for k in range(0, curve.size, LANES):
-        closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), load(candidates.beyond, k)))
+        wall = load(candidates.beyond, candidates.walls[c] + k)
+        closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), wall))
         costs = larger(load(curve, k), closed)
         store(curve, k, costs)
         lowest = smaller(lowest, costs)
@@ -74,11 +89,11 @@ def _winner(curve, lowest):
 
 
 @inlined
-def _interval(curve, lowest, count, cut_level, refine):
+def _interval(curve, lowest, least, most, cut_level, refine):
     """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
     first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
-    first -= refine & (first > 0) & (curve[first] == lowest)
-    last += refine & (last < count - 1) & (curve[last] == lowest)
+    first -= refine & (first > least) & (curve[first] == lowest)
+    last += refine & (last < most) & (curve[last] == lowest)
     return first, last
 
 
@@ -115,27 +130,28 @@ def update_right(curve, right, r, c):
 
 
 @part
-def search_flags(costs, r, c, count, possible):
+def search_flags(costs, r, c, first, last, possible):
     """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
     flags = 0
     if costs.left_state[r, c] != 0:
         flags |= LEFT_WINDOW
     usable, masked = 0, False
-    for x in range(c, c + count):
+    for x in range(c + first, c + last + 1):
         usable += costs.right_state[r, x] == 0
         masked |= costs.right_state[r, x] & MASKED != 0
     if usable == 0:
         flags |= RIGHT_MASKED if masked else NO_CANDIDATE
-    elif 0 < possible < count:
+    elif 0 < possible < last + 1 - first:
         flags |= RANGE_INCOMPLETE
     return flags
 
 
 @inlined
-def read_curve(curve, lowest, settings):
+def read_curve(curve, lowest, settings, least, most):
     """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
 
-    Bounds are disparities, or steps with sub-pixel cuts; NO_DISPARITY for a level that is off.
+    ``least`` and ``most`` are the first and the last candidate searched. Bounds are disparities, or steps with
+    sub-pixel cuts; NO_DISPARITY for a level that is off.
     """
     k = _winner(curve, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
@@ -143,8 +159,25 @@ def read_curve(curve, lowest, settings):
     if settings.steps > 0:
         high, low = subpixel_cuts(curve, lowest, k + shift, settings)
     elif settings.cut_level >= 0:
-        first, last = _interval(curve, lowest, settings.count, settings.cut_level, settings.refine)
+        first, last = _interval(curve, lowest, least, most, settings.cut_level, settings.refine)
         high = settings.minimum + first, settings.minimum + last
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
-    count = settings.count if settings.weights.size else 0
-    return settings.minimum + k, shift, refined, high, low, ambiguity(curve, count, lowest, settings.weights)
+    stop = most + 1 if settings.weights.size else least
+    amount = ambiguity(curve, least, stop, lowest, settings.weights)
+    count = stop - least
+    if 0 < count < settings.total:
+        if _distrusts(k, least, most, settings):
+            amount += settings.weights[0] * (settings.total - count)
+        else:
+            amount += amount * (settings.total - count) // count
+    return settings.minimum + k, shift, refined, high, low, amount
+
+
+@inlined
+def _distrusts(k, least, most, settings):
+    """Whether a winner stands at an end of its cell's range that is no end of the whole range, or next to it.
+
+    The true disparity may then be among the candidates of the whole range that were not searched: they are ambiguous.
+    """
+    first, last = settings.offset + least, settings.offset + most
+    return (k <= least + 1 and first > 0) or (k >= most - 1 and last < settings.total - 1)

@@ -178,8 +178,8 @@ def enter_row(paths, columns, falling, rising, down):
 # falling diagonal; 1, along the rising diagonal and the column. Wavefronts start at the upper left, the upper right,
 # the lower right and the lower left corner of the image.
 WAVEFRONTS = ((True, 0), (True, 1), (False, 0), (False, 1))
-# The wavefront whose states a tile also hands on when it is matched; it is of the sweep up.
-LAST = 3
+# The wavefront whose states a tile also hands on when it is matched, and its wave; it is of the sweep up.
+LAST, LAST_WAVE = 3, WAVEFRONTS[3][1]
 
 
 class Ring(NamedTuple):

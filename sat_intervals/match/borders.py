@@ -12,9 +12,10 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.matching import trace
-from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Ring
+from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Ring
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import MatchingCost
-from sat_intervals.match.patch import Frame, frame_area, kernel_settings, mirrored_settings, path_window
+from sat_intervals.match.patch import Frame, frame_area, mirrored_settings, patch_settings, path_window
 from sat_intervals.tiling import Window
 
 Place = tuple[int, int]
@@ -54,6 +55,22 @@ def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
     return Ring(borders[beside].ring.column if beside in borders else nothing, row)
 
 
+def rehulled(ring: Ring, minimum: int, config: Config) -> Ring:
+    """States of a neighbour, whose first disparity is ``minimum``, over the search range of ``config``.
+
+    What one of both does not search is beyond the cells of the pixels that they share: a wall.
+    """
+    size, shift = padded_to_lanes(config.disparity.count), config.disparity.minimum - minimum
+    found = []
+    for states in ring:
+        both = np.full((*states.shape[:2], size), WALL, np.uint16)
+        first, last = max(0, -shift), min(size, states.shape[2] - shift)
+        both[..., first : max(first, last)] = states[..., first + shift : max(first, last) + shift]
+        both[..., config.disparity.count :] = WALL
+        found.append(both)
+    return Ring(*found)
+
+
 def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Border]]) -> Borders:
     """Borders of a tile for the kernels, from those of its neighbours by wavefront and place."""
     patch, size = frame_area(frame, config).base, padded_to_lanes(config.disparity.count)
@@ -61,21 +78,31 @@ def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Bord
     return Borders(path_window(frame, config).relative_to(patch), rings)
 
 
-def trace_area(cost: MatchingCost, borders: Borders, wavefront: int, mirrored: bool, config: Config) -> Ring:
+def trace_area(
+    cost: MatchingCost,
+    frame: Frame,
+    borders: Borders,
+    wavefront: int,
+    config: Config,
+    ranges: LocalRanges | None = None,
+) -> Ring:
     """Path states that a tile hands on in a wavefront.
 
     Parameters
     ----------
     cost
-        Of the tile's `frame_area`.
+        Of the `frame_area`.
+    frame
+        Of the tile in its view.
     borders
         States that it takes over, see `borders_of`.
     wavefront
         Index of WAVEFRONTS.
-    mirrored
-        Whether this is the right view.
     config
         Settings.
+    ranges
+        Local search ranges; by default all pixels search the whole range.
     """
-    settings = kernel_settings(config)
-    return trace(cost.costs, mirrored_settings(settings) if mirrored else settings, borders, wavefront, cost.gradients)
+    settings, cells = patch_settings(frame_area(frame, config).base, config, ranges)
+    settings = mirrored_settings(settings) if frame.mirrored else settings
+    return trace(cost.costs, settings, borders, wavefront, cost.gradients, cells)

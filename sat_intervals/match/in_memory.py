@@ -8,13 +8,11 @@ import xarray as xr
 
 from sat_intervals.config import Config, load_config, resolved
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
-from sat_intervals.match.patch import match_patch, patch_windows
-from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
-from sat_intervals.products import BANDS, FLAGS, NO_DATA, NO_DISPARITY
-from sat_intervals.tiling import View, Window
+from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
+from sat_intervals.match.whole import match_whole
+from sat_intervals.products import BANDS, FLAGS
 
 Array = np.ndarray | xr.DataArray
 
@@ -28,7 +26,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         ``(rows, columns)`` real numbers; the rows correspond, the numbers of columns may differ. NaN, infinity and
         the masked pixels of a masked array are no data.
     config
-        Settings, or a mapping as `load_config` takes it; ``tiles`` has no effect.
+        Settings, or a mapping as `load_config` takes it; ``tiles`` has no effect. A search range that is auto is found
+        first.
 
     Returns
     -------
@@ -43,21 +42,21 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     """
     config = resolved(load_config(config))
     pixels = _pixels(left, "left"), _pixels(right, "right")
+    _check_rows(*pixels)
+    ranges = None
+    if config.disparity.grid:
+        raise SatIntervalsError("a raster of local ranges needs files: use match_pair, or disparity local")
+    if config.disparity.is_auto or config.disparity.local:
+        found = _found(_image(pixels[0]), _image(pixels[1]))
+        config = with_range(config, found) if config.disparity.is_auto else config
+        if config.disparity.local:
+            ranges = found.local.clipped(config.disparity.minimum, config.disparity.maximum)
     _check_fit(*pixels, config)
     images = _image(pixels[0]), _image(pixels[1])
-    whole = Window(0, 0, *images[0].shape)
-    windows = patch_windows(whole, whole, whole, config)
-    views = _view(images[0], windows[0]), _view(images[1], windows[1])
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
-    patch = match_patch(views, whole, whole, whole, config, statistics)
-    raw, rows = patch.raw, RawRows.of(patch.raw, patch.right)
-    scale = ConfidenceScale(np.nan, np.nan)
-    if config.ambiguity:
-        histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
-        scale = confidence_scale(config.ambiguity, histogram)
-    final = postprocess_rows(rows, 0, whole.height, scale, config)
+    final = match_whole(*images, config, statistics, ranges)
     labels = left if isinstance(left, xr.DataArray) else xr.DataArray(images[0], dims=("row", "column"))
     dataset = xr.Dataset(coords=labels.coords)
     for band, layer in zip(BANDS, final[:4], strict=True):
@@ -99,7 +98,19 @@ def _image(pixels: np.ma.MaskedArray) -> np.ma.MaskedArray:
     return np.ma.masked_invalid(pixels.astype(dtype))
 
 
-def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
+def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:
+    """Find the search range of two images; see `find_range`."""
+    step = finest_step(left.shape[0], max(left.shape[1], right.shape[1]))
+    small = [reduced(image.filled(0), np.ma.getmaskarray(image).view(np.uint8), step) for image in (left, right)]
+    try:
+        return find_range(small[0], small[1], step, left.shape)[0]
+    except NoRangeError as error:
+        raise NoRangeError(
+            f"the arrays have no common search range: {error}: give disparity minimum and maximum"
+        ) from None
+
+
+def _check_rows(left: np.ndarray, right: np.ndarray) -> None:
     if left.shape[0] != right.shape[0]:
         raise SatIntervalsError(
             f"the left array has {left.shape[0]} rows, the right {right.shape[0]}, but rows must correspond: "
@@ -107,6 +118,9 @@ def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
         )
     if 0 in left.shape or 0 in right.shape:
         raise SatIntervalsError(f"nothing to match: shapes {left.shape} and {right.shape}")
+
+
+def _check_fit(left: np.ndarray, right: np.ndarray, config: Config) -> None:
     config.disparity.check_images("the left array", left.shape[1], "the right array", right.shape[1])
     rows, columns = left.shape
     check_memory(
@@ -120,14 +134,3 @@ def _moments(image: np.ma.MaskedArray) -> Iterator[Moments]:
     """Moments of the blocks of an image, in order."""
     for block in blocks(*image.shape):
         yield moments(image.data[block.slices], np.ma.getmaskarray(image)[block.slices])
-
-
-def _view(image: np.ma.MaskedArray, window: Window) -> View:
-    """Pixels and states of a window, which may extend beyond the image."""
-    pixels = np.zeros((window.height, window.width), image.dtype)
-    state = np.full(pixels.shape, NO_DATA, np.uint8)
-    inside = window.clipped(Window(0, 0, *image.shape))
-    part, here = image[inside.slices], inside.relative_to(window).slices
-    pixels[here] = part.filled(0)
-    state[here] = np.where(np.ma.getmaskarray(part), NO_DATA, 0)
-    return View(window, pixels, state)

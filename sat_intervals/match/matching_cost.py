@@ -9,7 +9,7 @@ import numpy as np
 from sat_intervals.config import Config, InverseSgm, Mccnn, MccnnSgm, NegativeSgm
 from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.correlation import correlate
-from sat_intervals.kernels.cost import Codes, Costs, between, census, padded_to_lanes, window_state
+from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, padded_to_lanes, window_state
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
@@ -48,6 +48,11 @@ class Area(NamedTuple):
         """Make the area of right pixels and the left pixels that face them."""
         search = config.disparity
         return cls(base, facing(base, -search.maximum, -search.minimum), -search.maximum, mirrored=True)
+
+    @property
+    def disparities(self) -> int:
+        """Number of disparities."""
+        return self.facing.width - self.base.width + 1
 
     @property
     def left(self) -> Window:
@@ -149,10 +154,11 @@ def _varies(view: View, radius: int) -> np.ndarray:
     return varies
 
 
-def textureless(views: Views, area: Area, costs: Costs, config: Config) -> np.ndarray:
+def textureless(views: Views, area: Area, costs: Costs, config: Config, cells: Cells | None = None) -> np.ndarray:
     """Pixels of the base whose window, and all usable windows that face it, do not vary along any row.
 
     All their candidates cost the same. SGM would still choose among them, by costs carried in from the image borders.
+    ``cells`` are the local search ranges of the area; by default all pixels search all of it.
     """
     radius = config.cost.window // 2
     base_varies, there_varies = _of_area(area, views, [_varies(view, radius) for view in views], radius)
@@ -161,7 +167,12 @@ def textureless(views: Views, area: Area, costs: Costs, config: Config) -> np.nd
     textured = there_varies[rows] & (costs.right_state[rows] == 0)
     cumulative = np.pad(np.cumsum(textured, axis=1, dtype=np.int32), [(0, 0), (1, 0)])
     columns = flat.shape[1]
-    flat[rows] &= cumulative[:, -columns:] == cumulative[:, :columns]
+    if cells is None:
+        flat[rows] &= cumulative[:, -columns:] == cumulative[:, :columns]
+        return flat
+    row, column = (np.flatnonzero(rows) + cells.row) // cells.height, (np.arange(columns) + cells.column) // cells.width
+    first, last = (bound[row[:, np.newaxis], column] + np.arange(columns) for bound in (cells.first, cells.last))
+    flat[rows] &= np.take_along_axis(cumulative, last + 1, 1) == np.take_along_axis(cumulative, first, 1)
     return flat
 
 
@@ -182,10 +193,7 @@ def _correlations(
     """Costs of all areas, strip by strip: all areas share the features of a strip, which are then discarded."""
     states = [window_state(view.state, RADIUS) for view in views]
     made = [
-        np.empty(
-            (area.base.height, area.base.width, padded_to_lanes(area.facing.width - area.base.width + 1)), np.uint8
-        )
-        for area in areas
+        np.empty((area.base.height, area.base.width, padded_to_lanes(area.disparities)), np.uint8) for area in areas
     ]
     height = areas[0].base.height
     for row in range(0, height, STRIP):

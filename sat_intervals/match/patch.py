@@ -5,13 +5,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config, CosineSgm, Sgm
+from sat_intervals.config import Config, CosineSgm, Disparity, Sgm
+from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
 from sat_intervals.kernels.sgm import Borders, Ring
+from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, textureless, view_windows
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.products import LEFT_MASKED, MASKED, NO_DISPARITY
+from sat_intervals.products import IMPOSSIBLE_COST, LEFT_MASKED, MASKED, MISMATCH, NO_DISPARITY, RANGE_END
 from sat_intervals.tiling import Views, Window, facing
+
+# Number of disparities up to which a range has no ends of its own.
+_SHORT = 8
 
 
 class Frame(NamedTuple):
@@ -78,6 +83,27 @@ def kernel_settings(config: Config) -> Settings:
     )
 
 
+def patch_settings(base: Window, config: Config, ranges: LocalRanges | None) -> tuple[Settings, Cells | None]:
+    """Settings of the kernels for a patch, and the ranges of its cells; ``base`` is its window of the left image."""
+    settings = kernel_settings(config)
+    if ranges is None:
+        return settings, None
+    here, whole = ranges.within(base, config).disparity, config.disparity
+    settings = settings._replace(
+        minimum=here.minimum, count=here.count, offset=here.minimum - whole.minimum, total=whole.count
+    )
+    return settings, ranges.cells(base, here.minimum)
+
+
+def _of_whole_range(view: RightView, core: Window, settings: Settings) -> RightView:
+    """Right view in the layout of the whole search range, in which the strips of all tiles are put together."""
+    shape = core.height, core.width + settings.total - 1
+    cost, winner = np.full(shape, IMPOSSIBLE_COST, np.uint16), np.full(shape, NO_DISPARITY, np.int16)
+    here = slice(settings.offset, settings.offset + view.cost.shape[1])
+    cost[:, here], winner[:, here] = view.cost, view.winner
+    return RightView(cost, winner)
+
+
 def frames_of(core: Window, region: Window, whole: Window, config: Config) -> list[Frame]:
     """Frames of the views that matching a core with exact seams needs: left and, for accurate cross-checking, right."""
     left = Frame(core, region, whole)
@@ -105,25 +131,28 @@ def path_window(frame: Frame, config: Config) -> Window:
     return Window(row, column, row_stop - row, column_stop - column)
 
 
-def frame_area(frame: Frame, config: Config) -> Area:
+def frame_area(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> Area:
     """Area that a tile reads: `path_window` and one more pixel on each side where another tile follows."""
     window = path_window(frame, config).grown(1, 1).clipped(_supported(frame, config))
-    return Area.mirror(window, config) if frame.mirrored else Area.of(window, config)
+    return Area.mirror(window, config) if frame.mirrored else Area.of(window, narrowed(ranges, window, config))
 
 
 def _supported(frame: Frame, config: Config) -> Window:
     return frame.region.grown(config.tiles.support, config.tiles.support).clipped(frame.whole)
 
 
-def patch_areas(core: Window, region: Window, whole: Window, config: Config) -> list[Area]:
+def patch_areas(
+    core: Window, region: Window, whole: Window, config: Config, ranges: LocalRanges | None = None
+) -> list[Area]:
     """Area of a core with what it reads around it and, for accurate cross-checking, that of the right view.
 
     ``whole`` is the window of all left pixels. The area may leave the region, but not the image.
     """
     overlap = config.tiles.overlap
     if overlap == "exact":
-        return [frame_area(frame, config) for frame in frames_of(core, region, whole, config)]
-    areas = [Area.of(core.grown(overlap, overlap).clipped(whole), config)]
+        return [frame_area(frame, config, ranges) for frame in frames_of(core, region, whole, config)]
+    base = core.grown(overlap, overlap).clipped(whole)
+    areas = [Area.of(base, narrowed(ranges, base, config))]
     if config.matches_right_view:
         areas.append(_right_area(core, whole, overlap, config))
     return areas
@@ -137,9 +166,11 @@ def _right_area(core: Window, whole: Window, overlap: int, config: Config) -> Ar
     return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
 
 
-def patch_windows(core: Window, region: Window, whole: Window, config: Config) -> tuple[Window, Window]:
+def patch_windows(
+    core: Window, region: Window, whole: Window, config: Config, ranges: LocalRanges | None = None
+) -> tuple[Window, Window]:
     """Windows of both images that matching a core needs; see `patch_areas`."""
-    return view_windows(patch_areas(core, region, whole, config), config)
+    return view_windows(patch_areas(core, region, whole, config, ranges), config)
 
 
 def match_patch(
@@ -149,6 +180,7 @@ def match_patch(
     whole: Window,
     config: Config,
     statistics: PairStatistics | None = None,
+    ranges: LocalRanges | None = None,
 ) -> Patch:
     """Match a core.
 
@@ -166,9 +198,11 @@ def match_patch(
         Settings.
     statistics
         Mean and standard deviation of the whole images; None if the matching cost needs none.
+    ranges
+        Local search ranges; by default all pixels search the whole range.
     """
-    costs = cost_areas(views, patch_areas(core, region, whole, config), config, statistics)
-    return match_costed(views, Frame(core, region, whole), costs, config)
+    costs = cost_areas(views, patch_areas(core, region, whole, config, ranges), config, statistics)
+    return match_costed(views, Frame(core, region, whole), costs, config, ranges=ranges)
 
 
 def match_costed(
@@ -177,6 +211,7 @@ def match_costed(
     costs: Sequence[MatchingCost],
     config: Config,
     borders: Sequence[Borders] | None = None,
+    ranges: LocalRanges | None = None,
 ) -> Patch:
     """Match a core from its costs.
 
@@ -192,12 +227,14 @@ def match_costed(
         Settings.
     borders
         Path states of the neighbours for each area; by default every path starts where its area does.
+    ranges
+        As for `match_patch`.
     """
-    settings, is_exact = kernel_settings(config), config.tiles.overlap == "exact"
-    core = frame.core
+    is_exact, core = config.tiles.overlap == "exact", frame.core
     output = core if is_exact else core.grown(1, 1).clipped(frame.region)
-    areas = patch_areas(core, frame.region, frame.whole, config)
+    areas = patch_areas(core, frame.region, frame.whole, config, ranges)
     area, cost = areas[0], costs[0]
+    settings, cells = patch_settings(area.base, config, ranges)
     wants_fast = config.cross_check is not None and not config.matches_right_view
     right_core = core if wants_fast else Window(core.row, core.column, 0, 0)
     raw, right, *leaving = match_costs(
@@ -207,10 +244,17 @@ def match_costed(
         right_core.relative_to(area.base),
         cost.gradients,
         borders[0] if borders else None,
+        cells,
     )
+    if ranges:
+        right = _of_whole_range(right, right_core, settings)
     inside = output.relative_to(area.base).slices
     raw.validity[cost.state[inside] & MASKED != 0] |= LEFT_MASKED
-    _mark_ambiguous(raw, textureless(views, area, cost.costs, config)[inside], config)
+    flat = textureless(views, area, cost.costs, config, cells)[inside]
+    _mark_ambiguous(raw, flat, config)
+    _mark_ends(raw, flat, config.disparity)
+    if ranges:
+        _reject_ends(raw, *ranges.at(output), config.disparity)
     if config.matches_right_view:
         search = config.disparity
         reach = mirrored_frame(frame, config).core if is_exact else facing(core, search.minimum, search.maximum)
@@ -231,6 +275,27 @@ def _mark_ambiguous(raw: Raw, flat: np.ndarray, config: Config) -> None:
         if config.subpixel_levels == 2:
             raw.lower_low[ambiguous], raw.upper_low[ambiguous] = first, last
     raw.ambiguity[ambiguous] = config.largest_ambiguity
+
+
+def _mark_ends(raw: Raw, flat: np.ndarray, search: Disparity) -> None:
+    """Set the flag of winners at the first two and the last two candidates; a short range consists of ends only.
+
+    ``flat`` marks textureless pixels, whose winner means nothing.
+    """
+    if search.count > _SHORT:
+        ends = (raw.winner <= search.minimum + 1) | (raw.winner >= search.maximum - 1)
+        raw.validity[ends & (raw.winner != NO_DISPARITY) & ~flat] |= RANGE_END
+
+
+def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparity) -> None:
+    """Reject winners at an end of their cell's range, or next to it, that is no end of the whole range: no minima.
+
+    The cross-check would reject most of them in a search of the whole range. ``least`` and ``most`` are those ends.
+    """
+    ends = (raw.winner <= least + 1) & (least > search.minimum)
+    ends |= (raw.winner >= most - 1) & (most < search.maximum)
+    ends &= raw.winner != NO_DISPARITY
+    raw.validity[ends] |= MISMATCH
 
 
 def mirrored_settings(settings: Settings) -> Settings:

@@ -15,7 +15,16 @@ from sat_intervals.kernels.confidence import low_confidence, normalize, percenti
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
-from sat_intervals.products import BOUND_STEPS, INVALID, NO_DISPARITY, REGULARIZED, Bands
+from sat_intervals.products import (
+    BOUND_STEPS,
+    INVALID,
+    NO_DISPARITY,
+    OPEN_ABOVE,
+    OPEN_BELOW,
+    RANGE_END,
+    REGULARIZED,
+    Bands,
+)
 
 # Steps per pixel in which sub-pixel bounds are regularised.
 _STEPS = 8
@@ -127,6 +136,8 @@ def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filter
         validity |= cross_check(rows.winner, rows.right_winner, config.disparity.minimum, tolerance)
     kept = searched & (validity & INVALID == 0)
     confidence = normalize(rows.ambiguity, searched, scale.p1, scale.p99)
+    if config.opens_ends:
+        _open_ends(rows, validity, confidence, config)
     low = None
     if config.regularization:
         low = low_confidence(confidence, config.regularization.threshold, config.regularization.kernel)
@@ -157,6 +168,15 @@ def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
             round_(bound * BOUND_STEPS) / BOUND_STEPS for round_, bound in ((np.floor, lower), (np.ceil, upper))
         )
     return Bands(disparity, lower, upper, confidence[inner], validity)
+
+
+def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, config: Config) -> None:
+    """Distrust winners at the ends of the search range: the true disparity may lie beyond."""
+    ends = validity & RANGE_END != 0
+    confidence[ends] = 0
+    if config.interval:
+        below = rows.winner <= config.disparity.minimum + 1
+        validity[ends] |= np.where(below[ends], OPEN_BELOW, OPEN_ABOVE).astype(validity.dtype)
 
 
 def _bounds(rows: RawRows, low: np.ndarray | None, config: Config) -> tuple[np.ndarray, np.ndarray]:

@@ -27,5 +27,5 @@ def compile_kernels(config: Config) -> None:
     if config.hands_states_on:
         frame = Frame(spot, spot, spot)
         (cost,) = cost_areas(views, [frame_area(frame, config)], config, statistics)
-        trace_area(cost, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, False, config)
+        trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config)
     list(postprocess_strips([RawRows.of(patch.raw, patch.right)], ConfidenceScale(0.0, 1.0), config))

@@ -15,6 +15,7 @@ from sat_intervals.raster.layers import (
     whole_file,
     write_layer,
     write_once,
+    write_rows,
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, utm_of
@@ -63,4 +64,5 @@ __all__ = [
     "whole_file",
     "write_layer",
     "write_once",
+    "write_rows",
 ]

@@ -4,7 +4,7 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -104,6 +104,29 @@ def write_layer(
     ):
         dataset.update_tags(**tags)
         dataset.write(pixels, 1)
+
+
+def write_rows(
+    path: str | os.PathLike[str],
+    rows: Iterable[np.ndarray],
+    shape: tuple[int, int, int],
+    georeferencing: Georeferencing,
+) -> None:
+    """Write int16 rows, ``(bands, some, columns)`` from the top, as a tiled, compressed GeoTIFF; replaces a file.
+
+    ``shape`` has the numbers of bands, rows and columns.
+    """
+    bands, height, width = shape
+    kind = {"count": bands, "dtype": "int16", "tiled": True, "compress": "deflate"}
+    with (
+        whole_file(path) as new,
+        Env(),
+        gdal.create(str(new), height=height, width=width, **kind, **georeferencing.creation_options()) as dataset,
+    ):
+        first = 0
+        for part in rows:
+            dataset.write(part, window=RasterioWindow(0, first, width, part.shape[1]))
+            first += part.shape[1]
 
 
 def write_once(

@@ -23,6 +23,7 @@ from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter, stamps
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
+from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
 from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced, replaceable_files
@@ -31,16 +32,10 @@ Item = TypeVar("Item")
 
 # Pixels of a strip, in whole rows. A strip in memory takes about 100 bytes per pixel, and there are several.
 STRIP_PIXELS = 1 << 20
-# Number of disparities up to which refinement alone can widen an interval to the whole search range.
-_NARROW_RANGE = 3
-# Number of disparities up to which intervals of usual width are wider than half of the search range.
-_SHORT_RANGE = 8
-# Share of valid pixels with the whole search range as interval above which a run warns.
-_AMBIGUOUS_SHARE = 0.1
-
 # Meanings of some of the counts, for readers of run.json.
 _COUNTS_MEANING = {
     "ambiguous": "valid pixels whose interval is the whole search range",
+    "range_ends": "valid pixels with the flag range_end: at the minimum or at the maximum of the search range",
     "low_confidence": "valid pixels with the flag regularized; flags.regularized also counts invalid ones",
     "causes": "invalid pixels, each under its first flag that makes it invalid; with valid they add up to pixels",
     "flags": "pixels with the flag, valid or not; a pixel may have several flags",
@@ -78,7 +73,7 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     histogram, seams = store.histogram(records), store.seams(records)
     check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
-    tally = Tally(config.disparity.count)
+    tally = Tally(config.disparity.count, config.disparity.minimum)
     where = job.left.georeferencing.shifted(region)
     with _resumable(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
         with logged_stage(seconds, "bands"):
@@ -98,7 +93,10 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
             seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
         seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
         report = _report(job, statistics, scale, tally, seconds, seams) | {"files": files}
-        _warn_of_ambiguity(job, report["counts"])
+        report["quality"] = quality_of(job, records)
+        report["warnings"] = warnings_of(job, report["counts"], report["quality"])
+        for line in report["warnings"]:
+            _LOG.warning("%s", line)
         if not keep_tiles:
             mark_finished(store.home, job.name)
         text = json.dumps(report, indent=1) + "\n"
@@ -156,19 +154,6 @@ def check_matched(job: Job, records: Records, searched: int) -> None:
     )
 
 
-def _warn_of_ambiguity(job: Job, counts: dict[str, Any]) -> None:
-    """Warn if many intervals are the whole search range, or most are wider than half of it."""
-    search = job.config.disparity
-    width = counts["median_interval_width"] or 0
-    ambiguous = counts["ambiguous"] > _AMBIGUOUS_SHARE * counts["valid"] and search.count > _NARROW_RANGE
-    if ambiguous or (2 * width > search.count and search.count > _SHORT_RANGE):
-        _LOG.warning(
-            "%s: the interval of %d of %d valid pixels is the whole search range %d to %d, the median width is %g px: "
-            "check the search range, and no-data values (--nodata), or the ground has no texture",
-            job.left.path, counts["ambiguous"], counts["valid"], search.minimum, search.maximum, width,
-        )  # fmt: skip
-
-
 def _tags(config: Config) -> dict[str, str]:
     """Return the tags of the output files."""
     tags = {
@@ -213,6 +198,9 @@ def _report(
     return {
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "settings": config.model_dump(mode="json"),
+        "requested": {"disparity": job.requested},
+        "search": job.found and job.found.report(),
+        "local_ranges": job.local and job.local.report() | {"share": job.local.share},
         "inputs": job.inputs,
         "tiles": {
             "region": asdict(grid.region),

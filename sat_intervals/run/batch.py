@@ -8,12 +8,13 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from distributed import Client
 
-from sat_intervals.config import Cluster, Config, load_config
+from sat_intervals.config import Config, load_config
 from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
@@ -21,21 +22,19 @@ from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.results import open_run
-from sat_intervals.run.cluster import connected
-from sat_intervals.run.inputs import changes_since
-from sat_intervals.run.job import Job, fitted_to_jobs, prepare
+from sat_intervals.run.cluster import Connection
+from sat_intervals.run.inputs import changes_since, with_range_of
+from sat_intervals.run.job import Job, Search, fitted_to_jobs, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
-from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, match_jobs, measure_images
+from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, find_on, match_jobs, measure_images
 from sat_intervals.run.status import read_report
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
 from sat_intervals.store.tiles import finished_run, remove_tiles
+from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
-
-# Placeholder for the search range, which each pair sets.
-_ANY_RANGE = {"disparity": {"minimum": 0, "maximum": 0}}
 
 
 def match_batch(
@@ -75,11 +74,13 @@ def match_batch(
     """
     _check_not_replaced(pairs, [config] if isinstance(config, (str, Path)) else [], out, overwrite)
     ended: dict[str, dict[str, Any]] = {}
-    cluster = load_config(config, {**(overrides or {}), **_ANY_RANGE}).cluster
+    cluster = load_config(config, overrides).cluster
     _raise_file_limit()
     with ExitStack() as stack:
         stack.enter_context(LocalFolder(out).locked())
         read_report(out)  # raises if it is not ours
+        connection = stack.enter_context(Connection(cluster, out))
+        find = partial(find_on, connection, {}, progress)
 
         def note(states: Mapping[str, dict[str, Any]]) -> None:
             for name, how in states.items():
@@ -96,13 +97,13 @@ def match_batch(
                 settings = load_config(config, own, preset_wins=True)
                 before = None if overwrite else _done_before(pair, out, settings)
                 if before is None:
-                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack)
+                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find)
                 else:
                     _tidy(out / pair.name, keep_tiles, cluster.store)
                     note({pair.name: {"state": "done before", **before}})
             except Exception as error:  # one pair's failure must not stop the others
                 note({pair.name: _failed(error)})
-        for name, how in _matched(jobs, out, cluster, keep_tiles, progress):
+        for name, how in _matched(jobs, connection, keep_tiles, progress):
             note({name: how})
     return ended
 
@@ -120,7 +121,15 @@ def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Pat
 
 
 def _images(pair: PairOfBatch) -> tuple[Image, Image]:
-    return open_image(pair.left, mask=pair.left_mask), open_image(pair.right, mask=pair.right_mask)
+    def opened(side: str, path: str, mask: str | None) -> Image:
+        options = {name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")}
+        return open_image(path, **options, mask=mask)
+
+    return opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
+
+
+def _window(pair: PairOfBatch) -> Window | None:
+    return Window(*pair.window) if pair.window else None
 
 
 def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
@@ -129,16 +138,19 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
     if not is_complete(folder):
         return None
     run = open_run(folder)
-    if changes := changes_since(run.report, *_images(pair), fitted_to_jobs(settings)):
+    config = fitted_to_jobs(with_range_of(run.report, settings))
+    if changes := changes_since(run.report, *_images(pair), config, _window(pair)):
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
-    return {name: run.report[name] for name in ("counts", "seconds")}
+    return {name: run.report[name] for name in ("counts", "seconds", "warnings") if name in run.report}
 
 
-def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack) -> Job:
+def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack, find: Search) -> Job:
     """Prepare the job of a pair, lock its folder and open its store."""
-    job = prepare(*_images(pair), out / pair.name, settings, overwrite=overwrite, pair=pair.name)
+    job = prepare(
+        *_images(pair), out / pair.name, settings, window=_window(pair), overwrite=overwrite, pair=pair.name, find=find
+    )
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin(overwrite=overwrite)
     return job
@@ -182,7 +194,7 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
 
 
 def _matched(
-    jobs: Mapping[str, Job], out: Path, cluster: Cluster, keep_tiles: bool, progress: Progress
+    jobs: Mapping[str, Job], connection: Connection, keep_tiles: bool, progress: Progress
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Match the tiles of all jobs; assemble finished jobs in a thread meanwhile."""
     if not jobs:
@@ -190,8 +202,8 @@ def _matched(
     for config in {_kernels(job.config): job.config for job in jobs.values()}.values():
         compile_kernels(config)
     assembling: dict[Future[dict[str, Any]], str] = {}
-    with _thread() as (thread, check), connected(cluster, out) as client:
-        measured = {}
+    with _thread() as (thread, check), connection:
+        client, measured = connection.client(), {}
         for name, job in jobs.items():
             try:
                 with job.store.needed(job.manifest):
@@ -251,4 +263,4 @@ def _assembled(client: Client, matched: Matched, keep_tiles: bool, progress: Pro
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
-    return {"state": "done", "counts": report["counts"], "seconds": report["seconds"]}
+    return {"state": "done", **{name: report[name] for name in ("counts", "seconds", "warnings")}}

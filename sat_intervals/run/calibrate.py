@@ -110,6 +110,8 @@ def check_subjects(subjects: Sequence[Subject]) -> None:
     """Raise if subjects cannot be calibrated together: settings without confidence, other settings, too few truths."""
     first = subjects[0]
     for subject in subjects:
+        if subject.config.disparity.is_auto:
+            raise SatIntervalsError(f"{subject.name}: the search range is auto, but calibrate needs it as numbers")
         missing = [name for name in ("ambiguity", "regularization") if getattr(subject.config, name) is None]
         if missing:
             raise SatIntervalsError(
@@ -225,11 +227,12 @@ def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) ->
 
 
 def _at_levels(config: Config, high: float, low: float, quantile: float | None) -> Config:
-    """Return settings whose intervals are cut at two levels, whatever the coverage."""
+    """Return settings whose intervals are cut at two levels, whatever the coverage, and without local ranges."""
     rows = [{"coverage": coverage, "high": high, "low": low, "quantile": quantile} for coverage in COVERAGES]
     constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
     interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
-    return config.model_copy(update={"interval": interval})
+    disparity = config.disparity.model_copy(update={"local": False, "grid": None})
+    return config.model_copy(update={"interval": interval, "disparity": disparity})
 
 
 def calibration_from(
@@ -259,14 +262,12 @@ def calibration_from(
         ],
         "pixels": dict(zip(("high", "low"), pool.pixels, strict=True)),
         "notes": notes,
-        "expected": [{key: _rounded(value) for key, value in row.items()} for row in expected],
+        "expected": [
+            {key: round(value, 4) if math.isfinite(value) else None for key, value in row.items()} for row in expected
+        ],
     }
     content = {"name": name, "key": key_of(config), "levels": rows, "provenance": provenance}
     return Calibration.model_validate(content), expected
-
-
-def _rounded(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
 
 
 class _Gauge:

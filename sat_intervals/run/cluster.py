@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
+from typing import Any, Self
 
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster, Worker, WorkerPlugin
@@ -53,6 +54,29 @@ def connected(settings: Cluster, out: Path) -> Iterator[Client]:
             client.forward_logging(name)
         yield client
     _LOG.info("disconnected")
+
+
+class Connection:
+    """A cluster that is connected when it is first needed; see `connected`. A context manager."""
+
+    def __init__(self, settings: Cluster, out: Path) -> None:
+        self._settings, self._out = settings, out
+        self._stack = ExitStack()
+        self._client: Client | None = None
+
+    def client(self) -> Client:
+        """Return the client of the cluster."""
+        if self._client is None:
+            self._client = self._stack.enter_context(connected(self._settings, self._out))
+        return self._client
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Close the client and what it started; `client` connects again."""
+        self._client = None
+        self._stack.__exit__(*error)
 
 
 class _WorkerLog(WorkerPlugin):

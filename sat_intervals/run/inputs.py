@@ -93,11 +93,25 @@ def check_weights(cost: Mccnn, wanted: Mapping[str, Any]) -> None:
             )
 
 
-def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: Config) -> list[str]:
-    """List the differences between the run of a ``run.json`` and one of whole images with these settings.
+def with_range_of(report: Mapping[str, Any], config: Config) -> Config:
+    """Return the settings with the search range that a run found, if they ask for the same search as that run."""
+    asked = report.get("requested", {}).get("disparity")
+    if not config.disparity.is_auto or asked != config.disparity.model_dump(mode="json"):
+        return config
+    return config.model_copy(update={"disparity": load_config(report["settings"]).disparity})
+
+
+def changes_since(
+    report: Mapping[str, Any], left: Image, right: Image, config: Config, window: Window | None = None
+) -> list[str]:
+    """List the differences between the run of a ``run.json`` and one with these images, settings and region.
 
     Versions and cluster are ignored.
     """
+    if config.disparity.is_auto and report.get("requested", {}).get("disparity") == config.disparity.model_dump(
+        mode="json"
+    ):
+        config = config.model_copy(update={"disparity": load_config(report["settings"]).disparity})
     before = {
         "settings": load_config(report["settings"]).model_dump(mode="json", exclude={"cluster", "preset"}),
         "inputs": report["inputs"],
@@ -106,7 +120,7 @@ def changes_since(report: Mapping[str, Any], left: Image, right: Image, config: 
     now = {
         "settings": config.model_dump(mode="json", exclude={"cluster", "preset"}),
         "inputs": describe_inputs(left, right, config, report["inputs"])[0],
-        "region": asdict(Window(0, 0, left.height, left.width)),
+        "region": asdict(window or Window(0, 0, left.height, left.width)),
     }
     for one in (before, now):
         one["inputs"].get("weights", {}).pop("onnxruntime", None)

@@ -1,6 +1,6 @@
 """Prepare a pair for matching: open and check its images, folder, tiles and store."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
@@ -12,18 +12,25 @@ from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, fitted, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.search_range import Found
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, restore, stamps
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
+from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
+from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run, inputs_before
+from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run
 from sat_intervals.tiling import Grid, Tile, Window
+
+Search = Callable[[Image, Image, dict[str, dict[str, Any]]], Found]
+"""Finds the search range of two images, whose files have these identities."""
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
@@ -47,6 +54,14 @@ class Job:
         Description of the images and of the MC-CNN weights for run.json.
     files
         `identity` of each file that the images are read from, by the name it is opened with.
+    requested
+        The section ``disparity`` as the user gave it.
+    found
+        What the search for the range found, None if none was made.
+    grid
+        Digest of the local search ranges, None without them.
+    local
+        The local search ranges; not on workers, which read them from the store.
     """
 
     left: Image
@@ -56,11 +71,15 @@ class Job:
     out: Path
     inputs: dict[str, Any]
     files: dict[str, dict[str, Any]]
+    requested: dict[str, Any]
+    found: Found | None = None
+    grid: str | None = None
+    local: LocalRanges | None = None
 
     @property
     def manifest(self) -> dict[str, Any]:
         """Return all that decides the bytes of a tile."""
-        return _manifest(self.config, self.inputs, self.store.grid.region)
+        return _manifest(self.config, self.inputs, self.store.grid.region, self.grid)
 
     @property
     def hands_states_on(self) -> bool:
@@ -87,6 +106,9 @@ class Job:
         check_output(self.out, overwrite)
         restore(self.out, RUN_FILES)
         self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
+        if self.found or self.local:
+            search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
+            self.store.write_search(search, _origin(self.inputs))
 
     def check_inputs(self) -> None:
         """Raise if an input changed since the start of the run, or this process has other weights.
@@ -117,6 +139,29 @@ class Job:
             )
         return PairStatistics.of_report(normalization)
 
+    def ranges(self) -> LocalRanges | None:
+        """Return the local search ranges, None without them.
+
+        Raises
+        ------
+        DamagedTilesError
+            They are missing in the store.
+        """
+        if not self.config.disparity.is_local:
+            return None
+        if self.local is None:
+            stored = (self.store.search(_origin(self.inputs)) or {}).get("ranges")
+            if stored is None or digest(stored) != self.grid:
+                raise DamagedTilesError(
+                    f"the local search ranges in {self.store.folder} are missing: rerun the same command: it resumes"
+                )
+            return LocalRanges.of_report(stored)
+        return self.local
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what workers read from the store, see `ranges`."""
+        return self.__dict__ | {"local": None}
+
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""
         done = self.store.done()
@@ -132,21 +177,31 @@ def prepare(
     window: Window | None = None,
     overwrite: bool = False,
     pair: str = "",
+    find: Search | None = None,
 ) -> Job:
-    """Check all that can be checked before reading pixels; parameters as in `match_pair`.
+    """Check all that can be checked before tiles are matched; parameters as in `match_pair`.
 
-    ``pair`` distinguishes otherwise equal pairs of a batch in an external store.
+    ``pair`` distinguishes otherwise equal pairs of a batch in an external store. ``find`` finds a search range that is
+    not given; one that an interrupted run has found is taken over.
     """
-    config, out = resolved(fitted_to_jobs(load_config(config))), Path(out)
+    config, out = resolved(load_config(config)), Path(out)
+    requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
-    check_tiles(config, region)
+    if not config.disparity.is_auto:
+        check_tiles(fitted_to_jobs(config), region)
     check_output(out, overwrite)
-    check_space(out, RUN_FILES, region.height, region.width)
     home, elsewhere = out / "tiles", None
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
+    before = None if overwrite else _found_before(home, config.cluster.store, inputs)
+    config, found, local = searched(config, left, lambda: before or _find(find, left, right, files))
+    marked = digest(local.report()) if local else None
+    checked_pair(left, right, config)
+    config = fitted_to_jobs(config)
+    check_tiles(config, region)
+    check_space(out, RUN_FILES, region.height, region.width)
     read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
-    run = digest(_manifest(config, inputs, region))
+    run = digest(_manifest(config, inputs, region, marked))
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
         name = "-".join(filter(None, (pair, run)))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
@@ -158,7 +213,25 @@ def prepare(
     grid = Grid(region, config.tiles.size)
     levels = config.subpixel_levels
     store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, run, elsewhere)
-    return Job(left, right, config, store, out, inputs, files)
+    return Job(left, right, config, store, out, inputs, files, requested, found, marked, local)
+
+
+def _find(find: Search | None, left: Image, right: Image, files: dict[str, dict[str, Any]]) -> Found:
+    if find is None:
+        raise SatIntervalsError("the search range is auto: give it as numbers")
+    return find(left, right, files)
+
+
+def _origin(inputs: Mapping[str, Any]) -> str:
+    """Return a digest of all that decides which search range is found."""
+    images = {side: inputs[side] for side in ("left", "right")}
+    return digest({"version": _version(), "kernels": FINGERPRINT, "inputs": images})
+
+
+def _found_before(home: Path, store: str | None, inputs: Mapping[str, Any]) -> Found | None:
+    """Return the search range that an interrupted run of the same images has stored, None without one."""
+    search = search_before(home, store, _origin(inputs))
+    return Found.of_report(search["found"]) if search and search["found"] else None
 
 
 @cache
@@ -167,9 +240,10 @@ def _version() -> str:
     return version("sat-intervals")
 
 
-def _manifest(config: Config, inputs: Mapping[str, Any], region: Window) -> dict[str, Any]:
+def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
     """Return all that decides the bytes of a tile."""
     return {
+        **({"local_ranges": grid} if grid else {}),
         "version": _version(),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,
@@ -187,7 +261,7 @@ def fitted_to_jobs(config: Config) -> Config:
     ConfigError
         See `fitted` and `parse_memory`.
     """
-    if config.cluster.memory is None:
+    if config.cluster.memory is None or config.disparity.is_auto:
         return config
     # dask kills workers at 95 % of their memory
     return fitted(config, 9 * parse_memory(config.cluster.memory) // 10, config.cluster.cores)
@@ -196,8 +270,9 @@ def fitted_to_jobs(config: Config) -> Config:
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
     """Open the images of a pair and check that they can be matched."""
     left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
-    check_pair(left, right, config.disparity.count)
-    config.disparity.check_images(left.path, left.width, right.path, right.width)
+    check_pair(left, right, 1 if config.disparity.is_auto else config.disparity.count)
+    if not config.disparity.is_auto:
+        config.disparity.check_images(left.path, left.width, right.path, right.width)
     if isinstance(config.cost, Mccnn):
         load_network(weights_file(config.cost.weights))
     return left, right

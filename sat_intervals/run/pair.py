@@ -3,23 +3,27 @@
 import errno
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from distributed import Client
 
+from sat_intervals.config import Config, load_config
 from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
+from sat_intervals.match.search_range import Found
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
-from sat_intervals.run.cluster import connected
+from sat_intervals.run.cluster import Connection
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
+from sat_intervals.run.search_range import search_range
 from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_tile, measure_block, trace_tile
 from sat_intervals.store.folder import LocalFolder
@@ -57,7 +61,8 @@ def match_pair(
         Folder for ``intervals.tif``, ``validity.tif`` and ``run.json``. Finished tiles are kept there, or in
         ``cluster.store``, until the run is complete; after an interruption the same call resumes from them.
     config
-        Settings, or a source for `load_config`; ``cluster`` says where tiles are matched.
+        Settings, or a source for `load_config`; ``cluster`` says where tiles are matched. A search range that is auto
+        is found from the whole images first, see `search_range`.
     window
         Region of the left image; by default all of it.
     keep_tiles
@@ -78,19 +83,37 @@ def match_pair(
     RunError
         Tiles failed; no output was published.
     """
+    config = load_config(config)
+    with Connection(config.cluster, Path(out)) as connection:
+        return _match_pair((left, right), out, config, connection, window, keep_tiles, overwrite, progress)
+
+
+def _match_pair(
+    pair: tuple[str | Path | Image, str | Path | Image],
+    out: str | Path,
+    config: Config,
+    connection: Connection,
+    window: Window | None,
+    keep_tiles: bool,
+    overwrite: bool,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Match a pair on a cluster; see `match_pair`."""
     seconds: dict[str, float] = {}
+
+    find = partial(find_on, connection, seconds, progress)
     with logged_stage(seconds, "start"):
-        job = prepare(left, right, out, config, window=window, overwrite=overwrite)
+        job = prepare(*pair, out, config, window=window, overwrite=overwrite, find=find)
 
     def match() -> None:
-        with logged_stage(seconds, "tiles"):
+        with logged_stage(seconds, "tiles"), connection:
             if job.waiting() or not _is_measured(job):
-                with connected(job.config.cluster, job.out) as client:
-                    with logged_stage(seconds, "tiles.images"):
-                        measure_images(client, job, progress)
-                    for matched in match_jobs(client, [job], progress):
-                        check_failures(job, matched.failures)
-                        add_seconds(seconds, matched.seconds)
+                client = connection.client()
+                with logged_stage(seconds, "tiles.images"):
+                    measure_images(client, job, progress)
+                for matched in match_jobs(client, [job], progress):
+                    check_failures(job, matched.failures)
+                    add_seconds(seconds, matched.seconds)
 
     with LocalFolder(job.store.home).locked():
         if not overwrite and job.is_finished():
@@ -111,6 +134,19 @@ def match_pair(
         if not keep_tiles:
             job.store.remove()
     return report
+
+
+def find_on(
+    connection: Connection,
+    seconds: dict[str, float],
+    progress: Progress,
+    left: Image,
+    right: Image,
+    files: dict[str, dict[str, Any]],
+) -> Found:
+    """Find the search range of a pair on a cluster; see `search_range`. The time is added to ``seconds``."""
+    with logged_stage(seconds, "start.range"):
+        return search_range(connection.client(), left, right, files, progress)
 
 
 def assemble_repaired(

@@ -19,7 +19,9 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import Image
 from sat_intervals.run.cluster import tiles_at_once
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
+from sat_intervals.run.search_range import find_here
 from sat_intervals.run.submit import reason
 from sat_intervals.tiling import Grid, Window
 
@@ -85,7 +87,8 @@ def plan(
         Tiles at once; by default those of the settings (all cores of all jobs with batch systems), or one per core of
         this machine.
     progress
-        Called before kernels are compiled. The estimate contains only the time to load them.
+        Called before kernels are compiled, and during the search for a range that is not given. The estimate contains
+        only the time to load kernels.
 
     Raises
     ------
@@ -93,8 +96,10 @@ def plan(
         The pair cannot be matched, or not even the smallest tile fits in the memory.
     """
     config = resolved(load_config(config))
-    config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
     left, right = checked_pair(left, right, config)
+    config, _, _ = searched(config, left, lambda: find_here(left, right, progress))
+    checked_pair(left, right, config)
+    config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
     workers = workers or tiles_at_once(config.cluster)
     region = checked_region(left, window)
     check_tiles(config, region)

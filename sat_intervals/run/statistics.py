@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.products import FLAGS, INVALID, REGULARIZED, Bands, cause
+from sat_intervals.products import FLAGS, INVALID, RANGE_END, REGULARIZED, Bands, cause
 
 # Widths are counted in steps of a hundredth of a pixel.
 _WIDTH_STEP = 0.01
@@ -13,8 +13,10 @@ _WIDTH_STEP = 0.01
 class Tally:
     """Counts over the pixels of a run."""
 
-    def __init__(self, count: int) -> None:
-        """``count``: number of disparities, so one more than the widest interval."""
+    def __init__(self, count: int, minimum: int = 0) -> None:
+        """``count``: number of disparities, so one more than the widest interval; ``minimum``: the first."""
+        self._middle = minimum + (count - 1) / 2
+        self._ends = np.zeros(2, np.int64)
         # Histogram of the sums of flags, from which all counts follow.
         self._sums = np.zeros(1 << (max(flag.bit for flag in FLAGS) + 1), np.int64)
         self._widths = np.zeros(round(count / _WIDTH_STEP) + 1, np.int64)
@@ -23,6 +25,8 @@ class Tally:
     def add(self, bands: Bands) -> None:
         """Count some rows."""
         self._sums += np.bincount(bands.validity.ravel(), minlength=self._sums.size)
+        ends = bands.disparity[bands.valid & (bands.validity & RANGE_END != 0)]
+        self._ends += np.count_nonzero(ends < self._middle), np.count_nonzero(ends >= self._middle)
         width = (bands.upper - bands.lower)[bands.valid]
         width = np.rint(width[np.isfinite(width)] / np.float32(_WIDTH_STEP)).astype(np.int32)
         self._widths += np.bincount(width, minlength=self._widths.size)
@@ -33,6 +37,8 @@ class Tally:
 
     def report(self) -> dict[str, Any]:
         """Counts of pixels; ``ambiguous``: valid, with the whole search range as interval.
+
+        ``range_ends``: valid pixels with the flag range_end, by the end.
 
         ``flags`` counts a pixel under each of its flags. ``causes`` counts each invalid pixel once, see
         `products.cause`: with ``valid`` they sum to ``pixels``.
@@ -50,5 +56,6 @@ class Tally:
             "low_confidence": self._count(valid & (sums & REGULARIZED != 0)),
             "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
             "causes": {flag.name: self._count(cause(sums) == flag.value) for flag in FLAGS if flag.invalid},
+            "range_ends": {"minimum": int(self._ends[0]), "maximum": int(self._ends[1])},
             "median_interval_width": None if median is None else round(median, 2),
         }

@@ -11,7 +11,8 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Ring
-from sat_intervals.match.borders import Border, Place, borders_of, trace_area
+from sat_intervals.match.borders import Border, Place, borders_of, rehulled, trace_area
+from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
 from sat_intervals.match.patch import (
@@ -24,6 +25,7 @@ from sat_intervals.match.patch import (
     patch_areas,
     path_window,
 )
+from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_views, read_window
@@ -33,6 +35,9 @@ from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
 from sat_intervals.store.removal import BORDERS, COSTS
 from sat_intervals.tiling import Tile, Views, Window
+
+# Tiles along each side of the grid, at most, in which the quality of a pair is looked at.
+_LOOKS = 4
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,33 +81,43 @@ def _match_tile(job: Job, tile: Tile) -> None:
     job.store.check_space(tile)
     frame, borders = _frame(job, tile), None
     seconds: dict[str, float] = {}
-    costed = _costs(job, patch_areas(*frame[:3], job.config), tile, seconds)
+    ranges = job.ranges()
+    costed = _costs(job, patch_areas(*frame[:3], job.config, ranges), tile, seconds)
     if job.hands_states_on:
         with timed(seconds, "read"):
             frames = frames_of(*frame[:3], job.config)
-            borders = [_borders(job, tile, of_view, range(len(WAVEFRONTS))) for of_view in frames]
+            borders = [_borders(job, tile, of_view, range(len(WAVEFRONTS)), ranges) for of_view in frames]
     seconds["match"] = seconds.get("match", 0.0) + seconds.pop("costs", 0.0)
     with timed(seconds, "match"):
-        patch = match_costed(costed.views, frame, costed.made, job.config, borders)
+        patch = match_costed(costed.views, frame, costed.made, job.config, borders, ranges)
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), costed.views, strict=True)}
     with timed(seconds, "write"):
         if job.hands_states_on:
             for mirrored, ring in enumerate(patch.leaving):
                 job.store.write_step(BORDERS, Step(tile, LAST, bool(mirrored)).name, *ring)
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files})
+    looks = [look._asdict() for look in _looks(costed.views, tile, job)]
+    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files, "looks": looks})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
 
+def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
+    """Look at the quality of the pair in some of the tiles, unless the search for its range did so."""
+    grid, search = job.store.grid, job.config.disparity
+    if job.found or tile.grid_row % -(-grid.rows // _LOOKS) or tile.grid_column % -(-grid.columns // _LOOKS):
+        return []
+    return look_in_tile(views, tile.core, search.minimum, search.maximum)
+
+
 def _trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[str, float]:
-    frame = _frame(job, tile)
+    frame, ranges = _frame(job, tile), job.ranges()
     if mirrored:
         frame = mirrored_frame(frame, job.config)
     seconds: dict[str, float] = {}
     with timed(seconds, "trace"):
-        (cost,) = _costs(job, [frame_area(frame, job.config)], tile, seconds).made
-        borders = _borders(job, tile, frame, [wavefront])
-        ring = trace_area(cost, borders, wavefront, mirrored, job.config)
+        (cost,) = _costs(job, [frame_area(frame, job.config, ranges)], tile, seconds).made
+        borders = _borders(job, tile, frame, [wavefront], ranges)
+        ring = trace_area(cost, frame, borders, wavefront, job.config, ranges)
         job.store.write_step(BORDERS, Step(tile, wavefront, mirrored).name, *ring)
     costs = seconds.get("costs", 0.0)
     return {"tiles.costs": costs, "tiles.trace": seconds["trace"] - costs}
@@ -142,23 +157,24 @@ def _costs(job: Job, areas: Sequence[Area], tile: Tile, seconds: dict[str, float
     if not (job.config.cost.precomputed and job.hands_states_on):
         with timed(seconds, "match"):
             return _Costed(views, cost_areas(views, areas, job.config, statistics))
-    size = padded_to_lanes(job.config.disparity.count)
     names = [f"{tile.name}_right" if area.mirrored else tile.name for area in areas]
     with timed(seconds, "read"):
         kept = [costs for name in names for costs in job.store.read_step(COSTS, name) or ()]
     if len(kept) == len(names):
-        made = [np.pad(costs, [(0, 0), (0, 0), (0, size - costs.shape[2])]) for costs in kept]
+        missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
+        made = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
         with timed(seconds, "match"):
             return _Costed(views, cost_areas(views, areas, job.config, statistics, made))
     with timed(seconds, "costs"):
         costed = cost_areas(views, areas, job.config, statistics)
-        for name, cost in zip(names, costed, strict=True):
-            job.store.write_step(COSTS, name, cost.costs.left[:, :, : job.config.disparity.count])
+        for name, area, cost in zip(names, areas, costed, strict=True):
+            job.store.write_step(COSTS, name, cost.costs.left[:, :, : area.disparities])
     return _Costed(views, costed)
 
 
-def _borders(job: Job, tile: Tile, frame: Frame, wavefronts: Iterable[int]) -> Borders:
+def _borders(job: Job, tile: Tile, frame: Frame, wavefronts: Iterable[int], ranges: LocalRanges | None) -> Borders:
     """Read the path states that a tile takes over from its neighbours in a view."""
+    here = narrowed(ranges, frame_area(frame, job.config).base, job.config)
     found: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
     for wavefront in wavefronts:
         for step in needs(job.store.grid, Step(tile, wavefront, frame.mirrored)):
@@ -172,8 +188,11 @@ def _borders(job: Job, tile: Tile, frame: Frame, wavefronts: Iterable[int]) -> B
             there = _frame(job, step.tile)
             if frame.mirrored:
                 there = mirrored_frame(there, job.config)
-            found[wavefront][place] = Border(path_window(there, job.config), Ring(*states))
-    return borders_of(frame, job.config, found)
+            ring = Ring(*states)
+            if ranges:
+                ring = rehulled(ring, frame_area(there, job.config, ranges).minimum, here)
+            found[wavefront][place] = Border(path_window(there, job.config), ring)
+    return borders_of(frame, here, found)
 
 
 def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:

@@ -9,9 +9,10 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, is_seale
 from sat_intervals.store.zarr_arrays import MADE_BY
 
 ARRAYS, RECORDS, FAILURES, BORDERS, COSTS = "arrays.zarr", "records", "failures", "borders", "costs"
-NORMALIZATION = "normalization.json"
+FOLDERS = RECORDS, FAILURES, BORDERS, COSTS
+NORMALIZATION, SEARCH = "normalization.json", "range.json"
 _GROUP = f"{ARRAYS}/zarr.json"
-_OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
+_OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
     rf"|{BORDERS}/(\d+)_(\d+)(?:_right)?_[0-3]"
@@ -35,7 +36,7 @@ def drop(folder: Folder) -> None:
     if is_of_run(folder):
         # The manifest first, since the rest is invalid without it. The group last, to recognise an unfinished removal.
         folder.delete(MANIFEST)
-        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, (RECORDS, FAILURES, BORDERS, COSTS))
+        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, FOLDERS)
         folder.delete_all([_GROUP], [ARRAYS])
     folder.delete_if_empty()
 

@@ -25,11 +25,12 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, diges
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
-    BORDERS,
     COSTS,
     FAILURES,
+    FOLDERS,
     NORMALIZATION,
     RECORDS,
+    SEARCH,
     check_not_foreign,
     drop,
     final_name,
@@ -43,13 +44,11 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 7
+LAYOUT = 8
 
-# Marker files in the folder of a run.
-# Present while a run replaces an earlier one.
-_REPLACING = ".sat-intervals.replacing"
-# Name of the run, from the publication of its files to the removal of its tiles.
-_FINISHED = ".sat-intervals.finished"
+# Marker files in the folder of a run: present while it replaces an earlier run; its name, from the publication of its
+# files to the removal of its tiles.
+_REPLACING, _FINISHED = ".sat-intervals.replacing", ".sat-intervals.finished"
 
 
 class DamagedTilesError(RunError):
@@ -139,7 +138,7 @@ class Store:
                 drop(folder)
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
-            for name in ("", RECORDS, FAILURES, BORDERS, COSTS):
+            for name in ("", *FOLDERS):
                 folder.make(name)
             home.make("")
             home.delete(_FINISHED)
@@ -245,6 +244,17 @@ class Store:
     def normalization(self) -> dict[str, Any] | None:
         """Read the statistics of `write_normalization`; None if missing or damaged."""
         return unsealed(self.folder.read(NORMALIZATION), self.run)
+
+    def write_search(self, search: Mapping[str, Any], of: str) -> None:
+        """Write the search range that was found, so that it is not searched again, see `before`.
+
+        ``of`` names all that decides which range is found: not the run, which depends on the range.
+        """
+        self.folder.write(SEARCH, sealed(search, of))
+
+    def search(self, of: str) -> dict[str, Any] | None:
+        """Read what `write_search` wrote; None if missing, damaged or of other images."""
+        return unsealed(self.folder.read(SEARCH), of)
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Write why a tile failed, for `failures`; a later record replaces it."""
@@ -361,14 +371,6 @@ def replaceable_files(home: Path) -> dict[str, str]:
 def has_begun(home: Path) -> bool:
     """Return whether a run made this folder of tiles; a user's folder may have the same name."""
     return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
-
-
-def inputs_before(home: Path, store: str | None) -> dict[str, Any]:
-    """Return the inputs in the manifest of existing tiles; empty if it cannot be read."""
-    try:
-        return dict((unsealed(place_of(home, store).read(MANIFEST)) or {}).get("inputs", {}))
-    except (OSError, TypeError, ValueError):
-        return {}
 
 
 def _checksums(records: Records) -> Checksums:

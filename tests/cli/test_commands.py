@@ -191,21 +191,15 @@ def test_match__refuses_options_that_do_not_suit_the_pair(folder, tmp_path, opti
         ("sgm: {p1: 8, p1: 9}", "line 1: key 'p1' appears twice"),
         ("- sgm", "holds ['sgm'], allowed: sections preset, disparity, "),
         ("sgm: {", "line 1: "),
-        ("", "disparity is missing, allowed: section of minimum, maximum"),
+        ("disparity: {minimum: 3}", "disparity: minimum is 3, maximum is auto: give two numbers, or auto twice"),
     ],
 )
 def test_match__refuses_settings_that_it_does_not_know(folder, tmp_path, text, says):
     (tmp_path / "settings.yaml").write_text(text)
-    options = ["--disparity", "-9", "9"] if text else []
+    options = [] if text.startswith("disparity") else ["--disparity", "-9", "9"]
     result = invoke(*matching(folder, tmp_path / "out", *options, config=tmp_path / "settings.yaml"))
     assert_refused(result, f"{tmp_path / 'settings.yaml'}: ", says)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("command", "out"), [("match", ["out"]), ("plan", [])])
-def test_command__asks_for_a_search_range(folder, tmp_path, command, out):
-    result = invoke(command, folder / "left.tif", folder / "right.tif", *[tmp_path / name for name in out])
-    assert_refused(result, "Missing search range: give --disparity MIN MAX", f"{command} --help")
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
@@ -659,7 +653,7 @@ def test_match__writes_what_match_arrays_gives_as_xarray(folder, tmp_path, scene
 
 def test_match__reports_what_it_was_given(folder, done, scene):
     report = json.loads((done[0] / "run.json").read_text())
-    assert report["settings"]["disparity"] == search(scene)
+    assert report["settings"]["disparity"].items() >= search(scene).items()
     assert (report["tiles"]["rows"], report["tiles"]["columns"]) == (4, 5)
     for side in ("left", "right"):
         shown, path = report["inputs"][side], folder / f"{side}.tif"
@@ -726,7 +720,7 @@ def test_match__command_line_wins_over_the_file(folder, tmp_path):
     arguments = matching(folder, tmp_path / "out", "--disparity", -3, 4, config=tmp_path / "mine.yaml")
     assert invoke(*arguments, "--overlap", 7).exit_code == 0
     settings = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
-    assert settings["disparity"] == {"minimum": -3, "maximum": 4}
+    assert settings["disparity"].items() >= {"minimum": -3, "maximum": 4}.items()
     assert settings["tiles"] == {"size": 128, "overlap": 7}
     assert settings["interval"]["alpha"] == 0.8
 
@@ -747,8 +741,9 @@ def test_config__prints_settings_that_match_takes(folder, tmp_path, preset):
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == preset_text(preset)
     (tmp_path / "preset.yaml").write_text(result.stdout)
-    settings = load_config(tmp_path / "preset.yaml")
-    arguments = matching(folder, tmp_path / "out", "--window", 60, 80, 70, 90, config=tmp_path / "preset.yaml")
+    settings = load_config(tmp_path / "preset.yaml", {"disparity": {"minimum": -9, "maximum": 9}})
+    options = "--window", 60, 80, 70, 90, "--disparity", -9, 9
+    arguments = matching(folder, tmp_path / "out", *options, config=tmp_path / "preset.yaml")
     result = invoke(*arguments)
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "out" / "run.json").read_text())
@@ -793,7 +788,8 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     out = tmp_path / "out"
     arguments = ("demo", out, "--size", 150, 180, "--seed", 4)
     result = invoke(*arguments)
-    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.exit_code == 0
+    assert "the ends of the search range" in result.stderr  # a small scene: much of it lies beside the images' borders
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "left.tif", "right.tif", "truth.tif"])
     held, *compared = result.stdout.splitlines()[-3:]
     found = re.fullmatch(

@@ -70,7 +70,7 @@ def test_default_yaml__holds_every_setting_at_its_default() -> None:
     for section, keys in values.items():
         model = getattr(settings(), section)
         assert list(keys) == list(type(model).model_fields)
-    assert load_config(values) == settings()
+    assert load_config(values, RANGE) == settings()
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -93,7 +93,9 @@ def test_preset_text__comments_every_setting_with_its_meaning_and_range(name: st
 
 
 def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
-    assert load_config(yaml.safe_load(preset_text("mccnn"))) == settings(preset="mccnn", cost={"method": "mccnn"})
+    assert load_config(yaml.safe_load(preset_text("mccnn")), RANGE) == settings(
+        preset="mccnn", cost={"method": "mccnn"}
+    )
 
 
 @pytest.mark.parametrize(
@@ -101,12 +103,12 @@ def test_preset_text__mccnn_holds_the_defaults_of_its_cost() -> None:
     [("satellite", 7, 20, 128), ("urban", 11, 20, 80), ("mountain", 11, 38, 464), ("homogeneous", 11, 72, 309)],
 )
 def test_preset_text__changes_census_and_penalties(name: str, window: int, p1: int, p2: int) -> None:
-    config = load_config(yaml.safe_load(preset_text(name)))
+    config = load_config(yaml.safe_load(preset_text(name)), RANGE)
     assert config == settings(preset=name, cost={"window": window}, sgm={"p1": p1, "p2": p2})
 
 
 def test_preset_text__satellite_mccnn_has_constant_penalties_with_their_span() -> None:
-    config = load_config(yaml.safe_load(preset_text("satellite-mccnn")))
+    config = load_config(yaml.safe_load(preset_text("satellite-mccnn")), RANGE)
     sgm = {"penalty": "constant", "p1": 0.6, "p2": 3.5, "span": 42}
     assert isinstance(config.sgm, CosineSgm)
     assert config == settings(preset="satellite-mccnn", cost={"method": "mccnn"}, sgm=sgm)
@@ -256,7 +258,7 @@ REFUSED = [
     ("disparity", {"maximum": 5.0}, "disparity.maximum is 5.0, allowed: integer >= -16000, <= 16000"),
     ("disparity", {"maximum": True}, "disparity.maximum is true, allowed: integer >= -16000, <= 16000"),
     ("disparity", {"maximum": None}, "disparity.maximum is null, allowed: integer >= -16000, <= 16000"),
-    ("disparity", None, "disparity is null, allowed: section of minimum, maximum"),
+    ("disparity", None, "disparity is null, allowed: section of minimum, maximum, open_ends"),
     ("cost", None, "cost is null, allowed: section of method, window"),
     ("cost", {"method": "sad"}, "cost.method is 'sad', allowed: census or mccnn"),
     ("cost", {"method": "mccnn", "window": 5}, "unknown key 'cost.window' (known: method, weights)"),
@@ -360,10 +362,14 @@ def test_load_config__a_file_is_not_blamed_for_overrides(write) -> None:
     assert message(file, RANGE | {"tiles": {"size": 64}}).startswith(f"{file}: tiles.overlap is 2, allowed:")
 
 
-def test_load_config__missing_search_range_is_named() -> None:
-    assert message(None) == "disparity is missing, allowed: section of minimum, maximum"
-    assert message({"disparity": {"minimum": 0}}) == (
-        "disparity.maximum is missing, allowed: integer >= -16000, <= 16000"
+def test_load_config__search_range_is_found_unless_it_is_given() -> None:
+    assert load_config(None).disparity.is_auto
+    assert not settings().disparity.is_auto
+    assert message({"disparity": {"minimum": 0}}).startswith(
+        "disparity: minimum is 0, maximum is auto: give two numbers"
+    )
+    assert message({"disparity": {"minimum": "low", "maximum": 3}}) == (
+        "disparity.minimum is 'low', allowed: integer >= -16000, <= 16000 or auto"
     )
 
 

@@ -129,8 +129,8 @@ def test_match_arrays__takes_what_load_config_takes(scene, expected):
     left, right, _ = scene
     sections = {"disparity": {"minimum": -6, "maximum": 9}, "cost": {"window": 3}}
     check(match_arrays(left, right, sections), expected)
-    with pytest.raises(SatIntervalsError, match="disparity is missing"):
-        match_arrays(left, right, {})
+    with pytest.raises(SatIntervalsError, match="disparity is null"):
+        match_arrays(left, right, {"disparity": None})
 
 
 def test_match_arrays__of_one_pixel_is_one_invalid_pixel(scene):

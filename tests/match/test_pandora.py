@@ -23,11 +23,12 @@ from sat_intervals.config import Config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.in_memory import _moments, _view
+from sat_intervals.match.in_memory import _moments
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.normalization import PairStatistics, statistics_of
 from sat_intervals.match.patch import kernel_settings
+from sat_intervals.match.whole import _view
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
 from sat_intervals.tiling import Window
 

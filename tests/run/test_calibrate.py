@@ -8,12 +8,13 @@ import rasterio
 import yaml
 from helpers import PLACE, invoke, write_pair
 
-from sat_intervals import match_pair
+from sat_intervals import SatIntervalsError, match_pair, open_image
 from sat_intervals.config import PRESETS, calibration_of, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import write_layer
 from sat_intervals.run import tune
+from sat_intervals.run.calibrate import Subject, check_subjects, truth_of
 from sat_intervals.run.tune import Tuned, best_of, candidates
 
 
@@ -143,6 +144,21 @@ def test_calibrate__a_calibration_of_other_settings_is_refused(scene, tmp_path):
     line = one_line(invoke(*arguments, *with_calibration, "--preset", "satellite"))
     assert "belongs to other settings" in line
     assert "sat-intervals calibrate" in line
+
+
+def test_calibrate__a_run_with_local_ranges_is_matched_over_its_whole_range(scene, tmp_path):
+    settings = settings_with(scene)
+    settings["disparity"]["local"] = True
+    match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+    found = yaml.safe_load(calibrated(tmp_path / "out", tmp_path / "one.yaml"))
+    assert found["levels"] == yaml.safe_load((scene / "calibration.yaml").read_text())["levels"]
+
+
+def test_check_subjects__needs_the_search_range_as_numbers(scene):
+    left, right = (open_image(scene / f"{side}.tif") for side in ("left", "right"))
+    subject = Subject("one", "one", left, right, truth_of(left, scene / "truth.tif"), load_config({}))
+    with pytest.raises(SatIntervalsError, match="one: the search range is auto, but calibrate needs it as numbers"):
+        check_subjects([subject])
 
 
 def test_calibrate__levels_out_of_order_are_refused(scene, tmp_path):

@@ -1,0 +1,90 @@
+"""``sat-intervals range``: find the search range of a pair, with its evidence."""
+
+import json
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sat_intervals.cli.options import image_options, log_options, named, path, quiet_option
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from sat_intervals.raster import Image
+    from sat_intervals.tiling import Window
+
+# Bars of the histogram that are printed, each of several bins.
+_BARS = 8
+
+
+@click.command("range", short_help="Find the search range of a pair.")
+@click.argument("left", callback=named)
+@click.argument("right", callback=named)
+@image_options
+@click.option("--output", callback=path, metavar="FILE", help="Write the local ranges, for --range-grid of match.")
+@click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
+@quiet_option
+@log_options
+def search_range(
+    left: str,
+    right: str,
+    open_images: "Callable[[str, str], tuple[Image, Image]]",
+    window: "Window | None",
+    output: "Path | None",
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Find the search range of the epipolar images LEFT and RIGHT, as match does without --disparity.
+
+    Prints the range and its evidence; --output keeps the ranges of the cells. --window has no effect: a range is always
+    that of the whole images.
+    """
+    from sat_intervals.cli.console import Console
+    from sat_intervals.run.local_ranges import write_ranges
+    from sat_intervals.run.quality import doubts
+    from sat_intervals.run.search_range import find_here
+
+    with Console(quiet or as_json) as console:
+        images = open_images(left, right)
+        found = find_here(*images, console.progress)
+        if output:
+            write_ranges(output, found.local, images[0])
+    if as_json:
+        click.echo(json.dumps(found.report(), indent=1))
+        return
+    for name, value in _rows(found):
+        click.echo(f"{name:<36}{value}")
+    for line in doubts(found.quality, {"left": left, "right": right}):
+        click.echo(line)
+
+
+def _rows(found: Any) -> list[tuple[str, str]]:
+    rows = [("search range", f"{found.minimum} to {found.maximum} px")]
+    rows.append(("consistent matches", f"{100 * found.matched:.1f} % of the left pixels"))
+    rows.append(("local ranges, of the whole", f"{100 * found.local.share:.0f} %"))
+    for level in found.levels:
+        searched = f"{level.minimum} to {level.maximum} px searched, {100 * level.matched:.1f} % matched"
+        rows.append((f"  images reduced {level.step} times", searched))
+    rows += _histogram(found.histogram)
+    quality: dict[str, Any] = found.quality
+    if quality["noise"] is not None:
+        rows.append(("distance of matches", f"{quality['noise']:.2f} of that of random pixels"))
+        rows.append(("rows of both images differ by", f"{abs(quality['row_offset']):.1f} px"))
+    for side, collar in quality["collars"].items():
+        share = f"{100 * collar['share']:.0f} % of the pixels, along the borders"
+        rows.append((f"{side} image, value {collar['value']:g}", share))
+    return rows
+
+
+def _histogram(histogram: dict[str, list[float]]) -> list[tuple[str, str]]:
+    edges, counts = histogram["edges"], histogram["counts"]
+    each = len(counts) // _BARS
+    bars = [sum(counts[first : first + each]) for first in range(0, len(counts), each)]
+    return [
+        (
+            f"  {edges[each * i]:.0f} to {edges[each * (i + 1)]:.0f} px",
+            f"{100 * bar / max(sum(bars), 1):.1f} % of the matches",
+        )
+        for i, bar in enumerate(bars)
+    ]

@@ -1,0 +1,46 @@
+"""Matching of two arrays as one tile: raw products, cross-checking and final bands of whole images."""
+
+import numpy as np
+
+from sat_intervals.config import Config
+from sat_intervals.kernels.confidence import ambiguity_histogram
+from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.patch import match_patch, patch_windows
+from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
+from sat_intervals.products import NO_DATA, NO_DISPARITY, Bands
+from sat_intervals.tiling import View, Window
+
+
+def match_whole(
+    left: np.ma.MaskedArray,
+    right: np.ma.MaskedArray,
+    config: Config,
+    statistics: PairStatistics | None = None,
+    ranges: LocalRanges | None = None,
+) -> Bands:
+    """Match two images of finite floats, ``(rows, columns)``; masked pixels are no data.
+
+    ``statistics`` are those of the images; None if the matching cost needs none. ``ranges`` are local search ranges;
+    None: all pixels search the whole range.
+    """
+    whole = Window(0, 0, *left.shape)
+    windows = patch_windows(whole, whole, whole, config, ranges)
+    views = _view(left, windows[0]), _view(right, windows[1])
+    patch = match_patch(views, whole, whole, whole, config, statistics, ranges=ranges)
+    raw, scale = patch.raw, ConfidenceScale(np.nan, np.nan)
+    if config.ambiguity:
+        histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
+        scale = confidence_scale(config.ambiguity, histogram)
+    return postprocess_rows(RawRows.of(raw, patch.right), 0, whole.height, scale, config)
+
+
+def _view(image: np.ma.MaskedArray, window: Window) -> View:
+    """Pixels and states of a window, which may extend beyond the image."""
+    pixels = np.zeros((window.height, window.width), image.dtype)
+    state = np.full(pixels.shape, NO_DATA, np.uint8)
+    inside = window.clipped(Window(0, 0, *image.shape))
+    part, here = image[inside.slices], inside.relative_to(window).slices
+    pixels[here] = part.filled(0)
+    state[here] = np.where(np.ma.getmaskarray(part), NO_DATA, 0)
+    return View(window, pixels, state)

@@ -1,0 +1,102 @@
+"""The search range and the local ranges of a pair: given, found, or read from the raster that the user gives."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from sat_intervals.config import Config
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.search_range import Found, with_range
+from sat_intervals.raster import Image, open_image, read_shape, read_window, write_rows
+from sat_intervals.raster.identity import check_not_replaced
+from sat_intervals.tiling import Window
+
+# Side of the cells that a raster of ranges is reduced to, in pixels.
+_CELL = 64
+# Rows written at a time.
+_STRIP = 256
+
+
+def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
+    """Return settings with the search range as numbers, what was found, if anything, and the local ranges, if any.
+
+    ``find`` searches the images; it is called if the range or local ranges are wanted that are not given.
+    """
+    search = config.disparity
+    raster = read_ranges(search.grid, left) if search.grid else None
+    found = None
+    if raster is None and (search.is_auto or search.local):
+        found = find()
+    if search.is_auto:
+        config = with_range(config, found) if found else _with_range_of(config, raster)
+    if not search.is_local:
+        return config, found, None
+    local = raster if raster else found.local if found else None
+    assert local is not None
+    return config, found, local.clipped(config.disparity.minimum, config.disparity.maximum)
+
+
+def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
+    """Return settings with the hull of a raster of ranges as search range."""
+    assert raster is not None
+    known = raster.minimum <= raster.maximum
+    if not known.any():
+        raise SatIntervalsError(f"{config.disparity.grid} has no data: give another raster, or the search range")
+    ends = {"minimum": int(raster.minimum[known].min()), "maximum": int(raster.maximum[known].max())}
+    return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
+
+
+def write_ranges(path: str | Path, ranges: LocalRanges, left: Image) -> None:
+    """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
+    check_not_replaced([left.path], [Path(path)])
+    rows = (
+        np.stack(ranges.at(Window(row, 0, min(_STRIP, left.height - row), left.width)))
+        for row in range(0, left.height, _STRIP)
+    )
+    write_rows(path, rows, (2, left.height, left.width), left.georeferencing)
+
+
+def read_ranges(path: str, left: Image) -> LocalRanges:
+    """Read a raster of two bands, minimum and maximum for each pixel of the left image; reduce it to cells.
+
+    The range of a cell is the hull of its pixels, rounded outwards. It is empty, minimum above maximum, where a pixel
+    has no data.
+
+    Raises
+    ------
+    SatIntervalsError
+        The raster does not fit the image, or a minimum is above its maximum.
+    """
+    bands, height, width = read_shape(path)
+    if (bands, height, width) != (2, left.height, left.width):
+        raise SatIntervalsError(
+            f"{path} has {bands} bands of {height} x {width} pixels, {left.path} {left.height} x {left.width}: give "
+            "minimum and maximum for each pixel of the left image"
+        )
+    images = [open_image(path, band=band) for band in (1, 2)]
+    here, there = images[0].georeferencing, left.georeferencing
+    if here.crs and there.crs and (here.crs, here.transform) != (there.crs, there.transform):
+        raise SatIntervalsError(f"{path} and {left.path} lie at different places: give ranges of the left image")
+    rows = [_row_of_cells(images, Window(row, 0, min(_CELL, height - row), width)) for row in range(0, height, _CELL)]
+    minimum, maximum = (np.stack(bound) for bound in zip(*rows, strict=True))
+    return LocalRanges(minimum, maximum, _CELL, _CELL)
+
+
+def _row_of_cells(images: list[Image], window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Minima and maxima of the cells of some rows, int16."""
+    (low, no_low), (high, no_high) = (read_window(image, window) for image in images)
+    empty = (no_low | no_high) != 0
+    if (wrong := ~empty & (low > high)).any():
+        row, column = (int(place[0]) for place in np.nonzero(wrong))
+        raise SatIntervalsError(
+            f"{images[0].path} has minimum {low[row, column]:g} above maximum {high[row, column]:g} at row "
+            f"{window.row + row}, column {column}: swap the bands"
+        )
+    starts = np.arange(0, window.width, _CELL)
+    least = np.minimum.reduceat(np.floor(low).min(axis=0), starts)
+    most = np.maximum.reduceat(np.ceil(high).max(axis=0), starts)
+    has_gap = np.logical_or.reduceat(empty.any(axis=0), starts)
+    ends = np.clip(np.where(has_gap, [[1], [0]], [least, most]), -16000, 16000).astype(np.int16)
+    return ends[0], ends[1]

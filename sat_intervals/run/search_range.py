@@ -1,0 +1,164 @@
+"""Find the search range of a pair on a cluster: workers reduce the images block by block and look at samples."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from distributed import Client
+
+from sat_intervals.config import Cluster
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.match.normalization import blocks
+from sat_intervals.match.sampling import Look, Sample, coarse_rows, look, samples, summary
+from sat_intervals.match.search_range import (
+    Found,
+    NoRangeError,
+    Step,
+    collar,
+    find_range,
+    finest_step,
+    reduced,
+    settings,
+)
+from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.progress import Progress
+from sat_intervals.raster import Image, read_window
+from sat_intervals.raster.identity import ChangedInputError, check_unchanged
+from sat_intervals.run.cluster import Connection
+from sat_intervals.run.quality import COLLAR, is_plain
+from sat_intervals.run.submit import Submission, Task, reason
+from sat_intervals.tiling import Window
+
+_Files = dict[str, dict[str, Any]]
+_Result = TypeVar("_Result")
+_RETRIES = 2
+
+
+class _Block(NamedTuple):
+    """A block of an image at the finest level, and the smallest of its usable pixels."""
+
+    pixels: np.ndarray
+    smallest: float
+
+
+def reduce_block(image: Image, block: Window, step: Step, files: _Files) -> _Block:
+    """Reduce a block of an image; runs on a worker."""
+
+    def work() -> _Block:
+        pixels, state = read_window(image, block)
+        smallest = pixels.min(where=state == 0, initial=np.inf)
+        return _Block(reduced(pixels, state, step), float(smallest))
+
+    return _checked(work, files)
+
+
+def look_at(left: Image, right: Image, sample: Sample, files: _Files) -> Look | None:
+    """Match a sample; runs on a worker."""
+
+    def work() -> Look | None:
+        views = (read_window(image, window) for image, window in zip((left, right), sample.views, strict=True))
+        return look(sample, *views)
+
+    return _checked(work, files)
+
+
+def _checked(work: Callable[[], _Result], files: _Files) -> _Result:
+    """Do the work; raise if an input has changed meanwhile, and only errors that can be pickled."""
+    try:
+        try:
+            return work()
+        finally:
+            check_unchanged(files)
+    except SatIntervalsError as error:
+        error.__cause__ = error.__context__ = None
+        raise
+
+
+def search_range(client: Client, left: Image, right: Image, files: _Files, progress: Progress) -> Found:
+    """Find the search range of a pair from the whole images, with its evidence.
+
+    Parameters
+    ----------
+    client
+        Of the cluster.
+    left, right
+        The images.
+    files
+        `identity` of their files.
+    progress
+        Called after each block.
+
+    Raises
+    ------
+    NoRangeError
+        The images have too few consistent matches.
+    RunError
+        An image cannot be read.
+    """
+    progress("kernels", 0, 1)
+    compile_kernels(settings(0, 3))
+    step = finest_step(left.height, max(left.width, right.width))
+    small, collars = [], {}
+    for side, image in (("left", left), ("right", right)):
+        pixels, smallest = _reduced(client, image, step, files, progress)
+        found = collar(pixels, smallest)
+        if is_plain(image) and found.mean() > COLLAR:
+            collars[side] = {"value": smallest, "share": round(float(found.mean()), 4)}
+            pixels[found] = np.nan
+        small.append(pixels)
+    try:
+        searched, matches = find_range(small[0], small[1], step, (left.height, left.width))
+    except NoRangeError as error:
+        raise NoRangeError(
+            f"{left.path} and {right.path}: {error}: give the search range with --disparity MIN MAX, or check that the "
+            "images are an epipolar pair"
+        ) from None
+    chosen = [(left, right, sample, files) for sample in samples(matches, coarse_rows(*matches.images, matches))]
+    looks = [found for _, found in _outcomes(client, look_at, chosen, lambda stage, done, total: None)]
+    return replace(searched, quality=summary(looks) | {"collars": collars})
+
+
+def find_here(left: Image, right: Image, progress: Progress) -> Found:
+    """Find the search range of a pair with the cores of this machine; see `search_range`."""
+    with Connection(Cluster(), Path()) as connection:
+        return search_range(connection.client(), left, right, {}, progress)
+
+
+def _reduced(client: Client, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:
+    """An image at the finest level, and its smallest usable value."""
+    windows = [
+        block
+        for block in blocks(image.height, image.width)
+        if block.height >= step.rows and block.width >= step.columns
+    ]
+    small = np.full((image.height // step.rows, image.width // step.columns), np.nan, np.float32)
+    smallest = np.inf
+    for number, found in _outcomes(client, reduce_block, [(image, each, step, files) for each in windows], progress):
+        row, column = windows[number].row // step.rows, windows[number].column // step.columns
+        small[row : row + found.pixels.shape[0], column : column + found.pixels.shape[1]] = found.pixels
+        smallest = min(smallest, found.smallest)
+    return small, smallest
+
+
+def _outcomes(
+    client: Client, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], progress: Progress
+) -> Iterator[tuple[int, Any]]:
+    """Results of a function on workers, by the number of the task.
+
+    Raises
+    ------
+    RunError
+        A task failed.
+    """
+    done = 0
+    for outcome in Submission(client, (Task(i, function, arguments, _RETRIES) for i, arguments in enumerate(tasks))):
+        if outcome is not None and outcome.error is not None:
+            if isinstance(outcome.error, ChangedInputError):
+                raise outcome.error
+            raise RunError(f"the search range could not be found: {reason(outcome.error)}") from outcome.error
+        if outcome is not None:
+            done += 1
+            yield outcome.label, outcome.result
+        progress("range", done, len(tasks))

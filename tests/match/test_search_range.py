@@ -1,0 +1,89 @@
+"""The search range from the images: it holds the truth, and images that do not match are refused."""
+
+import numpy as np
+import pytest
+
+from sat_intervals import match_arrays
+from sat_intervals.demo import make_scene
+from sat_intervals.match.search_range import Found, NoRangeError, Step, collar, find_range, finest_step, reduced
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(300, 700, seed=7)
+
+
+def small(image, step):
+    return reduced(image.astype(np.float32), (image == 0).view(np.uint8), step)
+
+
+def searched(left, right):
+    step = finest_step(left.shape[0], max(left.shape[1], right.shape[1]))
+    return find_range(small(left, step), small(right, step), step, left.shape)[0]
+
+
+def test_find_range__holds_the_truth_and_is_narrow(scene):
+    found = searched(scene.left, scene.right)
+    truth = scene.truth[np.isfinite(scene.truth)]
+    assert np.mean((found.minimum <= truth) & (truth <= found.maximum)) > 0.999
+    assert found.maximum - found.minimum < 1.8 * (truth.max() - truth.min())
+    assert found.matched > 0.7
+    assert sum(found.histogram["counts"]) > 0
+
+
+def test_find_range__swapped_images_have_the_range_of_the_other_sign(scene):
+    there, back = searched(scene.left, scene.right), searched(scene.right, scene.left)
+    assert abs(there.minimum + back.maximum) <= 4
+    assert abs(there.maximum + back.minimum) <= 4
+
+
+def test_find_range__searches_further_where_the_range_is_far_from_zero(scene):
+    near = searched(scene.left, scene.right)
+    far = searched(scene.left[:, :400], scene.right[:, 300:])
+    assert abs(far.minimum + 300 - near.minimum) <= 25
+    assert abs(far.maximum + 300 - near.maximum) <= 25
+    assert len({(level.minimum, level.maximum) for level in far.levels}) == len(far.levels)
+
+
+def test_find_range__refuses_images_without_consistent_matches(scene):
+    with pytest.raises(
+        NoRangeError, match=r"only \d % of the pixels have a consistent match between disparities -69\d"
+    ):
+        searched(scene.left, scene.right[::-1])
+    with pytest.raises(NoRangeError, match="only 0 %"):
+        searched(np.full((200, 500), 7), np.full((200, 500), 7))
+
+
+def test_find_range__few_rows_are_averaged_less():
+    assert finest_step(400, 30_000) == Step(4, 8)
+    assert finest_step(12, 3000) == Step(1, 8)
+    assert finest_step(3000, 500) == Step(1, 1)
+    assert finest_step(3000, 1900) == Step(4, 4)
+
+
+def test_reduced__averages_usable_pixels_where_half_of_a_block_is_usable():
+    pixels = np.array([[1, 2, 0, 8, 9], [3, 0, 0, 0, 9]], np.float32)
+    assert reduced(pixels, (pixels == 0).view(np.uint8), Step(2, 2)).tolist()[0][0] == 2.0
+    assert np.isnan(reduced(pixels, (pixels == 0).view(np.uint8), Step(2, 2))[0, 1])
+    assert reduced(pixels, np.zeros(pixels.shape, np.uint8), Step(1, 2)).tolist() == [[1.5, 4.0], [1.5, 0.0]]
+
+
+def test_collar__reaches_the_border():
+    image = np.ones((5, 6), np.float32)
+    image[:, 0] = image[2, 3] = image[4, 3:] = 0
+    found = collar(image, 0.0)
+    assert found.sum() == 8
+    assert not found[2, 3]
+    assert not collar(image, np.inf).any()
+
+
+def test_found__survives_its_report(scene):
+    found = searched(scene.left, scene.right)
+    assert Found.of_report(found.report()) == found
+
+
+def test_match_arrays__finds_the_range_that_is_not_given(scene):
+    left, right = (np.ma.masked_equal(image[:120], 0) for image in (scene.left, scene.right))
+    found = searched(left.filled(0), right.filled(0))
+    search = {"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
+    assert match_arrays(left, right, {}).identical(match_arrays(left, right, {"disparity": search}))

@@ -1,0 +1,138 @@
+"""The search range of a run: found, kept, resumed, local, and the warnings about its ends."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import PLACE, bands, invoke, write_pair
+
+from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
+from sat_intervals.demo import make_scene
+from sat_intervals.raster import write_layer
+from sat_intervals.run import pair as run_pair
+from sat_intervals.run.local_ranges import read_ranges
+from sat_intervals.run.pair import prepare
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("range")
+    write_pair(place, make_scene(180, 420, seed=11))
+    return place
+
+
+def run(folder, out, **sections):
+    return match_pair(folder / "left.tif", folder / "right.tif", out, sections)
+
+
+def test_match_pair__keeps_what_was_asked_and_what_was_found(folder, tmp_path):
+    report = run(folder, tmp_path / "found")
+    search = report["settings"]["disparity"]
+    assert report["requested"]["disparity"]["minimum"] == "auto"
+    assert (search["minimum"], search["maximum"]) == tuple(report["search"][end] for end in ("minimum", "maximum"))
+    given = {"minimum": search["minimum"], "maximum": search["maximum"], "open_ends": True}
+    run(folder, tmp_path / "given", disparity=given)
+    for one, other in zip(bands(tmp_path / "found"), bands(tmp_path / "given"), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_match_pair__an_interrupted_run_keeps_its_range(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_pair, "match_jobs", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, tmp_path)
+    stored = json.loads((tmp_path / "tiles/range.json").read_text())["found"]
+    monkeypatch.undo()
+    monkeypatch.setattr(run_pair, "search_range", lambda *_: pytest.fail("searched again"))
+    report = run(folder, tmp_path)
+    assert report["search"]["minimum"] == stored["minimum"]
+    assert not (tmp_path / "tiles").exists() or not list((tmp_path / "tiles").glob("*.json"))
+
+
+def test_prepare__a_range_to_be_found_needs_a_search(folder, tmp_path):
+    with pytest.raises(SatIntervalsError, match="auto: give it as numbers"):
+        prepare(folder / "left.tif", folder / "right.tif", tmp_path, {})
+
+
+def test_match_pair__takes_no_range_of_other_images(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_pair, "match_jobs", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, tmp_path)
+
+    def search(*_):
+        raise RunError("searched again")
+
+    monkeypatch.setattr(run_pair, "search_range", search)
+    with pytest.raises(RunError, match="searched again"):
+        match_pair(folder / "right.tif", folder / "left.tif", tmp_path, {})
+
+
+OF_MCCNN = pytest.param({"preset": "satellite-mccnn"}, marks=pytest.mark.peer("onnxruntime", "mc_cnn"))
+
+
+@pytest.mark.parametrize("settings", [{}, {"interval": {"coverage": 0.9}}, OF_MCCNN])
+def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path, settings):
+    reports = []
+    for size in (64, 512):
+        tiles = {"size": size, "overlap": "exact"}
+        reports.append(run(folder, tmp_path / str(size), disparity={"local": True}, tiles=tiles, **settings))
+    assert reports[0]["local_ranges"]["share"] < 0.95
+    for one, other in zip(bands(tmp_path / "64"), bands(tmp_path / "512"), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def write_bands(file, low, high):
+    options = {"count": 2, "height": low.shape[0], "width": low.shape[1], "dtype": "float32", "nodata": np.nan}
+    with rasterio.open(file, "w", driver="GTiff", **options, **PLACE.creation_options()) as dataset:
+        dataset.write(np.stack([low, high]).astype(np.float32))
+
+
+def test_read_ranges__takes_the_hull_of_a_cell_rounded_outwards(folder, tmp_path):
+    left = open_image(folder / "left.tif")
+    low, high = np.full((180, 420), -3.5), np.full((180, 420), 4.2)
+    low[10, 10], high[70, 70], low[150, 410] = -9.1, 12.5, np.nan
+    file = tmp_path / "ranges.tif"
+    write_bands(file, low, high)
+    found = read_ranges(str(file), left).clipped(-20, 20)
+    assert (found.minimum[0, 0], found.maximum[0, 0]) == (-10, 5)
+    assert (found.minimum[1, 1], found.maximum[1, 1]) == (-4, 13)
+    assert (found.minimum[2, 6], found.maximum[2, 6]) == (-20, 20)
+    low[3, 4] = 9
+    write_bands(file, low, high)
+    with pytest.raises(SatIntervalsError, match=r"minimum 9 above maximum 4\.2 at row 3, column 4"):
+        read_ranges(str(file), left)
+    write_layer(file, low, np.nan, PLACE)
+    with pytest.raises(SatIntervalsError, match="has 1 bands of 180 x 420 pixels"):
+        read_ranges(str(file), left)
+
+
+def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):
+    images = folder / "left.tif", folder / "right.tif"
+    assert invoke("range", *images, "--output", tmp_path / "range.tif", "-q").exit_code == 0
+    report = run(folder, tmp_path / "out", disparity={"grid": str(tmp_path / "range.tif")}, tiles={"size": 128})
+    search = report["settings"]["disparity"]
+    with rasterio.open(tmp_path / "range.tif") as dataset:
+        low, high = dataset.read()
+    assert (search["minimum"], search["maximum"]) == (low.min(), high.max())
+    (disparity, *_), _ = bands(tmp_path / "out")
+    assert report["local_ranges"]["share"] < 0.95
+    assert np.isfinite(disparity).mean() > 0.5
+
+
+def test_match__names_a_wider_range_and_is_strict(folder, tmp_path):
+    command = "match", folder / "left.tif", folder / "right.tif", tmp_path, "--disparity", -3, 9, "--strict", "-q"
+    result = invoke(*command)
+    assert result.exit_code == 1
+    report = json.loads((tmp_path / "run.json").read_text())
+    assert any("lie at -3 or 9, the ends of the search range: try --disparity" in line for line in report["warnings"])
+    assert report["counts"]["range_ends"]["maximum"] > 0
+
+
+def test_range__prints_the_range_and_refuses_images_that_do_not_match(folder, tmp_path):
+    found = json.loads(invoke("range", folder / "left.tif", folder / "right.tif", "--json").stdout)
+    assert found["matched"] > 0.5
+    scene = make_scene(180, 420, seed=11)
+    write_layer(tmp_path / "other.tif", scene.right[::-1].copy(), 0, PLACE)
+    result = invoke("range", folder / "left.tif", tmp_path / "other.tif", "-q")
+    assert result.exit_code == 2
+    assert "give the search range with --disparity MIN MAX" in result.stderr
