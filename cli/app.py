@@ -25,6 +25,7 @@ from sat_intervals.cli.match import match
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
+from sat_intervals.cli.project import project
 from sat_intervals.cli.range import search_range
 from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
@@ -158,3 +159,4 @@ main.add_command(calibrate)
 main.add_command(triangulate)
 main.add_command(dsm)
 main.add_command(export)
+main.add_command(project)
