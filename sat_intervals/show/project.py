@@ -154,7 +154,9 @@ def _points(run: Run, written: Written) -> Iterator[Layer]:
     for number, ramp in ((6, styles.MAGMA), (3, styles.VIRIDIS)):
         name, is_height = POINTS[number - 1].name, number == 3
         renderer = styles.colours(number, bands[number - 1], ramp, unit="m")
-        yield Layer("Points", name, POINTS[number - 1].meaning, file, place, run.shape, renderer, is_height)
+        yield Layer(
+            "Points", f"{name} of points", POINTS[number - 1].meaning, file, place, run.shape, renderer, is_height
+        )
 
 
 def _surface(run: Run, written: Written) -> Iterator[Layer]:

@@ -186,9 +186,7 @@ def test_project__in_qgis(run, tmp_path):
     for name in (*layers, "map"):
         with Image.open(tmp_path / f"{name.replace(' ', '_')}.png") as picture:
             colours = picture.convert("RGB").getcolors(1 << 20)
-        assert len(colours) >= (2 if name in ("half width", "confidence of heights") else 6), (
-            name
-        )  # the same everywhere
+        assert len(colours) > (100 if name == "map" else 1), name  # the half width is 1.5 m everywhere
         assert max(count for count, _ in colours) < 0.9 * 700 * 700, name
     with zipfile.ZipFile(tmp_path / "saved.qgz") as archive:
         assert b"made by sat-intervals" not in archive.read("saved.qgs")[:1024]
