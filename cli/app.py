@@ -30,6 +30,7 @@ from sat_intervals.cli.range import search_range
 from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
+from sat_intervals.cli.stac import stac
 from sat_intervals.cli.status import status
 from sat_intervals.cli.triangulate import triangulate
 
@@ -160,3 +161,4 @@ main.add_command(triangulate)
 main.add_command(dsm)
 main.add_command(export)
 main.add_command(project)
+main.add_command(stac)

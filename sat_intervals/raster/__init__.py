@@ -1,6 +1,7 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
+from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
 from sat_intervals.raster.layers import (
@@ -40,6 +41,7 @@ __all__ = [
     "check_pair",
     "check_reference",
     "check_space",
+    "footprint",
     "is_marked",
     "is_surface",
     "north_up",
