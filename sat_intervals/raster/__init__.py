@@ -19,7 +19,7 @@ from sat_intervals.raster.layers import (
     write_rows,
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
-from sat_intervals.raster.projection import Projection, utm_of
+from sat_intervals.raster.projection import Projection, grid_mapping, utm_of
 from sat_intervals.raster.publishing import OutputError, stamps
 from sat_intervals.raster.surfaces import check_reference, is_surface, read_heights, read_place, resolution_of
 from sat_intervals.raster.windows import read_views, read_window
@@ -42,6 +42,7 @@ __all__ = [
     "check_reference",
     "check_space",
     "footprint",
+    "grid_mapping",
     "is_marked",
     "is_surface",
     "north_up",
