@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import log_options, path, quiet_option, settings_options
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, settings_options
 from sat_intervals.cli.pairs import finite
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ _SETTINGS = """\
 @click.option(
     "--tune", is_flag=True, help="Compare presets and penalties; write the best as settings for match --config."
 )
+@json_option
 @settings_options
 @quiet_option
 @log_options
@@ -55,6 +56,7 @@ def calibrate(
     by_group: bool,
     name: str | None,
     tune: bool,
+    as_json: bool,
     config_file: Path | None,
     given: dict[str, Any],
     quiet: bool,
@@ -85,14 +87,16 @@ def calibrate(
     check_not_replaced([*inputs, config_file], [output])
     folder = _checked_folder(output)
     check_subjects(subjects)
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         if tune:
-            _tune(subjects, output, folder, console)
+            _tune(subjects, output, folder, console, as_json)
             return
         parts = measure_subjects(subjects, folder, console.progress)
     calibration, expected = calibration_from(parts, subjects, name or output.stem)
     _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
-    if not quiet:
+    if as_json:
+        say_json({"calibration": calibration.model_dump(mode="json"), "expected": expected})
+    elif not quiet:
         show_calibration(calibration, expected)
         click.echo(str(output))
 
@@ -189,7 +193,7 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
 
 
-def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Console") -> None:
+def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Console", as_json: bool) -> None:
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
     from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
@@ -201,6 +205,9 @@ def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Conso
         console.say(f"calibrating {name}")
         found.append(tuned(name, changes, subjects, folder, console.progress))
     best = best_of(found)
-    show_tuned(found, best)
+    if as_json:
+        say_json([{"name": one.name, "kept": one.kept, "good": one.good, **one.figures} for one in found])
+    else:
+        show_tuned(found, best)
     _write(output, _SETTINGS, settings_of(best))
     console.say(str(output))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import log_options, path, quiet_option
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
 
 # Metres between lines of sight above which models are suspect.
 _SUSPECT = 0.1
@@ -18,9 +18,18 @@ _SUSPECT = 0.1
 )
 @click.option("--left-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the left image.")
 @click.option("--right-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the right image.")
+@json_option
 @quiet_option
 @log_options
-def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path, quiet: bool) -> None:
+def triangulate(
+    out: Path,
+    left_model: Path,
+    right_model: Path,
+    left_grid: Path,
+    right_grid: Path,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """Triangulate the disparity and both bounds of the finished run in the folder OUT.
 
     \b
@@ -36,9 +45,11 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.triangulate import triangulate
 
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         report = triangulate(out, left_model, right_model, left_grid, right_grid, progress=console.progress)
-    if report["points"]:
+    if as_json:
+        say_json(report)
+    elif report["points"]:
         (lowest, highest), residual = report["height"], report["residual"][1]
         console.say(
             f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid, "
