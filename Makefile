@@ -71,11 +71,13 @@ docs: $(VENV)/.has-docs,plot
 	$(BIN)/python docs/site.py
 
 # Wheel and sdist in dist/, checked; the wheel is installed and run in an empty environment.
-dist: $(VENV)/.has-dist
+dist:
 	rm -rf dist
-	$(BIN)/python -m build
-	$(BIN)/twine check --strict dist/*
-	$(BIN)/cffconvert --validate
+	$(PYTHON) -m venv --clear build/tools
+	build/tools/bin/python -m pip install --quiet --disable-pip-version-check build cffconvert twine
+	build/tools/bin/python -m build
+	build/tools/bin/twine check --strict dist/*
+	build/tools/bin/cffconvert --validate
 	$(PYTHON) -m venv --clear build/wheel
 	build/wheel/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build && wheel/bin/sat-intervals demo demo --size 300 300 --overwrite
