@@ -39,6 +39,7 @@ from sat_intervals.kernels.sgm import (
     WALL,
     WAVEFRONTS,
     Borders,
+    Edge,
     Paths,
     Ring,
     add_curve,
@@ -163,7 +164,7 @@ class Matched(NamedTuple):
 
     raw: Raw
     right: RightView
-    leaving: Ring
+    leaving: Edge
 
 
 class _Buffers(NamedTuple):
@@ -199,7 +200,7 @@ class _Buffers(NamedTuple):
     curve: np.ndarray
     inside: Rectangle
     rings: tuple[Ring, ...]
-    leaving: Ring
+    leaving: Edge
     down: bool
 
 
@@ -228,7 +229,7 @@ def _prepare(
         np.zeros(size, np.uint16),
         rectangle_of(inside),
         rings[:2] if down else rings[2:],
-        Ring(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
+        Edge(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
         down,
     )
 
@@ -375,11 +376,10 @@ def trace(
     wavefront: int,
     gradients: Gradients | None = None,
     cells: Cells | None = None,
-) -> Ring:
+) -> Edge:
     """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
 
     Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
-    Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]
     buffers = _prepare(costs, gradients, settings, borders, cells, down)

@@ -1,5 +1,7 @@
 """Estimates of the memory that matching needs, and the largest tile that fits in a given memory."""
 
+from math import isqrt
+
 from sat_intervals.config import Config, ConfigError, Mccnn
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.cost import padded_to_lanes
@@ -12,6 +14,17 @@ PROCESS_BYTES = 300 * 10**6
 _PATCH_BYTES, _CORE_BYTES = 40, 60
 # Per column of a patch: layers of MC-CNN's network for a strip of rows, and the features of both images.
 _NETWORK_BYTES = 140_000
+
+
+# Side in pixels of a block of small tiles, at most: that of one tile of the default size.
+_BLOCK = 1024
+
+
+def tiles_together(config: Config, size: int) -> int:
+    """Tiles along each side of a block, at most, whose path states take less memory than the volume of one tile."""
+    if not config.hands_states_on or config.cost.precomputed:
+        return 1
+    return max(1, min(_BLOCK // size, isqrt(size // 16)))
 
 
 def volume_bytes(height: int, width: int, config: Config) -> int:

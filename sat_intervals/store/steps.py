@@ -1,49 +1,64 @@
-"""What a step of a run hands to later ones, path states and matching costs: one file each, with its own checksum."""
+"""What a step of a run hands to later ones, path states and matching costs: one file each, with its own checksums."""
 
-import io
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 
 import numpy as np
 
 from sat_intervals.store.folder import Folder
+from sat_intervals.store.manifest import sealed, unsealed
 
-_CHECKSUM = struct.Struct("<I")
+# A file is the length of its header, the header, a sealed text, and the bytes of all arrays.
+_LENGTH = struct.Struct("<I")
 
 
 def write_step(folder: Folder, run: str, kind: str, name: str, *arrays: np.ndarray) -> None:
     """Write arrays as a whole; ``kind`` is their folder, BORDERS or COSTS, and ``run`` the run that they belong to."""
-    content = io.BytesIO()
-    content.write(_CHECKSUM.pack(0))
-    for array in arrays:
-        np.lib.format.write_array(content, array, allow_pickle=False)
-    with content.getbuffer() as written:
-        _CHECKSUM.pack_into(written, 0, _checksum(written[_CHECKSUM.size :], run, kind, name))
-    folder.write_bytes(f"{kind}/{name}", content.getvalue())
+    whole = [np.ascontiguousarray(array) for array in arrays]
+    about = [[array.dtype.str, list(array.shape), zlib.crc32(array.data)] for array in whole]
+    header = sealed({"arrays": about}, f"{run}/{kind}/{name}").encode()
+    folder.write_bytes(
+        f"{kind}/{name}", b"".join([_LENGTH.pack(len(header)), header, *(array.data for array in whole)])
+    )
 
 
-def read_step(folder: Folder, run: str, kind: str, name: str) -> list[np.ndarray] | None:
-    """Read what `write_step` wrote; None if the file is missing.
+def read_step(
+    folder: Folder, run: str, kind: str, name: str, wanted: Iterable[int] | None = None
+) -> list[np.ndarray] | None:
+    """Read what `write_step` wrote, or only the ``wanted`` arrays; None if the file is missing.
 
     None after its removal if it is damaged, or belongs to another run, tile or wavefront.
     """
     content = folder.read_bytes(f"{kind}/{name}")
-    if content is None:
-        return None
-    payload = memoryview(content)[_CHECKSUM.size :]
-    if not payload or _CHECKSUM.unpack_from(content) != (_checksum(payload, run, kind, name),):
+    found = None if content is None else _parsed(content, f"{run}/{kind}/{name}", wanted)
+    if content is not None and found is None:
         folder.delete(f"{kind}/{name}")
+    return found
+
+
+def _parsed(content: bytes, of: str, wanted: Iterable[int] | None) -> list[np.ndarray] | None:
+    """Return the wanted arrays of a file; None if it is damaged or belongs to something else."""
+    if len(content) < _LENGTH.size:
         return None
-    stream, arrays = io.BytesIO(payload), []
-    while stream.tell() < len(payload):
-        arrays.append(np.lib.format.read_array(stream, allow_pickle=False))
-    return arrays
-
-
-def _checksum(payload: memoryview, *of: str) -> int:
-    return zlib.crc32(payload, zlib.crc32("/".join(of).encode()))
+    place = _LENGTH.size + _LENGTH.unpack_from(content)[0]
+    header = unsealed(content[_LENGTH.size : place].decode(errors="replace"), of)
+    if header is None:
+        return None
+    places = []
+    for dtype, shape, checksum in header["arrays"]:
+        size = np.dtype(dtype).itemsize * int(np.prod(shape))
+        places.append((place, place + size, dtype, shape, checksum))
+        place += size
+    if place != len(content):
+        return None
+    found, view = [], memoryview(content)
+    for start, stop, dtype, shape, checksum in places if wanted is None else [places[i] for i in wanted]:
+        if zlib.crc32(view[start:stop]) != checksum:
+            return None
+        found.append(np.frombuffer(view[start:stop], dtype).reshape(shape).copy())  # kernels take writable arrays
+    return found
 
 
 def intact_steps(folder: Folder, run: str, kind: str) -> Callable[[str], bool]:

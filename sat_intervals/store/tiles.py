@@ -44,7 +44,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 8
+LAYOUT = 9
 
 # Marker files in the folder of a run: present while it replaces an earlier run; its name, from the publication of its
 # files to the removal of its tiles.
@@ -74,6 +74,8 @@ class Store:
         Largest possible ambiguity of a pixel.
     levels
         Levels of sub-pixel bounds, see `TileArrays`.
+    has_seams
+        Whether the lines along the tiles' borders are kept: with overlaps.
     run
         Digest of the manifest: what belongs to another run is not taken for a part of this one.
     elsewhere
@@ -85,6 +87,7 @@ class Store:
     count: int
     ambiguities: int
     levels: int
+    has_seams: bool
     run: str
     elsewhere: str | None = None
 
@@ -95,7 +98,9 @@ class Store:
 
     @property
     def _arrays(self) -> TileArrays:
-        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels)
+        return TileArrays(
+            self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels, self.has_seams
+        )
 
     def open(
         self, manifest: Mapping[str, Any], *, overwrite: bool = False, replaceable: Mapping[str, str] | None = None
@@ -229,9 +234,9 @@ class Store:
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
             self.folder.delete(f"{kind}/{name}")
 
-    def read_step(self, kind: str, name: str) -> list[np.ndarray] | None:
-        """Read what `write_step` wrote; None if it is missing or damaged."""
-        return read_step(self.folder, self.run, kind, name)
+    def read_step(self, kind: str, name: str, wanted: Sequence[int] | None = None) -> list[np.ndarray] | None:
+        """Read what `write_step` wrote, or only the ``wanted`` arrays; None if it is missing or damaged."""
+        return read_step(self.folder, self.run, kind, name, wanted)
 
     def drop_costs(self) -> None:
         """Delete precomputed costs, which nothing needs once all tiles are matched."""
@@ -403,4 +408,5 @@ def store_of(home: Path, store: str | None = None) -> Store:
     if text is None:
         raise StoreError(f"{home.parent} has no run: give the folder that match was given")
     manifest = parsed(text, folder)
-    return Store(home, grid_of(manifest, folder), 1, 0, 0, digest(manifest), str(folder))
+    grid, has_seams = grid_of(manifest, folder), manifest["settings"]["tiles"].get("overlap") != "exact"
+    return Store(home, grid, 1, 0, 0, has_seams, digest(manifest), str(folder))

@@ -37,14 +37,12 @@ def test_schedule__draws_the_order_of_a_grid():
 
 
 def test_schedule__of_one_worker_leaves_the_last_wavefront_to_the_tiles():
-    schedule, done = Schedule(GRID, GRID, set().__contains__, views=2), []
+    schedule, done = Schedule(GRID, GRID, set().__contains__), []
     while (step := schedule.next()) is not None:
         done.append(step)
         schedule.ended(step)
     assert [step.wavefront for step in done].count(None) == 20
-    assert {(step.wavefront, step.mirrored) for step in done if step.wavefront is not None} == {
-        (wavefront, mirrored) for wavefront in range(3) for mirrored in (False, True)
-    }
+    assert {step.wavefront for step in done} == {None, 0, 1, 2}
 
 
 @pytest.mark.parametrize("borders", [set(), {"0_0_0", "1_1_2"}])
@@ -53,11 +51,11 @@ def test_schedule__comes_after_what_it_needs_and_does_nothing_twice(borders):
     for steps in in_turn(Schedule(GRID, GRID, borders.__contains__)):
         for step in steps:
             for other in needs(GRID, step):
-                is_given = other.wavefront == LAST and Step(other.tile) in done
+                is_given = other.wavefront == LAST and Step(other.block) in done
                 assert is_given or other in done or other.name in borders
         done += steps
     assert len(done) == len(set(done))
-    assert {step.tile for step in done if step.wavefront is None} == set(GRID)
+    assert {step.block for step in done if step.wavefront is None} == set(GRID)
     assert not borders & {step.name for step in done}
 
 
@@ -87,6 +85,6 @@ def test_schedule__traces_what_a_failed_tile_would_have_given():
         else:
             schedule.ended(step)
             done.add(step)
-    assert Step(failed.tile, LAST) in done
-    assert {step.tile for step in done if step.wavefront is None} == set(GRID) - {failed.tile}
+    assert Step(failed.block, LAST) in done
+    assert {step.block for step in done if step.wavefront is None} == set(GRID) - {failed.block}
     assert not schedule

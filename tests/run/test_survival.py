@@ -369,7 +369,7 @@ def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tm
             started(uneven, out, "--cluster", address, "--log-file", str(log)) as command,
         ):
             assert command.end() == 1, command.output
-            alone = r"match_tile of \(0, Step\(tile=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
+            alone = r"match_block of \(0, Step\(tile=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
             assert re.search(alone, log.read_text())
             assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
             assert "give workers more memory, or choose smaller tiles" in command.output
@@ -427,8 +427,8 @@ def test_match_jobs__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_
     def record_only(job, tile):
         job.store.write_record(tile, {})
 
-    monkeypatch.setattr(run, "match_tile", record_only)
-    monkeypatch.setattr(run, "trace_tile", lambda *step: {})
+    monkeypatch.setattr(run, "match_block", record_only)
+    monkeypatch.setattr(run, "trace_block", lambda *step: {})
     futures, known = [], []
     image = tmp_path / "wide.tif"
     write_layer(image, np.ones((64 * 20, 64 * 25), np.uint16), 0, PLACE)
