@@ -23,7 +23,7 @@ from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
-from sat_intervals.run.schedule import blocks_of
+from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
@@ -112,6 +112,7 @@ class Job:
         check_output(self.out, overwrite)
         restore(self.out, RUN_FILES)
         self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
+        self.store.check_space_of_steps(handed_bytes(self.store.grid, self.config))
         if self.found or self.local:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
             self.store.write_search(search, _origin(self.inputs))

@@ -249,6 +249,8 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
             schedules[i].ended(step)
             add_seconds(matched[i].seconds, seconds or {})  # of tracing; a tile keeps its own in its record
         elif schedules[i].failed(step):
+            if step.wavefront is not None and not isinstance(error, ChangedInputError):
+                error = RunError(f"tracing its path states, wavefront {step.wavefront}: {reason(error)}")
             for tile in jobs[i].store.grid.within(step.block.core):
                 matched[i].failures.setdefault(tile.name, error)
                 jobs[i].store.write_failure(tile.name, reason(error))

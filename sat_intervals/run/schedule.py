@@ -5,9 +5,13 @@ A block is a tile, or several small ones: reading, opening files and submitting 
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from heapq import heappop, heappush
 from typing import NamedTuple
 
+import numpy as np
+
 from sat_intervals.config import Config
+from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS
 from sat_intervals.match.borders import sources
 from sat_intervals.match.memory import tiles_together
@@ -15,6 +19,8 @@ from sat_intervals.tiling import Grid, Tile
 
 # Blocks along each side of the grid, at least, if there are as many tiles: for several workers.
 _BLOCKS = 4
+# Blocks, at most, whose order `time_of` follows step by step, in a second; workers hardly wait for each other in more.
+_SIMULATED = 1000
 
 
 def blocks_of(grid: Grid, config: Config) -> Grid:
@@ -139,3 +145,32 @@ class Schedule:
 
 def _order(step: Step) -> tuple[int, int, int]:
     return step.block.grid_row, step.block.grid_column, -1 if step.wavefront is None else step.wavefront
+
+
+def time_of(blocks: Grid, workers: int, trace: float, match: float) -> float:
+    """Return the time that workers take for the steps of blocks, from that of tracing and of matching one block."""
+    if not trace or len(blocks) > _SIMULATED:
+        return len(blocks) * (LAST * trace + match) / workers
+    schedule, now, count = Schedule(blocks, blocks, set[str]().__contains__), 0.0, 0
+    queue, running = deque[Step](), list[tuple[float, int, Step]]()
+    while schedule:
+        # as in a run, two steps per worker are submitted
+        while len(queue) + len(running) < 2 * workers and (step := schedule.next()) is not None:
+            queue.append(step)
+        while queue and len(running) < workers:
+            step, count = queue.popleft(), count + 1
+            heappush(running, (now + (match if step.wavefront is None else trace), count, step))
+        now, _, step = heappop(running)
+        schedule.ended(step)
+    return now
+
+
+def handed_bytes(grid: Grid, config: Config) -> int:
+    """Return the bytes that steps hand to each other: path states on the tiles' borders, and precomputed costs."""
+    if not config.hands_states_on or len(grid) == 1:
+        return 0
+    height, width = grid.region.height, grid.region.width
+    lines = grid.columns * height + grid.rows * width
+    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(config.disparity.count) * np.dtype(np.uint16).itemsize
+    costs = config.cost.precomputed * height * width * config.disparity.count
+    return (1 + config.matches_right_view) * (states + costs)

@@ -25,6 +25,7 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, diges
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
+    BORDERS,
     COSTS,
     FAILURES,
     FOLDERS,
@@ -278,6 +279,22 @@ class Store:
         free = self.folder.free_bytes()
         if free is not None and free < needed:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
+
+    def check_space_of_steps(self, needed: int) -> None:
+        """Raise if the disk has no room for the path states and costs that a run needs and does not have yet.
+
+        Raises
+        ------
+        StoreError
+            Gives free and needed space.
+        """
+        there = sum(sum(self.folder.inside(kind).sizes().values()) for kind in (BORDERS, COSTS)) if needed else 0
+        free = self.folder.free_bytes()
+        if free is not None and free < needed - there:
+            raise StoreError(
+                f"{self.folder} has {free / 1e6:,.1f} MB free, path states and matching costs need "
+                f"{(needed - there) / 1e6:,.1f} MB: free disk space, choose another --store, or give --overlap 100"
+            )
 
     def records(self) -> dict[str, dict[str, Any]]:
         """Return the records of tiles that are done, by name: intact ones whose files have the right sizes."""

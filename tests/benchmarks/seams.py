@@ -3,7 +3,6 @@
 Run as ``python tests/benchmarks/seams.py``; it takes about five minutes. Prints the tables of docs/speed.md.
 """
 
-import heapq
 import json
 import os
 import resource
@@ -11,15 +10,13 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections import deque
-from itertools import count
 from pathlib import Path
 
 from candidates import search_range
 
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import north_up, write_layer
-from sat_intervals.run.schedule import Schedule
+from sat_intervals.run.schedule import time_of
 from sat_intervals.tiling import Grid, Window
 
 SIDE, COUNT, RUNS = 4000, 64, 3
@@ -74,19 +71,8 @@ def measured(folder):
 
 
 def idle(grid, workers, trace, match):
-    """Share of the workers' time without work; as in a run, two steps per worker are submitted."""
-    schedule, now, busy = Schedule(grid, grid, set().__contains__), 0.0, 0.0
-    queue, running, number = deque(), [], count()
-    while schedule:
-        while len(queue) + len(running) < 2 * workers and (step := schedule.next()) is not None:
-            queue.append(step)
-        while queue and len(running) < workers:
-            seconds = match if queue[0].wavefront is None else trace
-            busy += seconds
-            heapq.heappush(running, (now + seconds, next(number), queue.popleft()))
-        now, _, step = heapq.heappop(running)
-        schedule.ended(step)
-    return 1 - busy / (workers * now)
+    """Share of the workers' time without work that one worker would do."""
+    return 1 - time_of(grid, 1, trace, match) / (workers * time_of(grid, workers, trace, match))
 
 
 if __name__ == "__main__":
