@@ -28,7 +28,6 @@ from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_block, measure_block, trace_block
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.removal import BORDERS
-from sat_intervals.store.steps import intact_steps
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Tile, Window
 
@@ -259,14 +258,14 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
         progress("tiles", done, total)
         if not schedules[i]:
             if not matched[i].failures:
-                jobs[i].store.drop_costs()
+                jobs[i].store.steps.drop_costs()
             yield matched[i]
     assert not any(schedules)  # else steps would wait for each other
 
 
 def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:
     store, blocks = job.store, job.blocks
-    is_done = intact_steps(store.folder, store.run, BORDERS) if job.hands_states_on else None
+    is_done = store.steps.intact(BORDERS) if job.hands_states_on else None
     together = blocks.size // store.grid.size
     places = {(tile.grid_row // together, tile.grid_column // together) for tile in tiles}
     return Schedule(blocks, [blocks.tile(*place) for place in sorted(places)], is_done, together)

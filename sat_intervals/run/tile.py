@@ -200,12 +200,12 @@ def _costed(
         with timed(seconds, "match"):
             return views, cost_areas(views, areas, config, statistics)
     with timed(seconds, "read"):
-        kept = job.store.read_step(COSTS, name)
+        kept = job.store.steps.read(COSTS, name)
     if kept is None:
         with timed(seconds, "costs"):
             costed = cost_areas(views, areas, config, statistics)
             kept = [cost.costs.left[:, :, : area.disparities] for area, cost in zip(areas, costed, strict=True)]
-            job.store.write_step(COSTS, name, *kept)
+            job.store.steps.write(COSTS, name, *kept)
         return views, costed
     missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
     made = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
@@ -217,7 +217,7 @@ def _costed(
 def _write_states(job: Job, block: Tile, wavefront: int, handed: Handed) -> None:
     """Write what the tiles of a block hand on: for each tile and view the states of its last column and row."""
     edges = [edge for tile in job.store.grid.within(block.core) for edge in handed[_place(tile)]]
-    job.store.write_step(BORDERS, Step(block, wavefront).name, *(states for edge in edges for states in edge))
+    job.store.steps.write(BORDERS, Step(block, wavefront).name, *(states for edge in edges for states in edge))
 
 
 def _handed(job: Job, block: Tile, wavefront: int, *, inside: bool = False) -> Handed:
@@ -242,12 +242,12 @@ def _states_of(job: Job, step: Step, wanted: Sequence[int]) -> list[list[Edge]]:
     count = 2 * (1 + job.config.matches_right_view)  # arrays of a tile
     numbers = [number for i in wanted for number in range(i * count, (i + 1) * count)]
     file = f"{job.store.folder}/{BORDERS}/{step.name}"
-    arrays = job.store.read_step(BORDERS, step.name, numbers) if numbers else []
+    arrays = job.store.steps.read(BORDERS, step.name, numbers) if numbers else []
     if arrays is None:
         assert step.wavefront is not None
         _LOG.warning("%s is missing or damaged: it is traced again", file)
         _trace_block(job, step.block, step.wavefront)
-        arrays = job.store.read_step(BORDERS, step.name, numbers)
+        arrays = job.store.steps.read(BORDERS, step.name, numbers)
     if arrays is None:
         raise RunError(
             f"{file} was damaged as soon as it was written: check the disk, then rerun the same command: it resumes"

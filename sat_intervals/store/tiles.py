@@ -25,8 +25,6 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, diges
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
-    BORDERS,
-    COSTS,
     FAILURES,
     FOLDERS,
     NORMALIZATION,
@@ -37,7 +35,7 @@ from sat_intervals.store.removal import (
     final_name,
     is_of_run,
 )
-from sat_intervals.store.steps import read_step, write_step
+from sat_intervals.store.steps import Steps
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -102,6 +100,11 @@ class Store:
         return TileArrays(
             self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels, self.has_seams
         )
+
+    @property
+    def steps(self) -> Steps:
+        """Return what steps hand to later ones."""
+        return Steps(self.folder, self.run)
 
     def open(
         self, manifest: Mapping[str, Any], *, overwrite: bool = False, replaceable: Mapping[str, str] | None = None
@@ -229,20 +232,6 @@ class Store:
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
             self.folder.delete(name)
 
-    def write_step(self, kind: str, name: str, *arrays: np.ndarray) -> None:
-        """Write what a step hands to later ones, see `steps.write_step`."""
-        write_step(self.folder, self.run, kind, name, *arrays)
-        if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
-            self.folder.delete(f"{kind}/{name}")
-
-    def read_step(self, kind: str, name: str, wanted: Sequence[int] | None = None) -> list[np.ndarray] | None:
-        """Read what `write_step` wrote, or only the ``wanted`` arrays; None if it is missing or damaged."""
-        return read_step(self.folder, self.run, kind, name, wanted)
-
-    def drop_costs(self) -> None:
-        """Delete precomputed costs, which nothing needs once all tiles are matched."""
-        self.folder.delete_all([f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes()], [COSTS])
-
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Write the statistics of the whole images, so that all tiles use the same."""
         self.folder.write(NORMALIZATION, sealed(normalization, self.run))
@@ -279,22 +268,6 @@ class Store:
         free = self.folder.free_bytes()
         if free is not None and free < needed:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
-
-    def check_space_of_steps(self, needed: int) -> None:
-        """Raise if the disk has no room for the path states and costs that a run needs and does not have yet.
-
-        Raises
-        ------
-        StoreError
-            Gives free and needed space.
-        """
-        there = sum(sum(self.folder.inside(kind).sizes().values()) for kind in (BORDERS, COSTS)) if needed else 0
-        free = self.folder.free_bytes()
-        if free is not None and free < needed - there:
-            raise StoreError(
-                f"{self.folder} has {free / 1e6:,.1f} MB free, path states and matching costs need "
-                f"{(needed - there) / 1e6:,.1f} MB: free disk space, choose another --store, or give --overlap 100"
-            )
 
     def records(self) -> dict[str, dict[str, Any]]:
         """Return the records of tiles that are done, by name: intact ones whose files have the right sizes."""

@@ -12,11 +12,12 @@ from helpers import PLACE, hashes, write_pair
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sat_intervals import RunError, Window, match_pair
+from sat_intervals import RunError, SatIntervalsError, Window, match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
 from sat_intervals.run import schedule
+from sat_intervals.store.folder import LocalFolder
 
 SETTINGS = {
     "satellite": {"preset": "satellite"},
@@ -137,6 +138,12 @@ def test_match_pair__that_resumes_traces_damaged_path_states_again(folder, whole
     flip(list((tmp_path / "out" / "tiles" / "borders").glob("*_[02]")))
     match(folder, tmp_path / "out", 64, {})
     assert hashes(tmp_path / "out") == hashes(whole)
+
+
+def test_match_pair__needs_space_for_path_states_before_it_starts(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(LocalFolder, "free_bytes", lambda folder: 10**5)
+    with pytest.raises(SatIntervalsError, match=r"has 0\.1 MB free, path states and matching costs need 0\.4 MB"):
+        match(folder, tmp_path / "out", 64, {})
 
 
 def test_match_pair__takes_no_path_states_of_another_run(folder, whole, tmp_path, monkeypatch):
