@@ -18,6 +18,7 @@ from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
 from sat_intervals.run import schedule
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.tiles import Store
 
 SETTINGS = {
     "satellite": {"preset": "satellite"},
@@ -82,6 +83,31 @@ def test_match_pair__of_blocks_of_exact_tiles_equals_the_whole(folder, tmp_path,
     for size in (64, 1024):
         match(folder, tmp_path / str(size), size, {"cross_check": {"method": method}})
     assert hashes(tmp_path / "64") == hashes(tmp_path / "1024")
+
+
+def test_match_pair__resumes_inside_a_block(folder, whole, tmp_path, monkeypatch):
+    def write_record(store, tile, record):
+        if tile.name == "1_0":
+            raise RunError("killed inside a block")
+        return original(store, tile, record)
+
+    original = Store.write_record
+    monkeypatch.setattr(schedule, "_BLOCKS", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write_record", write_record)
+        with pytest.raises(RunError, match=r"tiles failed(.|\n)*tile 1_1: killed inside a block"):
+            match(folder, tmp_path / "out", 64, {"cluster": {"retries": 0}})
+    match(folder, tmp_path / "out", 64, {"cluster": {"retries": 0}})
+    assert hashes(tmp_path / "out") == hashes(whole)
+
+
+def test_match_pair__names_the_wavefront_that_cannot_be_traced(folder, tmp_path, monkeypatch):
+    def fail(job, block, wavefront):
+        raise RunError("no reason")
+
+    monkeypatch.setattr(run, "trace_block", fail)
+    with pytest.raises(RunError, match="tile 0_0: tracing its path states, wavefront 0: no reason"):
+        match(folder, tmp_path / "out", 64, {})
 
 
 def flip(files):
