@@ -12,8 +12,9 @@ from sat_intervals.cli.pairs import finite
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
+    from sat_intervals.config import Calibration
     from sat_intervals.config.pairs import Pair
-    from sat_intervals.run.calibrate import Subject
+    from sat_intervals.run.measure import Subject
 
 _FILE = click.Path(path_type=Path)
 _CALIBRATION = """\
@@ -77,7 +78,8 @@ def calibrate(
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.calibrate import calibration_from, check_subjects, measure_subjects
+    from sat_intervals.run.calibrate import calibration_from, check_subjects
+    from sat_intervals.run.measure import measure_subjects
 
     settings = _Settings(config_file, given, tolerance, remove_bias, by_group)
     subjects = _subjects(pairs, truth, settings)
@@ -91,7 +93,7 @@ def calibrate(
             return
         parts = measure_subjects(subjects, folder, console.progress)
     calibration, expected = calibration_from(parts, subjects, name or output.stem)
-    _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
+    write_calibration(output, calibration)
     if not quiet:
         show_calibration(calibration, expected)
         click.echo(str(output))
@@ -131,7 +133,7 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Sett
 def _of_pair(pair: "Pair", truth: Path | None, settings: _Settings) -> "Subject":
     from sat_intervals.config import load_config
     from sat_intervals.raster import open_image
-    from sat_intervals.run.calibrate import Subject, truth_of
+    from sat_intervals.run.measure import Subject, truth_of
 
     search = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
     config = load_config(settings.config_file, settings.given | search)
@@ -154,7 +156,7 @@ def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
     from sat_intervals.config.pairs import group_beside
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
-    from sat_intervals.run.calibrate import Subject
+    from sat_intervals.run.measure import Subject
 
     run = open_results(out, truth)
     if run.truth is None:
@@ -178,6 +180,11 @@ def _checked_folder(output: Path) -> Path:
     if output.is_dir() or not os.access(folder, os.W_OK):
         raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")
     return folder
+
+
+def write_calibration(output: Path, calibration: "Calibration") -> None:
+    """Write a calibration with an explanation."""
+    _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
 
 
 def _write(output: Path, head: str, content: dict[str, Any]) -> None:

@@ -11,10 +11,12 @@ import numpy as np
 from sat_intervals.config import PRESETS, Calibration, Config, Interval, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.match.calibration import ladder, left_out, means
+from sat_intervals.match.calibration import left_out, means
 from sat_intervals.match.mccnn import load_network
+from sat_intervals.match.measurement import ladder
 from sat_intervals.progress import Progress
-from sat_intervals.run.calibrate import Subject, calibration_from, measure_subjects
+from sat_intervals.run.calibrate import calibration_from
+from sat_intervals.run.measure import Subject, measure_subjects
 
 COVERAGE = 0.9  # that settings are compared at
 # Settings with fewer good pixels than this share of the most are not chosen, however narrow their intervals.

@@ -14,7 +14,8 @@ from sat_intervals.demo import make_scene
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import write_layer
 from sat_intervals.run import tune
-from sat_intervals.run.calibrate import Subject, check_subjects, truth_of
+from sat_intervals.run.calibrate import check_subjects
+from sat_intervals.run.measure import Subject, truth_of
 from sat_intervals.run.tune import Tuned, best_of, candidates
 
 
