@@ -89,7 +89,7 @@ def calibrate(
     check_subjects(subjects)
     with Console(quiet) as console:
         if tune:
-            _tune(subjects, output, folder, console)
+            _tune(subjects, output, folder, name, console)
             return
         parts = measure_subjects(subjects, folder, console.progress)
     calibration, expected = calibration_from(parts, subjects, name or output.stem)
@@ -152,7 +152,7 @@ def _of_pair(pair: "Pair", truth: Path | None, settings: _Settings) -> "Subject"
 
 def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
     """Open a finished run, with its own settings unless the options choose others."""
-    from sat_intervals.config import load_config
+    from sat_intervals.config import Cluster, load_config
     from sat_intervals.config.pairs import group_beside
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
@@ -165,7 +165,8 @@ def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
         search = {"disparity": run.config.disparity.model_dump()}
         config = load_config(settings.config_file, settings.given | search)
     else:
-        config = load_config(run.config, settings.given)
+        here = run.config.model_copy(update={"cluster": Cluster()})  # the run's may be jobs of a batch system
+        config = load_config(here, settings.given)
     group = group_beside(run.left.path) if settings.by_group else str(out)
     return Subject(
         str(out), group, run.left, run.right, run.truth, config, run.region, settings.tolerance, settings.remove_bias
@@ -196,18 +197,25 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
 
 
-def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Console") -> None:
+def _tune(subjects: "list[Subject]", output: Path, folder: Path, name: str | None, console: "Console") -> None:
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
+    from sat_intervals.errors import RunError, SatIntervalsError
     from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
         console.say("MC-CNN is left out: pip install sat-intervals[mccnn]")
     found = []
-    for name, changes in candidates(with_network=has_network()):
-        console.say(f"calibrating {name}")
-        found.append(tuned(name, changes, subjects, folder, console.progress))
+    for label, changes in candidates(subjects[0].config, with_network=has_network()):
+        console.say(f"calibrating {label}")
+        try:
+            found.append(tuned(label, changes, subjects, folder, console.progress))
+        except RunError:
+            raise
+        except SatIntervalsError as error:
+            console.say(f"{label} is left out: {error}")
     best = best_of(found)
-    show_tuned(found, best)
-    _write(output, _SETTINGS, settings_of(best))
+    if not console.quiet:
+        show_tuned(found, best)
+    _write(output, _SETTINGS, settings_of(best, name or best.name))
     console.say(str(output))

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
 from sat_intervals.cli.options import log_options
+from sat_intervals.cli.pairs import finite
 
 _FILE = click.Path(path_type=Path)
 _PICTURES = ("overview", "errors", "coverage", "profile", "curve", "dsm")
@@ -20,6 +22,12 @@ _PICTURES = ("overview", "errors", "coverage", "profile", "curve", "dsm")
 @click.option(
     "--beside", type=_FILE, multiple=True, metavar="OUT", help="Run of the same pair at another coverage, to draw too."
 )
+@click.option("--mask", type=_FILE, help="Pixels that coverage.png counts (not 0).")
+@click.option(
+    "--tolerance", type=click.FloatRange(min=0), default=0.0, callback=finite, metavar="PX",
+    help="In coverage.png, truth up to PX outside an interval counts as inside.",
+)  # fmt: skip
+@click.option("--remove-bias", is_flag=True, help="In coverage.png, add the median of disparity - truth to the truth.")
 @click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots per inch.")
 @log_options
 def plot(
@@ -30,6 +38,7 @@ def plot(
     pixel: tuple[int, int] | None,
     beside: tuple[Path, ...],
     dpi: int,
+    **judging: Any,
 ) -> None:
     """Draw pictures of the finished run in the folder OUT and write them there.
 
@@ -66,7 +75,7 @@ def plot(
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
     if is_judged:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)
-        drawings["coverage"] = lambda path: draw_coverage([out, *beside], truth, path, dpi)
+        drawings["coverage"] = lambda path: draw_coverage([out, *beside], path, dpi, truth=truth, **judging)
     if row is not None:
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
     if pixel:

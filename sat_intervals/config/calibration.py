@@ -119,6 +119,8 @@ def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calib
     except OSError as error:
         known = ", ".join(name for name, _ in _built_in_files()) or "none"
         raise ConfigError(f"calibration {file}: {error.strerror} (built in: {known}): {_MAKE_ONE}") from error
+    if "levels" not in values and values.keys() & {"preset", "disparity", "cost", "sgm", "interval"}:
+        raise ConfigError(f"{file} has settings, not a calibration: give it by --config")
     return _checked(values, str(file))
 
 

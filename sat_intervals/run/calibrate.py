@@ -32,6 +32,12 @@ def check_subjects(subjects: Sequence[Subject]) -> None:
             raise SatIntervalsError(
                 f"{subject.name} and {first.name} were matched with other settings: give one --preset or --config"
             )
+    groups = {subject.group for subject in subjects}
+    if len(subjects) > 1 and len(groups) == 1:
+        raise SatIntervalsError(
+            f"all {len(subjects)} pairs are of group {first.group}, so that no other is left to judge it with: leave "
+            "--by-group out, or give pairs of another group"
+        )
     known = 0
     for subject in subjects:
         search, region = subject.config.disparity, checked_region(subject.left, subject.window)

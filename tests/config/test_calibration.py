@@ -81,6 +81,7 @@ def test_load_calibration__reads_a_file_and_a_run_keeps_its_content(tmp_path) ->
         ({"name": "x"}, "key: field required"),
         ([1], "holds [1], allowed: keys name, key, levels, provenance"),
         ("{", "line 1:"),
+        ({"interval": {"coverage": 0.9}}, "own.yaml has settings, not a calibration: give it by --config"),
     ],
 )
 def test_load_calibration__names_the_file_and_the_error(tmp_path, values, words) -> None:
@@ -91,6 +92,12 @@ def test_load_calibration__names_the_file_and_the_error(tmp_path, values, words)
     assert str(file) in str(caught.value)
     assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_load_config__a_calibration_is_no_file_of_settings(tmp_path) -> None:
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(rising()))
+    with pytest.raises(ConfigError, match=r"own.yaml is a calibration: give it by --calibration"):
+        load_config(tmp_path / "own.yaml")
 
 
 def test_load_calibration__names_a_missing_file() -> None:
