@@ -115,7 +115,12 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Sett
     from sat_intervals.config.pairs import check_names, find_pairs, is_pair
     from sat_intervals.errors import SatIntervalsError
 
-    is_run = [(path / "run.json").exists() or not is_pair(path) for path in paths]
+    is_run = [(path / "run.json").exists() for path in paths]
+    if unknown := [path for path, run in zip(paths, is_run, strict=True) if not run and not is_pair(path)]:
+        raise SatIntervalsError(
+            f"{unknown[0]} is no pair and no finished run: give a folder with left.tif, right.tif, truth.tif and "
+            "meta.json, a CSV file, or the folder of a run"
+        )
     find_pairs(source for source, run in zip(paths, is_run, strict=True) if not run)  # raises if a pair is given twice
     found: list[tuple[Path, Pair | None]] = []
     for source, run in zip(paths, is_run, strict=True):
