@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sat_intervals.cli.options import log_options
 from sat_intervals.cli.pairs import finite
+
+if TYPE_CHECKING:
+    from sat_intervals.results import Results
 
 _FILE = click.Path(path_type=Path)
 _PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
@@ -64,15 +67,10 @@ def plot(
     from sat_intervals.show.search_range import draw_range, has_range
 
     results = open_results(out, truth)
-    if columns is not None and row is None:
-        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
+    _check(results, row, columns, pixel)
     is_judged = None not in (results.truth, results.config.interval)
     if beside and not is_judged:
         raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
-    if row is not None:
-        results.check_part(row, columns)
-    if pixel:
-        results.check_pixel(*pixel)
     results.check_kept([out / f"{name}.png" for name in _PICTURES], [truth, out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
     if is_judged:
@@ -90,6 +88,18 @@ def plot(
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
+
+
+def _check(results: "Results", row: int | None, columns: tuple[int, int] | None, pixel: tuple[int, int] | None) -> None:
+    """Raise if a profile or a pixel is outside the results."""
+    from sat_intervals.errors import SatIntervalsError
+
+    if columns is not None and row is None:
+        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
+    if row is not None:
+        results.check_part(row, columns)
+    if pixel:
+        results.check_pixel(*pixel)
 
 
 def _is_current(surface: Path, finished: str) -> bool:
