@@ -168,9 +168,12 @@ def widened(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bounds that contain the disparity, off which medians or quantiles may move them, rounded outwards."""
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
-    if not config.bound_steps:
-        return lower, upper
-    return np.floor(lower * BOUND_STEPS) / BOUND_STEPS, np.ceil(upper * BOUND_STEPS) / BOUND_STEPS
+    if config.bound_steps:
+        for round_, bound in ((np.floor, lower), (np.ceil, upper)):  # in place: half the time
+            bound *= BOUND_STEPS
+            round_(bound, out=bound)
+            bound /= BOUND_STEPS
+    return lower, upper
 
 
 def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, config: Config) -> None:
@@ -196,8 +199,10 @@ def _bounds(rows: RawRows, low: np.ndarray | None, config: Config) -> tuple[np.n
     lower, upper = lower.astype(np.float32), upper.astype(np.float32)
     if not steps:
         return lower, upper
-    minimum = np.float32(config.disparity.minimum)
-    return lower / steps + minimum, upper / steps + minimum
+    for bound in (lower, upper):
+        bound /= steps
+        bound += np.float32(config.disparity.minimum)
+    return lower, upper
 
 
 def regularized(
