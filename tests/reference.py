@@ -576,6 +576,7 @@ def match_arrays(left, right, left_state, right_state, config):
         quantile = settings.quantile
         if is_subpixel:
             quantile = config.cuts.quantile
+        if quantile is not None and is_subpixel:
             lower, upper = (
                 np.where(low, rounded(8 * bound) / 8, bound) for rounded, bound in ((np.floor, lower), (np.ceil, upper))
             )
