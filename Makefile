@@ -35,7 +35,7 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(PYTEST) --quiet tests/test_architecture.py
 
-# The tables of docs/speed.md: this project beside its peers; about thirteen minutes.
+# The tables of docs/speed.md: this project beside its peers; about fifteen minutes.
 bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
 
