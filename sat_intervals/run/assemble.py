@@ -179,10 +179,11 @@ def _versions() -> dict[str, str]:
 
 def _calibration(config: Config) -> dict[str, Any] | None:
     """Return what the run took from its calibration, whose content is in the settings."""
-    if config.interval is None or config.interval.coverage is None or config.cuts is None:
+    levels = config.cuts
+    if levels is None or levels.coverage is None:
         return None
     calibration = calibration_of(config)
-    return {"name": calibration.name, "sha256": calibration.sha256, **config.cuts._asdict()}
+    return {"name": calibration.name, "sha256": calibration.sha256, **levels.model_dump()}
 
 
 def _report(

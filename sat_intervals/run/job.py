@@ -249,13 +249,16 @@ def _version() -> str:
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
-    """Return all that decides the bytes of a tile."""
+    """Return all that decides the bytes of a tile; of a calibration only its levels."""
+    settings, levels = config.model_dump(mode="json", exclude=_NOT_OF_TILES), config.cuts
+    if levels is not None:
+        settings["interval"] = {"high": levels.high, "low": levels.low, "steps": config.bound_steps}
     return {
         **({"local_ranges": grid} if grid else {}),
         "version": _version(),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,
-        "settings": config.model_dump(mode="json", exclude=_NOT_OF_TILES),
+        "settings": settings,
         "inputs": inputs,
         "region": asdict(region),
     }
