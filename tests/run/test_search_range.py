@@ -15,6 +15,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
+from sat_intervals.run import schedule
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.run.pair import prepare
 from sat_intervals.show.report.contents import Pixels
@@ -76,14 +77,16 @@ OF_MCCNN = pytest.param({"preset": "satellite-mccnn"}, marks=pytest.mark.peer("o
 
 
 @pytest.mark.parametrize("settings", [{}, {"interval": {"coverage": 0.9}}, OF_MCCNN])
-def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path, settings):
-    reports = []
-    for size in (64, 512):
+def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path, monkeypatch, settings):
+    names = "tiles", "blocks", "whole"
+    for name, size, blocks in zip(names, (64, 64, 512), (4, 1, 4), strict=True):
+        monkeypatch.setattr(schedule, "_BLOCKS", blocks)
         tiles = {"size": size, "overlap": "exact"}
-        reports.append(run(folder, tmp_path / str(size), disparity={"local": True}, tiles=tiles, **settings))
-    assert reports[0]["local_ranges"]["share"] < 0.95
-    for one, other in zip(bands(tmp_path / "64"), bands(tmp_path / "512"), strict=True):
-        np.testing.assert_array_equal(one, other)
+        report = run(folder, tmp_path / name, disparity={"local": True}, tiles=tiles, **settings)
+        assert report["local_ranges"]["share"] < 0.95
+    for tiled, in_blocks, whole in zip(*(bands(tmp_path / name) for name in names), strict=True):
+        np.testing.assert_array_equal(tiled, whole)
+        np.testing.assert_array_equal(in_blocks, whole)
 
 
 def write_bands(file, low, high):
@@ -133,6 +136,29 @@ def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):
     searched = np.frombuffer(codes, "<u2").reshape(low.shape)
     assert (searched >= high - low + 1).all()  # a cell of 64 pixels searches the hull of smaller ones
     assert len(np.unique(searched)) > 1
+
+
+def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
+    images = folder / "left.tif", folder / "right.tif"
+    before = images[1].read_bytes()
+    result = invoke("range", *images, "--output", images[1])
+    assert result.exit_code == 2
+    assert "is an input" in result.stderr
+    assert images[1].read_bytes() == before
+    write_bands(tmp_path / "other.tif", *np.zeros((2, 180, 420)))
+    result = invoke("range", *images, "--output", tmp_path / "other.tif")
+    assert result.exit_code == 2
+    assert "was not made by sat-intervals" in result.stderr
+
+
+def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
+    grid = tmp_path / "tiles/range.tif"
+    grid.parent.mkdir()
+    write_bands(grid, *np.stack([np.full((180, 420), -5), np.full((180, 420), 5)]))
+    result = invoke("match", folder / "left.tif", folder / "right.tif", tmp_path, "--range-grid", grid, "--overwrite")
+    assert result.exit_code == 2
+    assert "is an input" in result.stderr
+    assert grid.exists()
 
 
 def test_match__names_a_wider_range_and_is_strict(folder, tmp_path):
