@@ -10,7 +10,7 @@ from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, Band
 
 @dataclass(frozen=True)
 class File:
-    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver."""
+    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression."""
 
     name: str
     dtype: str
@@ -19,6 +19,7 @@ class File:
     tags: Mapping[str, str] = field(default_factory=dict)
     predictor: str = "NO"
     driver: str = "COG"
+    compression: str = "deflate"
 
     def describe(self, dataset: DatasetWriter) -> None:
         """Write names, units and meanings of the bands."""

@@ -140,7 +140,8 @@ def test_output_writer__tells_a_lack_of_memory_from_a_full_disk(tmp_path, monkey
         raise error
 
     with OutputWriter(tmp_path, RUN_FILES, 9, 9, Georeferencing(), {}) as files:
-        monkeypatch.setattr(writer, "copy", fail)
+        files.write(0, np.zeros((4, 9, 9)), np.zeros((9, 9)))
+        monkeypatch.setattr(writer, "template", fail)
         monkeypatch.setattr(writer.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
         with pytest.raises(SatIntervalsError, match=r"tif cannot be written: not enough memory \(") as caught:
             files.build()

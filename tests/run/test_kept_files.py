@@ -658,7 +658,7 @@ def test_match_batch__that_fails_to_overwrite_keeps_the_runs(pair, monkeypatch):
 def test_export__that_fails_keeps_the_files_of_before(finished, tmp_path, monkeypatch):
     export(finished, "otb", tmp_path / "otb")
     before = contents(tmp_path / "otb")
-    monkeypatch.setattr("sat_intervals.raster.writer.copy", fail)
+    monkeypatch.setattr("sat_intervals.raster.writer.template", fail)
     with pytest.raises(OutputError):
         export(finished, "otb", tmp_path / "otb")
     assert contents(tmp_path / "otb") == before
@@ -739,14 +739,14 @@ def killed(number, *arguments, **options):
         patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
         publishing.publish(*arguments)
 
-    def create(writer, file):
+    def put_together(writer, name, levels):
         raise Killed
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
         patch.setattr("sat_intervals.raster.writer.publish", publish)
         if not number:
-            patch.setattr(OutputWriter, "_create", create)
+            patch.setattr(OutputWriter, "put_together", put_together)
         with pytest.raises(Killed):
             match_pair(*arguments, **options)
 
