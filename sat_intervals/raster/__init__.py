@@ -1,5 +1,6 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
+from sat_intervals.raster.cog import BLOCK, Part, codec_versions, compressed, factors
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
@@ -25,6 +26,7 @@ from sat_intervals.raster.windows import read_views, read_window
 from sat_intervals.raster.writer import OutputWriter, check_space, remove_scratch, restore
 
 __all__ = [
+    "BLOCK",
     "MARK",
     "POINT_FILES",
     "RUN_FILES",
@@ -35,11 +37,15 @@ __all__ = [
     "InputError",
     "OutputError",
     "OutputWriter",
+    "Part",
     "Projection",
     "check_marked",
     "check_pair",
     "check_reference",
     "check_space",
+    "codec_versions",
+    "compressed",
+    "factors",
     "is_marked",
     "is_surface",
     "north_up",

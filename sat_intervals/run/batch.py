@@ -258,7 +258,7 @@ def _assembled(client: Client, matched: Matched, keep_tiles: bool, progress: Pro
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assemble_repaired(job, match, seconds, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others

@@ -49,10 +49,10 @@ from sat_intervals.products import Bands
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image
 from sat_intervals.results import Layer
-from sat_intervals.run.assemble import STRIP_PIXELS, check_done, check_matched
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, checked_region, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
+from sat_intervals.run.strips import STRIP_PIXELS, check_done, check_matched
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
 

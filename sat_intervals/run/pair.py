@@ -1,6 +1,5 @@
 """Match a pair, files to files, with steps shared with batches: measure images, match tiles, repair damaged ones."""
 
-import errno
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -24,15 +23,13 @@ from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.search_range import search_range
-from sat_intervals.run.submit import Submission, Task, reason
+from sat_intervals.run.submit import Submission, Task, check_not_full, reason
 from sat_intervals.run.tile import match_tile, measure_block, trace_tile
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.removal import BORDERS
 from sat_intervals.store.steps import intact_steps
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Tile, Window
-
-_FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
 # How often damaged tiles are matched again; more damage means a broken disk.
 _TRIES = 2
@@ -106,7 +103,7 @@ def _match_pair(
         job = prepare(*pair, out, config, window=window, overwrite=overwrite, find=find)
 
     def match() -> None:
-        with logged_stage(seconds, "tiles"), connection:
+        with logged_stage(seconds, "tiles"):
             if job.waiting() or not _is_measured(job):
                 client = connection.client()
                 with logged_stage(seconds, "tiles.images"):
@@ -130,7 +127,7 @@ def _match_pair(
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
             match()
-            report = assemble_repaired(job, match, seconds, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, connection.client, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     return report
@@ -150,17 +147,23 @@ def find_on(
 
 
 def assemble_repaired(
-    job: Job, match: Callable[[], None], seconds: dict[str, float], progress: Progress, *, keep_tiles: bool
+    job: Job,
+    client: Callable[[], Client],
+    match: Callable[[], None],
+    seconds: dict[str, float],
+    progress: Progress,
+    *,
+    keep_tiles: bool,
 ) -> dict[str, Any]:
-    """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles."""
+    """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles or parts."""
     for _ in range(_TRIES):
         try:
-            return assemble(job, seconds, progress, keep_tiles=keep_tiles)
+            return assemble(job, client, seconds, progress, keep_tiles=keep_tiles)
         except DamagedTilesError as error:
             job.store.check(job.manifest)
             _LOG.warning("%s; trying this now", error)
             match()
-    return assemble(job, seconds, progress, keep_tiles=keep_tiles)
+    return assemble(job, client, seconds, progress, keep_tiles=keep_tiles)
 
 
 def _is_measured(job: Job) -> bool:
@@ -240,11 +243,8 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
             progress("tiles", done, total)
             continue
         (i, step), seconds, error = outcome
-        if isinstance(error, OSError) and error.errno in _FULL_DISK:  # all other tiles would fail too
-            raise RunError(
-                f"{error.filename or jobs[i].store.folder}: {error.strerror}: free disk space and rerun the same "
-                "command: it resumes"
-            ) from error
+        if error is not None:
+            check_not_full(error, jobs[i].store.folder)
         if error is None:
             schedules[i].ended(step)
             add_seconds(matched[i].seconds, seconds or {})  # of tracing; a tile keeps its own in its record

@@ -1,5 +1,6 @@
 """Submit tasks to a cluster with a bounded number in flight, and handle lost workers."""
 
+import errno
 import logging
 import time
 import uuid
@@ -15,6 +16,7 @@ from distributed.client import ClosedClientError
 from sat_intervals.errors import RunError
 from sat_intervals.run.batch_system import current_workers
 
+_FULL_DISK = errno.ENOSPC, errno.EDQUOT
 # Seconds between checks of the workers, whose number may change.
 _CHECK_EVERY = 2.0
 # Seconds without a heartbeat, normally sent every few seconds, after which a warning names a worker.
@@ -187,6 +189,14 @@ def _scheduler_errors() -> Iterator[None]:
         yield
     except (OSError, ClosedClientError) as error:
         raise RunError("the dask scheduler is gone; rerun the same command: it resumes") from error
+
+
+def check_not_full(error: BaseException, place: object) -> None:
+    """Raise if a task failed because the disk is full: all others would fail too."""
+    if isinstance(error, OSError) and error.errno in _FULL_DISK:
+        raise RunError(
+            f"{error.filename or place}: {error.strerror}: free disk space and rerun the same command: it resumes"
+        ) from error
 
 
 def reason(error: BaseException) -> str:

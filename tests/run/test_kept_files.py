@@ -35,7 +35,7 @@ from sat_intervals.raster import (
 )
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.results import Run, open_results
-from sat_intervals.run import assemble
+from sat_intervals.run import strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
@@ -574,7 +574,7 @@ def test_demo__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(tmp_pat
     names = ["left.tif", "right.tif", "truth.tif", "intervals.tif", "validity.tif", "run.json"]
     before = {name: (out / name).read_bytes() for name in names}
     with monkeypatch.context() as patch:
-        patch.setattr(assemble, "postprocess_strips", fail)
+        patch.setattr(strips, "postprocess_strip", fail)
         assert invoke(*command, "--seed", "1", "--overwrite").exit_code == 1
     assert {name: (out / name).read_bytes() for name in names} == before
     assert sorted(path.name for path in out.iterdir()) == sorted([*names, "tiles"])
@@ -649,7 +649,7 @@ def test_match_batch__that_fails_to_overwrite_keeps_the_runs(pair, monkeypatch):
     pairs = [PairOfBatch("one", str(folder / "left.tif"), str(folder / "right.tif"))]
     match_batch(pairs, folder / "out", settings)
     before = contents(folder / "out" / "one")
-    monkeypatch.setattr(assemble, "postprocess_strips", fail)
+    monkeypatch.setattr(strips, "postprocess_strip", fail)
     report = match_batch(pairs, folder / "out", settings | {"median": None}, overwrite=True)
     assert report["one"]["state"] == "failed"
     assert {name: content for name, content in contents(folder / "out" / "one").items() if name in before} == before

@@ -187,7 +187,7 @@ def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):
         assert_nothing_final(out)
     before = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done_tiles(out)}
     with started(pair, out, "--keep-tiles") as command:  # while it writes the files
-        wait_until(lambda: list(out.glob(".*/files/strips-*")) or command.ended, "strips")
+        wait_until(lambda: list(out.glob("tiles/parts/*")) or command.ended, "parts")
         command.kill()
     assert_nothing_final(out)
     after = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in before}
