@@ -12,7 +12,6 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from distributed import Client
 
 from sat_intervals.config import Config, calibration_of
 from sat_intervals.errors import RunError
@@ -27,6 +26,7 @@ from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
 from sat_intervals.run.strips import check_done, check_matched, finish_strips, levels_of, parts_of
+from sat_intervals.run.workers import Workers
 from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, replaceable_files
 
 # Meanings of some of the counts, for readers of run.json.
@@ -43,7 +43,7 @@ _LOG = logging.getLogger(__name__)
 
 def assemble(
     job: Job,
-    client: Callable[[], Client],
+    client: Callable[[], Workers],
     seconds: dict[str, float],
     progress: Progress,
     *,

@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from distributed import Client
-
 from sat_intervals.config import Config, load_config
 from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
@@ -18,13 +16,12 @@ from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
-from sat_intervals.run.cluster import Connection
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.search_range import search_range
-from sat_intervals.run.submit import Submission, Task, check_not_full, reason
 from sat_intervals.run.tile import match_tile, measure_block, trace_tile
+from sat_intervals.run.workers import Connection, Task, Workers, check_not_full, reason
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.removal import BORDERS
 from sat_intervals.store.steps import intact_steps
@@ -148,7 +145,7 @@ def find_on(
 
 def assemble_repaired(
     job: Job,
-    client: Callable[[], Client],
+    client: Callable[[], Workers],
     match: Callable[[], None],
     seconds: dict[str, float],
     progress: Progress,
@@ -171,7 +168,7 @@ def _is_measured(job: Job) -> bool:
     return not job.config.cost.needs_statistics or job.store.normalization() is not None
 
 
-def measure_images(client: Client, job: Job, progress: Progress) -> None:
+def measure_images(client: Workers, job: Job, progress: Progress) -> None:
     """Measure mean and standard deviation of both images and store them, if the cost needs them and they are missing.
 
     Raises
@@ -186,12 +183,12 @@ def measure_images(client: Client, job: Job, progress: Progress) -> None:
     )
 
 
-def _measured(client: Client, image: Image, job: Job, progress: Progress) -> ImageStatistics:
+def _measured(client: Workers, image: Image, job: Job, progress: Progress) -> ImageStatistics:
     windows = blocks(image.height, image.width)
     retries = job.config.cluster.retries
     found: dict[int, Moments] = {}
-    for outcome in Submission(
-        client, (Task(i, measure_block, (image, block, job.files), retries) for i, block in enumerate(windows))
+    for outcome in client.outcomes(
+        (Task(i, measure_block, (image, block, job.files), retries) for i, block in enumerate(windows))
     ):
         if outcome is not None and outcome.error is not None:
             if isinstance(outcome.error, ChangedInputError):
@@ -225,7 +222,7 @@ class Matched(NamedTuple):
     seconds: dict[str, float]
 
 
-def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
+def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
     """Match the unfinished tiles of jobs; yield each job after its last tile.
 
     Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the
@@ -238,7 +235,7 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
     yield from (ended for ended, schedule in zip(matched, schedules, strict=True) if not schedule)
     done = total - sum(map(len, schedules))
     progress("tiles", done, total)
-    for outcome in Submission(client, _tasks(jobs, schedules)):
+    for outcome in client.outcomes(_tasks(jobs, schedules)):
         if outcome is None:
             progress("tiles", done, total)
             continue

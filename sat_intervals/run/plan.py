@@ -17,12 +17,11 @@ from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image
-from sat_intervals.run.cluster import tiles_at_once
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.search_range import find_here
-from sat_intervals.run.submit import reason
+from sat_intervals.run.workers import reason, tiles_at_once
 from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from distributed import Client
 
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
@@ -18,7 +17,7 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, RUN_FILES, Part, codec_versions, compressed, factors
 from sat_intervals.run.job import Job
 from sat_intervals.run.statistics import Tally
-from sat_intervals.run.submit import Submission, Task, check_not_full, reason
+from sat_intervals.run.workers import Task, Workers, check_not_full, reason
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.parts import Parts, Place
 from sat_intervals.store.tiles import DamagedTilesError, Records
@@ -79,7 +78,7 @@ def check_matched(job: Job, records: Records, searched: int) -> None:
 
 
 def finish_strips(
-    job: Job, client: Callable[[], Client], scale: ConfidenceScale, records: Records, progress: Progress
+    job: Job, client: Callable[[], Workers], scale: ConfidenceScale, records: Records, progress: Progress
 ) -> dict[Place, dict[str, Any]]:
     """Make the parts of a run that are missing; return the records of all.
 
@@ -118,7 +117,7 @@ def finish_strips(
                 waiting.remove(place)
                 yield _task(job, place, counts, scale, records)
 
-    for outcome in Submission(client(), tasks()) if waiting else ():
+    for outcome in client().outcomes(tasks()) if waiting else ():
         if outcome is not None and outcome.error is not None:
             _raise(job, outcome.label, outcome.error)
         elif outcome is not None and outcome.result is not None:

@@ -1,24 +1,21 @@
-"""Submit tasks to a cluster with a bounded number in flight, and handle lost workers."""
+"""Submit tasks to a dask cluster with a bounded number in flight, and handle lost workers."""
 
-import errno
 import logging
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
 from sat_intervals.errors import RunError
 from sat_intervals.run.batch_system import current_workers
+from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task
 
-_FULL_DISK = errno.ENOSPC, errno.EDQUOT
-# Seconds between checks of the workers, whose number may change.
-_CHECK_EVERY = 2.0
 # Seconds without a heartbeat, normally sent every few seconds, after which a warning names a worker.
 SILENT = 30.0
 # Seconds without a heartbeat of any worker, after the first one, at which a run ends.
@@ -28,31 +25,14 @@ _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Task:
-    """A call that any worker may make, and may repeat.
+class DaskWorkers:
+    """Workers of a dask cluster; see `Workers`."""
 
-    Attributes
-    ----------
-    label
-        Identifies the task in its `Outcome`.
-    function, arguments
-        The call.
-    retries
-        How often it is tried again if it raises.
-    """
+    client: Client
 
-    label: Any
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    retries: int
-
-
-class Outcome(NamedTuple):
-    """Result or error of a task."""
-
-    label: Any
-    result: Any
-    error: BaseException | None
+    def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
+        """See `Workers` and `Submission`."""
+        return iter(Submission(self.client, tasks))
 
 
 class Submission:
@@ -102,13 +82,13 @@ class Submission:
     def _next(self) -> Future[Any] | None:
         """Wait for the next finished future; return None after a few seconds."""
         try:
-            return self._ended.get(timeout=_CHECK_EVERY)
+            return self._ended.get(timeout=CHECK_EVERY)
         except Empty:
             return None
 
     def _fill(self) -> None:
         """Submit tasks until two per current core are in flight."""
-        if time.monotonic() - self._checked > _CHECK_EVERY:
+        if time.monotonic() - self._checked > CHECK_EVERY:
             with _scheduler_errors():
                 cores = current_workers(self._client)
                 self._heartbeats.check(self._client)
@@ -189,23 +169,3 @@ def _scheduler_errors() -> Iterator[None]:
         yield
     except (OSError, ClosedClientError) as error:
         raise RunError("the dask scheduler is gone; rerun the same command: it resumes") from error
-
-
-def check_not_full(error: BaseException, place: object) -> None:
-    """Raise if a task failed because the disk is full: all others would fail too."""
-    if isinstance(error, OSError) and error.errno in _FULL_DISK:
-        raise RunError(
-            f"{error.filename or place}: {error.strerror}: free disk space and rerun the same command: it resumes"
-        ) from error
-
-
-def reason(error: BaseException) -> str:
-    """Return why a task failed, in one line."""
-    if isinstance(error, KilledWorker):
-        return (
-            f"every worker that matched it died, the last at {error.last_worker.address}, probably out of memory: give "
-            "workers more memory, or choose smaller tiles"
-        )
-    if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename2 or error.filename}: {error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__
