@@ -1,7 +1,7 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
 from sat_intervals.raster.cog import BLOCK, Part, codec_versions, compressed, factors
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
 from sat_intervals.raster.layers import (
@@ -64,6 +64,7 @@ __all__ = [
     "remove_scratch",
     "resolution_of",
     "restore",
+    "run_files",
     "stamps",
     "surface_file",
     "utm_of",

@@ -19,7 +19,7 @@ from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter, stamps
+from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
 from sat_intervals.run.quality import quality_of, warnings_of
@@ -82,14 +82,15 @@ def assemble(
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count, config.disparity.minimum)
     where = job.left.georeferencing.shifted(region)
-    with _resumable(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
+    files = run_files(config.products.compression)
+    with _resumable(), OutputWriter(job.out, files, region.height, region.width, where, _tags(config)) as writer:
         with logged_stage(seconds, "bands"):
             parts = finish_strips(job, client, scale, records, progress)
             for place in parts:
                 tally.merge(parts[place].get("counts", {}))
         with logged_stage(seconds, "files"):
             progress("files", 0, 1)
-            for file in RUN_FILES:
+            for file in files:
                 writer.put_together(file.name, levels_of(job, file.name, parts))
             job.check_inputs()
             progress("files", 0, 1)  # a last chance to interrupt the run before it publishes

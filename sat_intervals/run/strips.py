@@ -14,7 +14,7 @@ import numpy as np
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, RUN_FILES, Part, codec_versions, compressed, factors
+from sat_intervals.raster import BLOCK, RUN_FILES, Part, codec_versions, compressed, factors, run_files
 from sat_intervals.run.job import Job
 from sat_intervals.run.statistics import Tally
 from sat_intervals.run.workers import Task, Workers, check_not_full, reason
@@ -223,7 +223,7 @@ def _half(content: bytes, shape: Sequence[int]) -> list[np.ndarray]:
 
 def _write(job: Job, parts: Parts, place: Place, rasters: Sequence[np.ndarray], record: Mapping[str, Any]) -> None:
     contents, blocks = {}, {}
-    for file, raster in zip(RUN_FILES, rasters, strict=True):
+    for file, raster in zip(run_files(job.config.products.compression), rasters, strict=True):
         kind = file.name.partition(".")[0]
         blocks[kind], contents[kind] = compressed(raster, file)
     halves = [raster[:, ::2, ::2] for raster in rasters]

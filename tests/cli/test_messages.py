@@ -69,18 +69,8 @@ def test_main__names_a_variable_that_numba_cannot_start_with(threads, monkeypatc
 def test_main__names_a_malformed_dask_configuration(tmp_path):
     (tmp_path / "distributed.yaml").write_text("a: [1\n b: }")
     image = write(tmp_path / "image.tif", np.ones((9, 9), np.uint8))
-    result = ended(
-        "match",
-        image,
-        image,
-        tmp_path / "out",
-        "--disparity",
-        0,
-        4,
-        "--cluster",
-        "processes",
-        env=os.environ | {"DASK_CONFIG": str(tmp_path)},
-    )
+    arguments = "match", image, image, tmp_path / "out", "--disparity", 0, 4, "--cluster", "processes"
+    result = ended(*arguments, env=os.environ | {"DASK_CONFIG": str(tmp_path)})
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert str(tmp_path / "distributed.yaml") in line

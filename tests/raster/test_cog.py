@@ -15,7 +15,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals.products import Band
-from sat_intervals.raster import POINT_FILES, RUN_FILES, File, Georeferencing, cog, north_up
+from sat_intervals.raster import POINT_FILES, RUN_FILES, File, Georeferencing, cog, north_up, run_files
 from sat_intervals.raster.cog import BLOCK, Part, codec_versions, combined, compressed, factors, put_together, template
 from sat_intervals.raster.streaming import Stream
 
@@ -82,6 +82,18 @@ def test_put_together__is_a_valid_file_with_every_level(tmp_path, monkeypatch, f
     with rasterio.open(path) as dataset:
         assert (dataset.tags()["ALPHA"], dataset.tags(1)["meaning"]) == ("0.9", file.bands[0].meaning)
         assert Georeferencing.of(dataset) == PLACE
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lerc", "none"])
+def test_put_together__with_other_compressions(tmp_path, compression):
+    for file, shape in zip(run_files(compression), [(513, 40), (40, 30)], strict=True):
+        bands, path = noise(file, *shape), tmp_path / file.name
+        write(path, bands, file)
+        assert_valid(path)
+        with rasterio.open(path) as dataset:
+            assert dataset.profile.get("compress", "none") == file.compression
+            error = 0.01001 if file.compression == "lerc" else 0
+            np.testing.assert_allclose(dataset.read(), bands, rtol=0, atol=error)
 
 
 def test_put_together__gives_the_same_bytes_whatever_the_order(tmp_path):

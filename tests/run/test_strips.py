@@ -127,6 +127,16 @@ def test_finish_strips__takes_no_parts_of_other_settings(tall, tmp_path, monkeyp
     assert hashes(other) == hashes(tmp_path / "alone") != hashes(out)
 
 
+@pytest.mark.parametrize("compression", ["zstd", "lerc", "none"])
+def test_finish_strips__with_another_compression(tall, tmp_path, compression):
+    matched(tall, with_tiles(tall, tmp_path / "out"), products={"compression": compression})
+    for name in ("intervals.tif", "validity.tif"):
+        with rasterio.open(tmp_path / "out" / name) as file, rasterio.open(tall[0] / "kept" / name) as kept:
+            error = 0.01001 if compression == "lerc" and name == "intervals.tif" else 0
+            np.testing.assert_allclose(file.read(), kept.read(), rtol=0, atol=error)
+            assert file.tags() == kept.tags()
+
+
 def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
     task = strips._task
