@@ -22,7 +22,7 @@ from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 
 from sat_intervals.raster import gdal
-from sat_intervals.raster.files import File
+from sat_intervals.raster.files import File, run_files
 from sat_intervals.raster.georeferencing import Georeferencing
 
 BLOCK = 512
@@ -134,16 +134,15 @@ def _bits(bands: np.ndarray) -> np.ndarray:
 
 
 @cache
-def codec_versions() -> dict[str, Any]:
-    """Return what decides the bytes of blocks: versions, and a checksum of some compressed bands."""
-    random = np.random.default_rng(0)
-    bands = random.integers(-99, 99, (2, BLOCK, 64)).astype(np.float32)
-    made = [compressed(bands, File("", "float32", None, (), compression=name)).content for name in sorted(_LEVELS)]
-    return {
-        "rasterio": rasterio.__version__,
-        "gdal": rasterio.__gdal_version__,
-        "codecs": [zlib.crc32(content) for content in made],
-    }
+def codec_versions(compression: str) -> dict[str, Any]:
+    """Return what decides the bytes of blocks of a run: versions, and checksums of some compressed numbers."""
+    numbers = np.random.default_rng(0).integers(0, 99, (1, 99, 99))
+    made = [
+        compressed(numbers, File("", "uint16", None, (), compression=file.compression)).content
+        for file in run_files(compression)
+    ]
+    checksums = [zlib.crc32(content) for content in made]
+    return {"rasterio": rasterio.__version__, "gdal": rasterio.__gdal_version__, "codecs": checksums}
 
 
 def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch: Path) -> bytes:

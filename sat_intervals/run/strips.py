@@ -24,6 +24,8 @@ from sat_intervals.store.tiles import DamagedTilesError, Records
 
 # Pixels of a piece, in whole rows; each takes about 100 bytes.
 STRIP_PIXELS = 1 << 19
+# Bytes of compressed blocks and of the half per pixel.
+_COMPRESSED = 12
 # Pixels for the next level, not compressed: every second row and column of all files.
 _HALF = "half"
 # Increase when parts change.
@@ -34,14 +36,18 @@ _LOG = logging.getLogger(__name__)
 
 def parts_of(job: Job, codecs: Mapping[str, Any] | None = None) -> Parts:
     """Return the parts of a run; ``codecs`` are the versions of the codecs, by default those of this process."""
-    made_by = {"run": job.name, "codecs": codecs or codec_versions(), "layout": _LAYOUT}
+    made_by = {"run": job.name, "codecs": codecs or _codecs(job), "layout": _LAYOUT}
     return Parts(job.store.folder, digest(made_by))
 
 
+def _codecs(job: Job) -> dict[str, Any]:
+    return codec_versions(job.config.products.compression)
+
+
 def strip_bytes(width: int) -> int:
-    """Return the memory of a strip in bytes: its final bands, a piece, and blocks that are compressed."""
+    """Return the memory of a strip in bytes: its final bands, its compressed blocks and half, and a piece."""
     pixel = sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in RUN_FILES)
-    return pixel * BLOCK * width + 100 * max(STRIP_PIXELS, 64 * width) + (64 << 20)
+    return (pixel + _COMPRESSED) * BLOCK * width + 100 * max(STRIP_PIXELS, 32 * width)
 
 
 def _levels(job: Job) -> list[int]:
@@ -141,7 +147,7 @@ def _below(place: Place, counts: Sequence[int]) -> list[Place]:
 
 
 def _task(job: Job, place: Place, counts: Sequence[int], scale: ConfidenceScale, records: Records) -> Task:
-    codecs, retries = codec_versions(), job.config.cluster.retries
+    codecs, retries = _codecs(job), job.config.cluster.retries
     if place[0]:
         return Task(place, reduce_rows, (job, codecs, place, _below(place, counts)), retries)
     top, bottom = _rows(job, place[1], halo(job.config))
@@ -237,9 +243,9 @@ def _on_worker(job: Job, codecs: Mapping[str, Any]) -> Iterator[Parts]:
     """Check that a worker makes the same bytes as the others; yield the parts of the run."""
     try:
         job.store.check(job.manifest)
-        if codec_versions() != codecs:
+        if _codecs(job) != codecs:
             raise RunError(
-                f"this worker compresses with {codec_versions()}, the command with {dict(codecs)}: install the same "
+                f"this worker compresses with {_codecs(job)}, the command with {dict(codecs)}: install the same "
                 "version of rasterio for all"
             )
         yield parts_of(job, codecs)
