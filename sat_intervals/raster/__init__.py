@@ -1,6 +1,6 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.raster.cog import BLOCK, Part, codec_versions, compressed, factors
+from sat_intervals.raster.cog import BLOCK, Copy, Part, codec_versions, compressed, factors
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
@@ -31,6 +31,7 @@ __all__ = [
     "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
+    "Copy",
     "File",
     "Georeferencing",
     "Image",

@@ -41,6 +41,8 @@ _LEVELS: dict[str, dict[str, float]] = {
 _PREDICTORS = {"NO": 1, "FLOATING_POINT": 3}
 # Columns compressed at a time: padded and interleaved copies stay small.
 _COLUMNS = 4 * BLOCK
+# Bytes around each block: its size before it, and the copy of its end.
+_AROUND = 8
 # Size from which a file is a BigTIFF.
 _CLASSIC = 1 << 32
 # Tags of a TIFF directory, its types, and their sizes in bytes.
@@ -61,11 +63,21 @@ class Blocks(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A row of blocks that is stored elsewhere: sizes of its blocks, CRC-32 of its bytes, and how to read them."""
+    """A row of blocks that is stored elsewhere: sizes of its blocks, CRC-32 of its bytes, how to read them, a label."""
 
     sizes: Sequence[int]
     checksum: int
     read: Callable[[], bytes]
+    label: Any = None
+
+    @property
+    def length(self) -> int:
+        """Return the number of bytes, with those around each block."""
+        return sum(self.sizes) + _AROUND * len(self.sizes)
+
+
+Copy = Callable[[Path, Sequence[tuple[int, Part]]], None]
+"""Writes parts into a file, each at its offset."""
 
 
 def factors(height: int, width: int) -> list[int]:
@@ -164,7 +176,13 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch
     return made
 
 
-def put_together(path: Path, made: bytes, shape: tuple[int, int], levels: Sequence[Sequence[Part]]) -> dict[str, int]:
+def put_together(
+    path: Path,
+    made: bytes,
+    shape: tuple[int, int],
+    levels: Sequence[Sequence[Part]],
+    copy_all: Copy | None = None,
+) -> dict[str, int]:
     """Write a file from the rows of blocks of each level, see `factors`; return its size and CRC-32.
 
     Parameters
@@ -177,19 +195,28 @@ def put_together(path: Path, made: bytes, shape: tuple[int, int], levels: Sequen
         Rows and columns.
     levels
         Rows of blocks of each level, from the top.
+    copy_all
+        Writes the parts into the file; by default they are read and written one after another.
     """
     head = header(made, shape, [[size for part in level for size in part.sizes] for level in levels])
-    size, checksum = len(head), zlib.crc32(head)
+    parts = [part for level in reversed(levels) for part in level]
+    checksum = zlib.crc32(head)
+    for part in parts:
+        checksum = combined(checksum, part.checksum, part.length)
+    *offsets, size = accumulate((part.length for part in parts), initial=len(head))
     with open(path, "wb") as stream:
         stream.write(head)
-        for part in (part for level in reversed(levels) for part in level):
-            content = part.read()
-            stream.write(content)
-            size, checksum = size + len(content), combined(checksum, part.checksum, len(content))
+        if copy_all is None:
+            for part in parts:
+                stream.write(part.read())
+        else:
+            stream.truncate(size)
+            stream.flush()
+            copy_all(path, list(zip(offsets, parts, strict=True)))
         stream.flush()
         os.fsync(stream.fileno())
-        if stream.tell() != size:
-            raise OSError(errno.EIO, f"{stream.tell()} of {size} bytes were written")
+    if (found := path.stat().st_size) != size:
+        raise OSError(errno.EIO, f"{found} of {size} bytes were written")
     return {"bytes": size, "crc32": checksum}
 
 
@@ -214,8 +241,7 @@ def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) 
         changed = {tag: (_LONG, 1, struct.pack("<I", number)) for tag, number in numbers.items()}
         changed[_SIZES] = _LONG, len(of_level), np.array(of_level, "<u4").tobytes()
         directories.append((whole if factor == 1 else overview) | changed)
-    around = 8  # the size before a block, and the copy of its end
-    data = sum(size + around for of_level in sizes for size in of_level)
+    data = sum(size + _AROUND for of_level in sizes for size in of_level)
     is_big = data + len(_written(ghost, directories, sizes, 0, is_big=False)) >= _CLASSIC
     start = len(_written(ghost, directories, sizes, 0, is_big=is_big))
     return _written(ghost, directories, sizes, start, is_big=is_big)
@@ -228,7 +254,7 @@ def _written(
     kind, dtype = (_LONG8, "<u8") if is_big else (_LONG, "<u4")
     offsets: list[bytes] = []
     for of_level in reversed(sizes):
-        *places, start = accumulate(of_level, lambda place, size: place + size + 8, initial=start)
+        *places, start = accumulate(of_level, lambda place, size: place + size + _AROUND, initial=start)
         offsets.insert(0, (np.array(places, np.uint64) + 4).astype(dtype).tobytes())
     out = bytearray(struct.pack("<2sHHHQ", b"II", 43, 8, 0, 0) if is_big else struct.pack("<2sHI", b"II", 42, 0))
     pointer, number, entry = (8, "<Q", "<HHQ8s") if is_big else (4, "<I", "<HHI4s")

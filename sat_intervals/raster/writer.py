@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import shutil
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -17,7 +18,7 @@ from rasterio.shutil import copy
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.raster import gdal
-from sat_intervals.raster.cog import Part, put_together, template
+from sat_intervals.raster.cog import Copy, Part, put_together, template
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
@@ -29,7 +30,7 @@ from sat_intervals.store.folder import LocalFolder
 # replaced, others stay.
 _SCRATCH = ".unpublished-{}"
 # Names there: a final one, those of its strips and their levels, and those of GDAL beside both.
-_UNFINISHED = r"(?:(?:strips|rows)-(?:\d+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
+_UNFINISHED = r"(?:(?:strips|rows)-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
 # Tags in the file itself, not in another beside it.
 _PNG = {"WRITE_METADATA_AS_TEXT": "YES"}
 # GDAL's block cache in bytes; the default is a twentieth of the memory.
@@ -154,12 +155,15 @@ class OutputWriter:
             strips.write(bands, window=RasterioWindow(0, row, self._shape[1], bands.shape[1]))
             self._pictures[file.name] = strips, before + _sum(bands)
 
-    def put_together(self, name: str, levels: Sequence[Sequence[Part]]) -> dict[str, int]:
+    def put_together(self, name: str, levels: Sequence[Sequence[Part]], copy_all: Copy | None = None) -> dict[str, int]:
         """Make a file of rows of blocks, see `cog.put_together`, under a temporary name; return size and CRC-32."""
         (file,) = (file for file in self._files if file.name == name)
         with self._failing(self._folder / name):
             made = template(file, self._georeferencing, self._tags, self._scratch / name)
-            self._made[name] = put_together(self._scratch / name, made, self._shape, levels)
+            # a name of its own: a worker that was lost must not write into the file of a later run
+            path = self._scratch / f"strips-{uuid.uuid4().hex}-{name}"
+            self._made[name] = put_together(path, made, self._shape, levels, copy_all)
+            os.replace(path, self._scratch / name)
         return self._made[name]
 
     def build(self) -> dict[str, dict[str, int]]:

@@ -85,13 +85,13 @@ def assemble(
     files = run_files(config.products.compression)
     with _resumable(), OutputWriter(job.out, files, region.height, region.width, where, _tags(config)) as writer:
         with logged_stage(seconds, "bands"):
-            parts = finish_strips(job, client, scale, records, progress)
+            parts, copy_all = finish_strips(job, client, scale, records, progress)
             for place in parts:
                 tally.merge(parts[place].get("counts", {}))
         with logged_stage(seconds, "files"):
             progress("files", 0, 1)
             for file in files:
-                writer.put_together(file.name, levels_of(job, file.name, parts))
+                writer.put_together(file.name, levels_of(job, file.name, parts), copy_all)
             job.check_inputs()
             progress("files", 0, 1)  # a last chance to interrupt the run before it publishes
         _add_seconds(seconds, records)

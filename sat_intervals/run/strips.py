@@ -4,9 +4,11 @@ A strip is one row of blocks. It is computed in pieces, so memory depends on the
 overview is made of two rows of the level below it, so the parts form a binary tree.
 """
 
-import logging
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ import numpy as np
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, RUN_FILES, Part, codec_versions, compressed, factors, run_files
+from sat_intervals.raster import BLOCK, RUN_FILES, Copy, Part, codec_versions, compressed, factors, run_files
 from sat_intervals.run.job import Job
 from sat_intervals.run.statistics import Tally
 from sat_intervals.run.workers import Task, Workers, check_not_full, reason
@@ -30,8 +32,6 @@ _COMPRESSED = 12
 _HALF = "half"
 # Increase when parts change.
 _LAYOUT = 1
-
-_LOG = logging.getLogger(__name__)
 
 
 def parts_of(job: Job, codecs: Mapping[str, Any] | None = None) -> Parts:
@@ -85,8 +85,10 @@ def check_matched(job: Job, records: Records, searched: int) -> None:
 
 def finish_strips(
     job: Job, client: Callable[[], Workers], scale: ConfidenceScale, records: Records, progress: Progress
-) -> dict[Place, dict[str, Any]]:
-    """Make the parts of a run that are missing; return the records of all.
+) -> tuple[dict[Place, dict[str, Any]], Copy | None]:
+    """Make the parts of a run that are missing; return the records of all, and how workers copy them into a file.
+
+    Workers copy if they are there and share the folder of the run with this process.
 
     Parameters
     ----------
@@ -123,7 +125,8 @@ def finish_strips(
                 waiting.remove(place)
                 yield _task(job, place, counts, scale, records)
 
-    for outcome in client().outcomes(tasks()) if waiting else ():
+    workers = client() if waiting else None
+    for outcome in workers.outcomes(tasks()) if workers else ():
         if outcome is not None and outcome.error is not None:
             _raise(job, outcome.label, outcome.error)
         elif outcome is not None and outcome.result is not None:
@@ -137,7 +140,7 @@ def finish_strips(
         damage = [f"part {level}_{row} is missing in {parts.folder}" for level, row in set(places) - finished.keys()]
     if damage:
         raise DamagedTilesError(damage[0])
-    return finished
+    return finished, partial(copy_parts, job, workers) if workers and job.store.elsewhere is None else None
 
 
 def _below(place: Place, counts: Sequence[int]) -> list[Place]:
@@ -238,6 +241,43 @@ def _write(job: Job, parts: Parts, place: Place, rasters: Sequence[np.ndarray], 
     parts.write(place, contents, {**record, "blocks": blocks, "half": halves[0].shape[1:]})
 
 
+def copy_parts(job: Job, workers: Workers, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
+    """Write parts into a file at their offsets, on workers.
+
+    Raises
+    ------
+    DamagedTilesError
+        Parts must be made again.
+    OSError
+        The file cannot be written.
+    """
+    codecs, retries = _codecs(job), job.config.cluster.retries
+    tasks = (Task(part.label, copy_part, (job, codecs, *part.label, path, at), retries) for at, part in parts)
+    for outcome in workers.outcomes(tasks):
+        if outcome is not None and outcome.error is not None:
+            if isinstance(outcome.error, (OSError, DamagedTilesError)):
+                raise outcome.error
+            raise RunError(f"{path} cannot be written: {reason(outcome.error)}") from outcome.error
+        if outcome is not None and outcome.result is not None:
+            raise DamagedTilesError(outcome.result)
+
+
+def copy_part(job: Job, codecs: Mapping[str, Any], place: Place, kind: str, path: Path, offset: int) -> str | None:
+    """Write a part into a file; see `finish_strip`."""
+    with _on_worker(job, codecs) as parts:
+        record = parts.record(place)
+        try:
+            content = parts.read(place, kind, record or {"files": {kind: ()}})
+        except DamagedTilesError as error:
+            return str(error)
+        with open(path, "r+b") as stream:
+            stream.seek(offset)
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+    return None
+
+
 @contextmanager
 def _on_worker(job: Job, codecs: Mapping[str, Any]) -> Iterator[Parts]:
     """Check that a worker makes the same bytes as the others; yield the parts of the run."""
@@ -261,6 +301,6 @@ def levels_of(job: Job, name: str, records: Mapping[Place, Mapping[str, Any]]) -
     def part(place: Place) -> Part:
         record = records[place]
         _, crc = record["files"][kind]
-        return Part(record["blocks"][kind], crc, lambda: parts.read(place, kind, record))
+        return Part(record["blocks"][kind], crc, lambda: parts.read(place, kind, record), (place, kind))
 
     return [[part((level, row)) for row in range(count)] for level, count in enumerate(_levels(job))]

@@ -739,7 +739,7 @@ def killed(number, *arguments, **options):
         patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
         publishing.publish(*arguments)
 
-    def put_together(writer, name, levels):
+    def put_together(*arguments):
         raise Killed
 
     with pytest.MonkeyPatch.context() as patch:

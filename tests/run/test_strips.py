@@ -92,6 +92,36 @@ def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, mon
     assert hashes(out) == hashes(tall[0] / "kept")
 
 
+@pytest.mark.parametrize("by", ["workers", "command"])
+def test_copy_parts__gives_the_same_bytes_as_one_after_another(tall, tmp_path, monkeypatch, by):
+    copied, copy_part = [], strips.copy_part
+    monkeypatch.setattr(strips, "copy_part", lambda *part: (copied.append(part), copy_part(*part))[1])
+    # a store of its own may be out of the workers' reach
+    store = {} if by == "workers" else {"store": str(tmp_path / "store")}
+    matched(tall, tmp_path / "out", cluster=store)
+    assert len(copied) == (2 * PARTS if by == "workers" else 0)
+    assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
+
+
+@pytest.mark.parametrize("how", ["gone", "bit"])
+def test_copy_part__meets_a_damaged_part_which_is_made_again(tall, tmp_path, monkeypatch, how):
+    out = with_tiles(tall, tmp_path / "out")
+    copy_part = strips.copy_part
+
+    def damaged(job, codecs, place, kind, *rest):
+        if not (tmp_path / "done").exists():
+            (tmp_path / "done").touch()
+            (file,) = (out / "tiles" / "parts").glob(f"*_{place[0]}_{place[1]}_{kind}")
+            content = bytearray(file.read_bytes())
+            content[len(content) // 2] ^= 4
+            file.unlink() if how == "gone" else file.write_bytes(content)
+        return copy_part(job, codecs, place, kind, *rest)
+
+    monkeypatch.setattr(strips, "copy_part", damaged)
+    matched(tall, out)
+    assert hashes(out) == hashes(tall[0] / "kept")
+
+
 @pytest.mark.parametrize("kind", ["0_1_half", "1_0_intervals", "0_3_validity", "0_1.json"])
 @pytest.mark.parametrize("how", ["gone", "cut short", "bit"])
 def test_finish_strips__makes_damaged_parts_again(tall, tmp_path, monkeypatch, kind, how):
@@ -174,9 +204,16 @@ class Second:
 def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp_path, cluster):
     out = with_tiles(tall, tmp_path / "out")
     seen: dict[str, int] = {}
-    for count in (1, 4, PARTS):
+    for count in (1, 4, PARTS, "file"):
+        if count == "file":  # one part is missing, so that workers copy them
+            (out / "tiles" / "parts" / next(name for name in seen if name.endswith("_2_0.json"))).unlink()
+            seen = parts(out)
+
+        def reached(count=count):
+            return list(out.glob(".*/files/strips-*")) if count == "file" else len(parts(out)) >= count
+
         with Second(tall, out, "--cluster", cluster) as process:
-            wait_until(lambda: len(parts(out)) >= count or process.poll() is not None, f"{count} parts")  # noqa: B023
+            wait_until(lambda: reached() or process.poll() is not None, f"{count}")
             children = psutil.Process(process.pid).children() if process.poll() is None else []
             process.kill()
             process.wait()
