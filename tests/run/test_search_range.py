@@ -135,6 +135,29 @@ def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):
     assert len(np.unique(searched)) > 1
 
 
+def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
+    images = folder / "left.tif", folder / "right.tif"
+    before = images[1].read_bytes()
+    result = invoke("range", *images, "--output", images[1])
+    assert result.exit_code == 2
+    assert "is an input" in result.stderr
+    assert images[1].read_bytes() == before
+    write_bands(tmp_path / "other.tif", *np.zeros((2, 180, 420)))
+    result = invoke("range", *images, "--output", tmp_path / "other.tif")
+    assert result.exit_code == 2
+    assert "was not made by sat-intervals" in result.stderr
+
+
+def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
+    grid = tmp_path / "tiles/range.tif"
+    grid.parent.mkdir()
+    write_bands(grid, *np.stack([np.full((180, 420), -5), np.full((180, 420), 5)]))
+    result = invoke("match", folder / "left.tif", folder / "right.tif", tmp_path, "--range-grid", grid, "--overwrite")
+    assert result.exit_code == 2
+    assert "is an input" in result.stderr
+    assert grid.exists()
+
+
 def test_match__names_a_wider_range_and_is_strict(folder, tmp_path):
     command = "match", folder / "left.tif", folder / "right.tif", tmp_path, "--disparity", -3, 9, "--strict", "-q"
     result = invoke(*command)
