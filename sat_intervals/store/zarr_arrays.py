@@ -32,8 +32,8 @@ _RIGHT = "right"
 _UNSEEN = np.uint32(0xFFFFFFFF)
 SIDES = ("top", "bottom", "left", "right")
 
-# Rows of a shard that are compressed together. Writing a tile of 1024 x 1024 pixels and reading it by strips of 512 rows
-# with a halo takes 0.26 s of processor time with 64 rows, as with 128, and 0.34 s with 32, since each piece has a price.
+# Rows of a shard that are compressed together. Writing a tile of 1024 x 1024 pixels and reading it by strips of 512
+# rows with a halo takes 0.26 s of processor time with 64 rows, as with 128, and 0.34 s with 32: each piece has a price.
 _ROWS_TOGETHER = 64
 # Local files that this process has checked: path and checksum, with the stamp of then. Strips share tiles.
 _CHECKED: dict[tuple[str, int], tuple[int, ...]] = {}
