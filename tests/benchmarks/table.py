@@ -63,18 +63,45 @@ def write_pair(folder, size):
     return paths
 
 
-def match(pair, out, workers, disparities=64, environment=None):
+# Prints the processor time of the command itself, without its workers, from the first strip on, and the bytes it wrote.
+CLIENT = """
+import json, sys, time
+from sat_intervals import match_pair
+def progress(stage, done, total):
+    if stage in ("bands", "files"):
+        marks.setdefault(stage, time.process_time())
+        marks["end"] = time.process_time()
+if __name__ == "__main__":
+    left, right, out, minimum, maximum = sys.argv[1:]
+    marks, search = {}, {"minimum": int(minimum), "maximum": int(maximum)}
+    settings = {"disparity": search, "cluster": {"kind": "processes", "workers": 2}}
+    report = match_pair(left, right, out, settings, overwrite=True, progress=progress)
+    print(json.dumps([marks["end"] - marks["bands"], sum(file["bytes"] for file in report["files"].values())]))
+"""
+
+
+def client(pair, folder):
+    """Processor time of the command while workers finish strips and copy them, and gigabytes written."""
+    (folder / "client.py").write_text(CLIENT)
+    ends = map(str, search_range(64))
+    command = [sys.executable, folder / "client.py", *pair, folder / "client", *ends]
+    seconds, written = json.loads(run([str(part) for part in command], CORES)[2].splitlines()[-1])
+    return seconds, written / 1e9
+
+
+def match(pair, out, workers, disparities=64, environment=None, options=()):
     """Seconds, peak memory in MB and run.json of a whole `sat-intervals match`."""
     ends = map(str, search_range(disparities))
     command = [Path(sys.executable).with_name("sat-intervals"), "match", *pair, out, "--disparity", *ends, "--quiet"]
-    command += ["--overwrite", "--workers", workers]
+    command += ["--overwrite", "--workers", workers, *options]
     seconds, memory, _ = run([str(part) for part in command], CORES[:workers], environment)
     return seconds, memory, json.loads((out / "run.json").read_text())
 
 
-def median_run(pair, out, workers, runs):
+def median_run(pair, out, workers, runs, options=()):
     """Return the result of `match` of the run with the median time."""
-    return sorted((match(pair, out, workers) for _ in range(runs)), key=lambda run: run[0])[runs // 2]
+    results = (match(pair, out, workers, options=options) for _ in range(runs))
+    return sorted(results, key=lambda run: run[0])[runs // 2]
 
 
 def row(*cells):
@@ -143,7 +170,10 @@ def file_to_file(folder):
         f"files {stages['files']:.1f} s, starting {starting:.1f} s",
     )
     row("what all but the kernels adds to them", f"{100 * (one[0] / kernels - 1):.0f} %")
-    row("rows, with reading and writing", f"{16 / stages['bands']:.0f} Mpx/s")
+    (folder / "none.yaml").write_text("products: {compression: none}\n")
+    plain = median_run(pairs[4000], folder / "out", 1, 3, ["--config", folder / "none.yaml"])
+    row("the same without compression", f"{100 * (plain[0] / plain[2]['seconds']['tiles.match'] - 1):.0f} %")
+    row("strips, with reading, compressing and writing", f"{16 / stages['bands']:.0f} Mpx/s")
     if len(CORES) > 1:
         two = median_run(pairs[4000], folder / "out", 2, 3)
         tiles = stages["tiles"] / two[2]["seconds"]["tiles"]
@@ -151,6 +181,9 @@ def file_to_file(folder):
     small, large = median_run(pairs[2000], folder / "out", 1, RUNS), median_run(pairs[8000], folder / "out", 1, 1)
     row("cost a pixel, 8000 x 8000 against 2000 x 2000", f"{large[0] / small[0] / 16:.2f}")
     row("peak memory, the same", f"{large[1] / small[1]:.2f} ({large[1]:.0f} and {small[1]:.0f} MB)")
+    if len(CORES) > 1:
+        seconds, written = client(pairs[8000], folder)
+        row("the command itself after its tiles, 8000 x 8000, two processes", f"{seconds:.2f} s for {written:.2f} GB")
 
 
 def main():
