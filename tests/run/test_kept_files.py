@@ -447,7 +447,7 @@ def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(pair)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["records", "failures", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
+@pytest.mark.parametrize("name", ["records", "parts", "failures", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
 def test_match__refuses_a_link_among_the_folders_of_its_tiles(pair, name, overwrite):
     folder, settings = pair
     (folder / "precious").mkdir()
