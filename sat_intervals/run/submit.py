@@ -5,7 +5,7 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -26,13 +26,14 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DaskWorkers:
-    """Workers of a dask cluster; see `Workers`."""
+    """Workers of a dask cluster, and the addresses of those that were logged; see `Workers`."""
 
     client: Client
+    known: set[str] = field(default_factory=set)
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
         """See `Workers` and `Submission`."""
-        return iter(Submission(self.client, tasks))
+        return iter(Submission(self.client, tasks, self.known))
 
 
 class Submission:
@@ -47,7 +48,8 @@ class Submission:
         The scheduler is gone, or all workers of a batch system.
     """
 
-    def __init__(self, client: Client, tasks: Iterator[Task | None]) -> None:
+    def __init__(self, client: Client, tasks: Iterator[Task | None], known: set[str] | None = None) -> None:
+        """``known``: workers that were logged before, kept up to date."""
         self._client, self._tasks = client, tasks
         self._name = uuid.uuid4().hex  # unique, since a scheduler may serve several runs
         self._submitted = 0
@@ -55,7 +57,7 @@ class Submission:
         self._in_flight: dict[str, tuple[Task, bool, Future[Any]]] = {}
         self._suspects: list[Task] = []
         self._limit, self._checked = 2, float("-inf")
-        self._workers: set[str] = set()
+        self._workers: set[str] = set() if known is None else known
         self._heartbeats = _Heartbeats()
 
     def __iter__(self) -> Iterator[Outcome | None]:
@@ -104,7 +106,8 @@ class Submission:
     def _log_workers(self, workers: set[str]) -> None:
         for worker in sorted(workers ^ self._workers):
             _LOG.info("worker %s %s", worker, "joined" if worker in workers else "left")
-        self._workers = workers
+        self._workers.clear()
+        self._workers.update(workers)
 
     def _submit(self, task: Task, *, is_alone: bool = False) -> None:
         self._submitted += 1
