@@ -76,8 +76,7 @@ def assemble(
     config, store, region = job.config, job.store, job.store.grid.region
     records, statistics = store.records(), job.statistics()
     check_done(job, records)
-    histogram = store.histogram(records)
-    seams = None if config.tiles.overlap == "exact" else store.seams(records)
+    histogram, seams = store.histogram(records), store.seams(records) if store.has_seams else None
     check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count, config.disparity.minimum)
@@ -153,10 +152,11 @@ def _versions() -> dict[str, str]:
 
 def _calibration(config: Config) -> dict[str, Any] | None:
     """Return what the run took from its calibration, whose content is in the settings."""
-    if config.interval is None or config.interval.coverage is None or config.cuts is None:
+    levels = config.cuts
+    if levels is None or levels.coverage is None:
         return None
     calibration = calibration_of(config)
-    return {"name": calibration.name, "sha256": calibration.sha256, **config.cuts._asdict()}
+    return {"name": calibration.name, "sha256": calibration.sha256, **levels.model_dump()}
 
 
 def _report(

@@ -39,7 +39,7 @@ from sat_intervals.run import strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
-from sat_intervals.run.tile import match_tile
+from sat_intervals.run.tile import match_block
 from sat_intervals.show.maps import draw_overview
 from sat_intervals.show.report import write_report
 from sat_intervals.store.folder import LocalFolder
@@ -193,7 +193,7 @@ def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
     (folder / "left.tif").unlink()
     monkeypatch.setattr("sat_intervals.run.tile.cost_areas", None)
     with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed"):
-        match_tile(job, next(iter(job.store.grid)))
+        match_block(job, next(iter(job.store.grid)))
 
 
 # Inputs among the outputs
@@ -447,7 +447,7 @@ def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(pair)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["records", "parts", "failures", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
+@pytest.mark.parametrize("name", ["records", "parts", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
 def test_match__refuses_a_link_among_the_folders_of_its_tiles(pair, name, overwrite):
     folder, settings = pair
     (folder / "precious").mkdir()
