@@ -370,7 +370,9 @@ def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tm
             started(uneven, out, "--cluster", address, "--log-file", str(log)) as command,
         ):
             assert command.end() == 1, command.output
-            alone = r"match_block of \(0, Step\(block=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
+            alone = (
+                r"match_block of \(0, Step\(block=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
+            )
             assert re.search(alone, log.read_text())
             assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
             assert "give workers more memory, or choose smaller tiles" in command.output
