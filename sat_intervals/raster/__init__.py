@@ -1,6 +1,7 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
+from sat_intervals.raster.cog import BLOCK, Copy, Part, codec_versions, compressed, factors
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file
 from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
@@ -26,21 +27,27 @@ from sat_intervals.raster.windows import read_views, read_window
 from sat_intervals.raster.writer import OutputWriter, check_space, remove_scratch, restore
 
 __all__ = [
+    "BLOCK",
     "MARK",
     "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
+    "Copy",
     "File",
     "Georeferencing",
     "Image",
     "InputError",
     "OutputError",
     "OutputWriter",
+    "Part",
     "Projection",
     "check_marked",
     "check_pair",
     "check_reference",
     "check_space",
+    "codec_versions",
+    "compressed",
+    "factors",
     "footprint",
     "grid_mapping",
     "is_marked",
@@ -61,6 +68,7 @@ __all__ = [
     "remove_scratch",
     "resolution_of",
     "restore",
+    "run_files",
     "stamps",
     "surface_file",
     "utm_of",
