@@ -95,7 +95,7 @@ def make_surface(
     if interval not in ("envelope", "mean"):
         raise SatIntervalsError(f"interval is {interval!r}, allowed: envelope or mean")
     _check_target(path)
-    runs = _triangulated([Path(out) for out in outs])
+    runs = triangulated([Path(out) for out in outs])
     for run in runs:
         run.check_kept([path], [run.out / "points.tif", geoid])
     projection = _projection(runs, crs, None if geoid is None else Path(geoid))
@@ -148,7 +148,14 @@ def _check_target(path: Path) -> None:
         raise SatIntervalsError(f"{path} exists and is not a surface model: choose another --output")
 
 
-def _triangulated(outs: Sequence[Path]) -> list[Run]:
+def triangulated(outs: Sequence[Path]) -> list[Run]:
+    """Open runs with points of their own.
+
+    Raises
+    ------
+    SatIntervalsError
+        A folder is no run, is given twice, or has no points, those of an earlier run, or damaged ones.
+    """
     for out, count in Counter(out.resolve() for out in outs).items():
         if count > 1:
             raise SatIntervalsError(f"{out} is given {count} times: give each run once")
@@ -166,13 +173,13 @@ def _triangulated(outs: Sequence[Path]) -> list[Run]:
 
 
 def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Projection:
-    middle = _point_near_the_middle(runs)
+    middle = point_near_the_middle(runs)
     projection = Projection(utm_of(*middle) if crs is None else crs, geoid)
     projection.check(*middle)
     return projection
 
 
-def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
+def point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
     """Return longitude and latitude of the middle of a window with points, of the first run that has any."""
     for run in runs:
         tiles = Grid(Window(0, 0, *run.shape), WINDOW)

@@ -1,7 +1,9 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file, truth_file
+from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
+from sat_intervals.raster.heightfield import HeightRaster
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
 from sat_intervals.raster.layers import (
     MARK,
@@ -30,12 +32,15 @@ __all__ = [
     "RUN_FILES",
     "ControlPoint",
     "File",
+    "Frame",
     "Georeferencing",
+    "HeightRaster",
     "Image",
     "InputError",
     "OutputError",
     "OutputWriter",
     "Projection",
+    "Vertical",
     "check_marked",
     "check_pair",
     "check_reference",
@@ -60,6 +65,7 @@ __all__ = [
     "restore",
     "stamps",
     "surface_file",
+    "truth_file",
     "utm_of",
     "whole_file",
     "write_layer",
