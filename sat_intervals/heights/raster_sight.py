@@ -66,6 +66,7 @@ class RasterSight:
         self._scene, self._raster, self._shift = scene, raster, shift
         self._search = search
         self._lattice = self._new_lattice()
+        self._heights: dict[int, tuple[float, float]] = {}
         self._steepest = np.tan(np.radians(_STEEPEST)) * raster.cell / raster.frame.unit
 
     def strips(self, pixel: float) -> Iterator[tuple[int, np.ndarray]]:
@@ -119,7 +120,7 @@ class RasterSight:
         begin = min(int(tile.column / step[1]), sights.shape[1] - 2)
         end = min(int((tile.column_stop - 1) / step[1]) + 1, sights.shape[1] - 1)
         sights = np.ascontiguousarray(sights[:, begin : end + 1])
-        below = self._below(sights) if np.isfinite(sights).any() else None
+        below = self._below(sights, tile.column) if np.isfinite(sights).any() else None
         if below is None:
             return np.full((tile.height, tile.width), np.nan)
         window, surface = below
@@ -130,14 +131,19 @@ class RasterSight:
             seen_disparities(surface, tops(surface), relative, step, place, (tile.height, tile.width), self._steepest)
         )
 
-    def _below(self, sights: np.ndarray) -> tuple[Window, np.ndarray] | None:
+    def _below(self, sights: np.ndarray, column: int) -> tuple[Window, np.ndarray] | None:
         """Read the heights that lines of sight can meet; None if there are none.
 
         The window follows from the range of heights and the other way round: it grows until both agree.
         """
         ends = float(np.nanmin(sights[..., 2])), float(np.nanmax(sights[..., 2]))
-        found = self._grown(sights, (sum(ends) / 2,) * 2)
-        return self._grown(sights, ends) if found is None else found
+        begin = self._heights.get(column, (sum(ends) / 2,) * 2)  # those of the tile above
+        found = self._grown(sights, begin)
+        if found is None:
+            found = self._grown(sights, ends)
+        if found is not None:
+            self._heights[column] = float(np.nanmin(found[1])), float(np.nanmax(found[1]))
+        return found
 
     def _grown(self, sights: np.ndarray, heights: tuple[float, float]) -> tuple[Window, np.ndarray] | None:
         """Read below a range of heights, which grows to that of the heights found; None if there are none."""

@@ -1,6 +1,7 @@
 """Read a raster of reference heights in its own grid and CRS, in parts."""
 
 import math
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from sat_intervals.tiling import Window
 
 # Heights of the ground on Earth in metres; others are no-data values that the file does not declare.
 _GROUND = -600.0, 9500.0
+# Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
+_BLOCK, _KEPT = 512, 128
 
 
 class HeightRaster:
@@ -50,6 +53,7 @@ class HeightRaster:
         a, b, _, d, e, _ = place.transform[:6]
         self.cell = math.sqrt(abs(a * e - b * d)) * self.frame.metres
         """Side of a cell in metres, about."""
+        self._block = lru_cache(_KEPT)(self._read_block)
         if min(self.shape) < 2:
             raise SatIntervalsError(f"{path} has {self.shape[0]} x {self.shape[1]} cells: give at least 2 x 2")
 
@@ -60,8 +64,18 @@ class HeightRaster:
         return a * x + b * y + c - 0.5, d * x + e * y + f - 0.5, z
 
     def read(self, window: Window) -> np.ndarray:
-        """Read a window, which may reach beyond the raster, as float32; NaN where there is no height."""
-        pixels, state = read_window(self._image, window)
+        """Read a window inside the raster as float32; NaN where there is no height. Thread-safe."""
+        heights = np.empty((window.height, window.width), np.float32)
+        for i in range(window.row // _BLOCK, (window.row_stop - 1) // _BLOCK + 1):
+            for j in range(window.column // _BLOCK, (window.column_stop - 1) // _BLOCK + 1):
+                block = Window(i * _BLOCK, j * _BLOCK, _BLOCK, _BLOCK)
+                common = block.clipped(window)
+                heights[common.relative_to(window).slices] = self._block(i, j)[common.relative_to(block).slices]
+        return heights
+
+    def _read_block(self, i: int, j: int) -> np.ndarray:
+        block = Window(i * _BLOCK, j * _BLOCK, _BLOCK, _BLOCK).clipped(Window(0, 0, *self.shape))
+        pixels, state = read_window(self._image, block)
         heights = (pixels * self._scale + self._offset).astype(np.float32)
         metres = heights * self.frame.unit
         return np.where((state == 0) & (metres >= _GROUND[0]) & (metres <= _GROUND[1]), heights, np.float32(np.nan))
