@@ -254,10 +254,10 @@ class _Work:
         with TemporaryDirectory(dir=self.run.out, prefix=".reference-") as folder:
             sight = PointSight(Path(folder), self.run.region, self._rise)
             lattice = self._lattice(shift, progress)
-            for part in self._near(progress):
-                assert lattice is not None  # there is a point
-                row, column, _, right = lattice.positions(part + shift).T
-                sight.add(row, column, right - column)
+            if lattice is not None:
+                for part in self._near(progress):
+                    row, column, _, right = lattice.positions(part + shift).T
+                    sight.add(row, column, right - column)
             for row, strip in sight.strips():
                 progress("truth", row + len(strip), height)
                 yield row, strip

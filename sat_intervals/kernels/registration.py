@@ -28,6 +28,8 @@ _SEARCHED, _LEAST_BLOCKS = 8_000, 4
 _CLIP, _FLOOR = 3.0, 1.0
 # Cells of the shift that must raise the loss: by so many cells, and by so many standard errors.
 _PROBE, _LEAST_RISE, _CLEARLY = 4.0, 0.02, 5.0
+# Standard deviation that interpolation between cells adds, in cells: no spread between blocks shows it.
+_BETWEEN = 0.1
 # Makes a median of absolute values a standard deviation.
 _NORMAL = 1.4826
 _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
@@ -183,7 +185,8 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
     errors = [_mean_of_blocks(blocks, (after - before) / (2 * step))[1] for before, after in sides[:2]]
     inverse = np.linalg.inv(bend)
     up, deviation = _vertical(blocks, _differences(blocks, place))
-    return np.array([*place, up[2]]), np.array([*np.sqrt(inverse**2 @ np.square(errors)), deviation[2]])
+    across = np.sqrt(inverse**2 @ np.square(errors) + (_BETWEEN * blocks.cell) ** 2)
+    return np.array([*place, up[2]]), np.array([*across, deviation[2]])
 
 
 def _mean_of_blocks(blocks: Blocks, values: np.ndarray) -> tuple[float, float]:

@@ -31,12 +31,15 @@ def _height(surface, x, y):
 
 
 @inlined
-def _rise(surface, x, y):
-    """Return the largest difference of the four heights around a position inside."""
+def _is_in_wall(surface, x, y, z, steepest):
+    """Return whether a position is below the highest of the four heights around, and these differ by too much."""
     rows, columns = surface.shape
+    if not (0 <= x <= columns - 1 and 0 <= y <= rows - 1):
+        return False
     i, j = min(int(y), rows - 2), min(int(x), columns - 2)
     a, b, c, d = surface[i, j], surface[i, j + 1], surface[i + 1, j], surface[i + 1, j + 1]
-    return max(a, b, c, d) - min(a, b, c, d)
+    highest = max(a, b, c, d)
+    return z < highest and highest - min(a, b, c, d) > steepest
 
 
 @cached
@@ -79,8 +82,8 @@ def seen_disparities(surface, top, lattice, spacing, first, shape, steepest):
     shape
         Rows and columns of the pixels.
     steepest
-        Pixels that meet a wall have no disparity, since its place is known to a cell only: four neighbouring heights
-        that differ by more than this.
+        Four neighbouring heights that differ by more than this are a wall, whose place is known to a cell only. Lines
+        of sight that meet it, or pass between its heights, have no disparity.
 
     Returns
     -------
@@ -125,9 +128,9 @@ def _first_crossing(surface, top, highest, line, steepest):
         for piece in range(pieces):
             begin, end = piece / pieces, (piece + 1) / pieces
             middle = 0.5 * (begin + end)
-            i, j = int(np.floor(y + middle * dy)) // BLOCK, int(np.floor(x + middle * dx)) // BLOCK
-            is_inside = 0 <= i < top.shape[0] and 0 <= j < top.shape[1]
-            if not is_inside or z + end * dz > top[i, j]:
+            i = min(max(int(np.floor(y + middle * dy)) // BLOCK, 0), top.shape[0] - 1)
+            j = min(max(int(np.floor(x + middle * dx)) // BLOCK, 0), top.shape[1] - 1)
+            if z + end * dz > top[i, j]:
                 is_known_above = False
                 continue
             steps = max(1, int(np.ceil(length / pieces / _STEP)))
@@ -137,11 +140,13 @@ def _first_crossing(surface, top, highest, line, steepest):
             for step in range(1, steps + 1):
                 t = begin + (end - begin) * step / steps
                 over = z + t * dz - _height(surface, x + t * dx, y + t * dy)
+                if _is_in_wall(surface, x + t * dx, y + t * dy, z + t * dz, steepest):
+                    return np.nan
                 if over <= 0:
                     if not is_known_above:  # it went below where heights are unknown
                         return np.nan
                     t = _crossing(surface, x, y, z, dx, dy, dz, gone, t)
-                    if _rise(surface, x + t * dx, y + t * dy) > steepest:
+                    if _is_in_wall(surface, x + t * dx, y + t * dy, z + t * dz - _NEAR, steepest):
                         return np.nan
                     return k + t
                 is_known_above = over > 0
