@@ -1,7 +1,6 @@
 """``sat-intervals reference``: true disparities of a run from reference heights."""
 
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -52,6 +51,7 @@ def reference(
     if ellipsoid and geoid:
         raise click.UsageError("--ellipsoid and --geoid exclude each other.")
     from sat_intervals.cli.console import Console
+    from sat_intervals.cli.tables import registration_lines
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
     from sat_intervals.raster import Vertical
 
@@ -61,7 +61,7 @@ def reference(
     with Console(quiet) as console:
         report = make_truth(out, files, given, path=output, registers=not no_register, progress=console.progress)
     if report["registration"]:
-        for line in said_of_registration(report["registration"]):
+        for line in registration_lines(report["registration"]):
             console.say(line)
         up = report["registration"]["shift"][2]
         if abs(up) > _SUSPECT_HEIGHT:
@@ -78,21 +78,3 @@ def reference(
         f"{100 * report['outside_range']:.1f} % of them outside the search range"
     )
     console.say(str(output or out / "truth.tif"))
-
-
-def said_of_registration(found: dict[str, Any]) -> list[str]:
-    """Return lines for people: the shift, and figures before and after it."""
-    east, north, up = (
-        f"{value:+.2f} m" + ("" if deviation is None else f" (standard deviation {deviation:.2g})")
-        for value, deviation in zip(found["shift"], found["deviation"], strict=True)
-    )
-    lines = [f"reference moved: easting {east}, northing {north}, height {up}"]
-    if not found["is_horizontal"]:
-        lines = [f"reference moved: height {up}; the ground is too flat to tell easting and northing"]
-    for when in ("before", "after"):
-        figures = found[when]
-        lines.append(
-            f"height - reference {when}: median {figures['median']:.2f} m, NMAD {figures['nmad']:.2f} m, "
-            f"LE90 {figures['le90']:.2f} m, {figures['count']} points"
-        )
-    return lines

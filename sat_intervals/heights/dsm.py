@@ -91,9 +91,7 @@ def make_surface(
         A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, radius = Path(path), resolution if radius is None else radius
-    _check_lengths(resolution, radius)
-    if interval not in ("envelope", "mean"):
-        raise SatIntervalsError(f"interval is {interval!r}, allowed: envelope or mean")
+    _check_settings(resolution, radius, interval)
     _check_target(path)
     runs = triangulated([Path(out) for out in outs])
     for run in runs:
@@ -109,6 +107,7 @@ def make_surface(
         "INTERVAL": interval,
         "RADIUS": f"{radius:g} m",
         "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}",
+        **_nominal_tag(runs),
     }
     place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
     writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
@@ -131,7 +130,16 @@ def runs_tag(runs: Sequence[Run]) -> str:
     return " ".join(run.report["finished"] for run in runs)
 
 
-def _check_lengths(resolution: float, radius: float) -> None:
+def _nominal_tag(runs: Sequence[Run]) -> dict[str, str]:
+    """Return the tag COVERAGE or ALPHA of a surface, none if its runs differ or have no intervals."""
+    levels = {("COVERAGE", run.config.interval.coverage) if run.config.interval.coverage else
+              ("ALPHA", run.config.interval.alpha) for run in runs if run.config.interval}  # fmt: skip
+    return {name: str(level) for name, level in levels} if len(levels) == 1 else {}
+
+
+def _check_settings(resolution: float, radius: float, interval: str) -> None:
+    if interval not in ("envelope", "mean"):
+        raise SatIntervalsError(f"interval is {interval!r}, allowed: envelope or mean")
     for name, value in (("resolution", resolution), ("radius", radius)):
         if not 0 < value <= _LARGEST:
             raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, up to {_LARGEST:g}")

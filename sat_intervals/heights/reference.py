@@ -20,7 +20,7 @@ from sat_intervals.heights.point_sight import PointSight
 from sat_intervals.heights.raster_sight import RasterSight, Scene, Shift
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
 from sat_intervals.heights.sensors import Sensors
-from sat_intervals.kernels.registration import LEAST, Blocks, Registration, register, summary
+from sat_intervals.kernels.registration import LEAST, Blocks, Registration, register
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     MARK,
@@ -137,24 +137,11 @@ def make_truth(
         progress("files", 0, 1)
         writer.publish()
         progress("files", 1, 1)
-    return tally.report() | {"row_misfit": work.row_misfit, "registration": _described(found)}
+    return tally.report() | {"row_misfit": work.row_misfit, "registration": found and found.report()}
 
 
 def _georeferencing(run: Run) -> Georeferencing:
     return open_image(run.out / "validity.tif").georeferencing
-
-
-def _described(found: Registration | None) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    return {
-        "shift": found.shift.tolist(),
-        "deviation": [None if np.isnan(value) else float(value) for value in found.deviation],
-        "is_horizontal": found.is_horizontal,
-        "used": found.used,
-        "before": summary(found.before),
-        "after": summary(found.after),
-    }
 
 
 class _Work:

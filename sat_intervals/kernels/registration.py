@@ -11,7 +11,7 @@ between blocks.
 Letters: i, j row and column of a block's surface.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,6 +83,17 @@ class Registration(NamedTuple):
     before: np.ndarray
     after: np.ndarray
 
+    def report(self) -> dict[str, Any]:
+        """Return plain values, None for a deviation that is unknown; `summary` of differences before and after."""
+        return {
+            "shift": self.shift.tolist(),
+            "deviation": [None if np.isnan(value) else float(value) for value in self.deviation],
+            "is_horizontal": self.is_horizontal,
+            "used": self.used,
+            "before": summary(self.before),
+            "after": summary(self.after),
+        }
+
 
 @cached
 def sampled(surface, block, x, y):
@@ -138,12 +149,18 @@ def _thinned(blocks: Blocks) -> Blocks:
 def _clipped(blocks: Blocks, shift: np.ndarray, most: float) -> np.ndarray:
     """Return distances of differences from their median, up to ``most``; NaN where unknown."""
     differences = _differences(blocks, shift)
-    return np.minimum(np.abs(differences - np.nanmedian(differences)), most)
+    return np.minimum(np.abs(differences - _median(differences)), most)
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of the known values; NaN without."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else np.nan
 
 
 def _most(blocks: Blocks, shift: np.ndarray) -> float:
     """Return the distance from the median up to which differences count."""
-    scale = _NORMAL * float(np.nanmedian(_clipped(blocks, shift, np.inf)))
+    scale = _NORMAL * _median(_clipped(blocks, shift, np.inf))
     return _CLIP * max(scale, _FLOOR * blocks.cell)
 
 

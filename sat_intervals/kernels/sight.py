@@ -145,7 +145,7 @@ def _first_crossing(surface, top, highest, line, steepest):
                 if over <= 0:
                     if not is_known_above:  # it went below where heights are unknown
                         return np.nan
-                    t = _crossing(surface, x, y, z, dx, dy, dz, gone, t)
+                    t = _crossing(surface, line[k], line[k + 1], gone, t)
                     if _is_in_wall(surface, x + t * dx, y + t * dy, z + t * dz - _NEAR, steepest):
                         return np.nan
                     return k + t
@@ -156,11 +156,15 @@ def _first_crossing(surface, top, highest, line, steepest):
 
 
 @inlined
-def _crossing(surface, x, y, z, dx, dy, dz, above, below):
-    """Return the place where a line crosses the surface between a place above it and one below it."""
+def _crossing(surface, first, last, above, below):
+    """Return the place between two points, from 0 to 1, where their line crosses the surface.
+
+    It is above the surface at place ``above``, and not at ``below``.
+    """
     for _ in range(_MOST):
         t = 0.5 * (above + below)
-        over = z + t * dz - _height(surface, x + t * dx, y + t * dy)
+        x, y, z = (1 - t) * first + t * last
+        over = z - _height(surface, x, y)
         if over > 0:
             above = t
         else:
