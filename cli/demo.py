@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import check_strict, path, run_options, settings_options, with_range
+from sat_intervals.cli.options import check_strict, local_option, path, run_options, settings_options, with_range
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -19,12 +19,23 @@ if TYPE_CHECKING:
     "--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True, help="Size in pixels."
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the scene.")
+@click.option(
+    "--relief",
+    type=click.FloatRange(0, 2000),
+    default=0,
+    metavar="METRES",
+    show_default=True,
+    help="Height of a mountain under the city; 1 m is a disparity of 1 px.",
+)
+@local_option
 @settings_options
 @run_options
 def demo(
     out: Path,
     size: tuple[int, int],
     seed: int,
+    relief: float,
+    local_range: bool,
     config_file: Path | None,
     given: dict[str, Any],
     strict: bool,
@@ -51,13 +62,12 @@ def demo(
     check_output(out, run["overwrite"])
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
     overwrite = run["overwrite"] or is_replacing(out / "tiles")
-    somewhere = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
+    somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
     with Console(quiet) as console, put_back(layers if overwrite else (), out / "run.json"):
         console.progress("scene", 0, 1)
-        scene = make_scene(*size, seed=seed)
-        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum)))
+        scene = make_scene(*size, seed=seed, relief=relief)
+        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum), local_range))
         check_not_replaced([config_file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
-        nodata = 0, 0, float("nan")
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
             write_once(path, pixels, value, somewhere, overwrite=overwrite)
         console.progress("scene", 1, 1)

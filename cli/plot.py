@@ -8,7 +8,7 @@ import click
 from sat_intervals.cli.options import log_options
 
 _FILE = click.Path(path_type=Path)
-_PICTURES = ("overview", "errors", "coverage", "profile", "curve", "dsm")
+_PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
@@ -37,6 +37,7 @@ def plot(
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
     OUT/coverage.png   likewise: nominal and measured coverage, width
+    OUT/range.png      if the search range was found, or is local: matches, ranges of cells
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
     OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence
@@ -51,6 +52,7 @@ def plot(
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.marks import check_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
+    from sat_intervals.show.search_range import draw_range, has_range
 
     results = open_results(out, truth)
     if columns is not None and row is None:
@@ -67,6 +69,8 @@ def plot(
     if is_judged:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)
         drawings["coverage"] = lambda path: draw_coverage([out, *beside], truth, path, dpi)
+    if has_range(results):
+        drawings["range"] = lambda path: draw_range(results, path, dpi)
     if row is not None:
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
     if pixel:

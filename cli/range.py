@@ -41,12 +41,14 @@ def search_range(
     that of the whole images.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.run.local_ranges import write_ranges
+    from sat_intervals.run.local_ranges import check_replaceable, write_ranges
     from sat_intervals.run.quality import doubts
     from sat_intervals.run.search_range import find_here
 
     with Console(quiet or as_json) as console:
         images = open_images(left, right)
+        if output:
+            check_replaceable(output, *images)
         found = find_here(*images, console.progress)
         if output:
             write_ranges(output, found.local, images[0])

@@ -11,7 +11,7 @@ view shows the point. Beside a step, blur mixes both sides; the truth is that of
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +24,12 @@ Profile = tuple[int, Array, Array, Array]  # row; ground column (px), height (m)
 VIEWS = (-0.4, 0.6)  # a of the left and the right view, px per metre
 DATUM, PIXEL = 12.0, 0.5  # m: the height of disparity 0, the size of a pixel
 OVER, FRACTIONS = 4, np.arange(4) / 4  # nodes (and samples) per pixel; their positions
-MARGIN = 64  # px of ground around the image: more than a parallax (20 px) or a shadow (60 rows, 45 px)
+MARGIN = 64  # px of ground around a scene without mountain: more than a parallax (20 px) or a shadow (60 rows, 45 px)
+BANK = 18  # px, half the width of the river
+SAMPLES = 96  # positions along a side at which a mountain is measured
 STEP = 0.8  # m between adjacent nodes that form a wall
 SLOPE_LIGHT = (0.5, 0.65)  # shading of slopes along columns and rows: sun in the upper left, 50 degrees high
+LIGHTS = (0.3, 1.8)  # least and largest shading of slopes
 SHADOW_SHIFT, SHADOW_DROP, AMBIENT = 3, 0.75, 0.25  # nodes and m per row; share of light in a shadow
 OFFSET, GAIN = np.array([[90, 62], [2400, 2570]])  # DN = offset + gain * radiance; left, right
 MID_LEVEL, SATURATION = 600.0, 4095  # DN at which the signal to noise ratio is defined; 12 bits
@@ -70,10 +73,58 @@ class Scene:
     maximum: int
 
 
+@dataclass(frozen=True)
+class Ground:
+    """What the ground is made of: random numbers, and a mountain of `relief` m in a scene of `size` px."""
+
+    lattice: Array
+    relief: float
+    size: float
+    low: float  # noise at the foot of the mountain, and at its top
+    high: float
+
+    @property
+    def margin(self) -> int:
+        """Return the px of ground around the image: more than a parallax."""
+        return MARGIN + int(np.ceil(max(map(abs, VIEWS)) * self.relief))
+
+    def mountain(self, r: Array, c: Array) -> Array:
+        """Return noise, about -1 to 1, that is high where the mountain is."""
+        return _noise(self.lattice, r + 0.37 * self.size, c, self.size, 3)
+
+    def height(self, r: Array, c: Array) -> Array:
+        """Return the height (m) that the mountain adds: 0 on the river, all of it a quarter of the scene away."""
+        share = ((self.mountain(r, c) - self.low) / (self.high - self.low)).clip(0, 1)
+        valley = np.exp(-((np.maximum(_from_river(self.lattice, r, c) - BANK, 0) / (self.size / 4)) ** 2))
+        return np.asarray(self.relief * share * (1 - valley))
+
+
+def _ground_of(rows: int, columns: int, seed: int, relief: float) -> Ground:
+    """Return the ground of a scene, whose mountain is `relief` m high within the image."""
+    lattice = np.pad(np.random.default_rng([seed, 0]).uniform(-1, 1, (256, 256)), (0, 1), mode="wrap")
+    ground = Ground(lattice, relief, max(rows, columns), 0, 1)
+    if not relief:
+        return ground
+    r, c = np.linspace(0, rows, SAMPLES)[:, None], np.linspace(0, columns, SAMPLES)[None]
+    noise = ground.mountain(r, c)
+    ground = replace(ground, low=float(noise.min()), high=float(noise.max()))
+    return replace(ground, relief=relief * relief / float(ground.height(r, c).max()))
+
+
 def make_scene(
-    rows: int = 600, columns: int = 800, seed: int = 0, *, psf: float = 0.6, snr: float = 95, block: int = 64
+    rows: int = 600,
+    columns: int = 800,
+    seed: int = 0,
+    *,
+    relief: float = 0,
+    psf: float = 0.6,
+    snr: float = 95,
+    block: int = 64,
 ) -> Scene:
-    """Make a scene with blur `psf` (sigma, px) and signal to noise `snr` (inf: no noise), `block` rows at a time."""
+    """Make a scene, `block` rows at a time, with blur `psf` (sigma, px) and signal to noise `snr` (inf: no noise).
+
+    `relief` is the height of a mountain (m) under the city; 1 m is a disparity of 1 px.
+    """
     random, halo = np.random.default_rng([seed, 1]), int(np.ceil(3 * psf))
     kernel = np.exp(-0.5 * (np.arange(-halo * OVER, halo * OVER + 1) / OVER / max(psf, 0.01)) ** 2)
     across, down = kernel / kernel.sum(), kernel[::OVER] / kernel[::OVER].sum()
@@ -82,7 +133,7 @@ def make_scene(
     images, lines = np.zeros((2, rows, columns), np.uint16), deque[Array](maxlen=down.size)
     truth, visible = np.full((rows, columns), np.nan, np.float32), np.zeros((rows, columns), bool)
     starts = np.ceil(CORNER[1] * columns * (1 - np.arange(rows) / (CORNER[0] * rows))).clip(0).astype(int)
-    for profile in profiles(rows, columns, seed, halo, block):
+    for profile in profiles(rows, columns, seed, halo, block, relief):
         (height, left, seen), (_, right, _) = (look(profile, view, at) for view in (0, 1))
         fine = np.stack([left, right])
         lines.append(sum(w * fine[:, k : k + columns * OVER : OVER] for k, w in enumerate(across)))
@@ -128,13 +179,15 @@ def _highest_crossing(x: Array, at: Array, slant: float) -> tuple[Array, Array]:
     return k, (at - x[k]) / (x[k + 1] - x[k])
 
 
-def profiles(rows: int, columns: int, seed: int = 0, halo: int = 0, block: int = 64) -> Iterator[Profile]:
-    """Yield the lit surface of rows -halo to rows + halo - 1, with MARGIN px on either side."""
-    lattice = np.pad(np.random.default_rng([seed, 0]).uniform(-1, 1, (256, 256)), (0, 1), mode="wrap")
-    grid = np.arange((columns + 2 * MARGIN) * OVER) / OVER - MARGIN
+def profiles(
+    rows: int, columns: int, seed: int = 0, halo: int = 0, block: int = 64, relief: float = 0
+) -> Iterator[Profile]:
+    """Yield the lit surface of rows -halo to rows + halo - 1, with a margin of MARGIN px or more on either side."""
+    ground = _ground_of(rows, columns, seed, relief)
+    grid = np.arange((columns + 2 * ground.margin) * OVER) / OVER - ground.margin
     shade = np.full(grid.size, -np.inf)  # m, the height of the shadow of the rows above
     for first in range(-MARGIN, rows + halo, block):
-        surface = _surface(lattice, np.arange(first, min(first + block, rows + halo)), columns)
+        surface = _surface(ground, np.arange(first, min(first + block, rows + halo)), columns)
         for row, (height, albedo) in enumerate(np.moveaxis(surface, 1, 0), first):
             lit = np.clip(1 - (shade - height) / 0.4, 0, 1)
             shade[SHADOW_SHIFT:] = np.maximum(shade, height)[:-SHADOW_SHIFT] - SHADOW_DROP
@@ -144,18 +197,19 @@ def profiles(rows: int, columns: int, seed: int = 0, halo: int = 0, block: int =
                 yield row, u, height, albedo * (AMBIENT + (1 - AMBIENT) * lit)
 
 
-def _surface(lattice: Array, rows: Array, columns: int) -> Array:
+def _surface(ground: Ground, rows: Array, columns: int) -> Array:
     """Return height (m) and albedo (shaded by slope) of the nodes of some rows: (2, rows, nodes)."""
-    r, c = np.append(rows, rows[-1] + 1.0)[:, None], np.arange(-MARGIN, columns + MARGIN + 2.0)[None]
-    height, grain, quarter = _terrain(lattice, r, c), _noise(lattice, r, c, 4, 2), _quarter(lattice, r, c)
+    lattice, margin = ground.lattice, ground.margin
+    r, c = np.append(rows, rows[-1] + 1.0)[:, None], np.arange(-margin, columns + margin + 2.0)[None]
+    height, grain, quarter = _terrain(ground, r, c), _noise(lattice, r, c, 4, 2), _quarter(lattice, r, c)
     albedo = np.where(height > 0, _ground(lattice, r, c, grain, quarter), 0.07 + 0.0015 * grain)
     along, down = np.diff(height)[:-1] / PIXEL, np.diff(height, axis=0)[:, :-1] / PIXEL
-    albedo[:-1, :-1] *= 1 + SLOPE_LIGHT[0] * along + SLOPE_LIGHT[1] * down
+    albedo[:-1, :-1] *= np.clip(1 + SLOPE_LIGHT[0] * along + SLOPE_LIGHT[1] * down, *LIGHTS)
     pixels = np.stack([height, albedo, grain])[:, :-1, :-1, None]
     nodes = pixels[:, :, :-1] + np.diff(pixels, axis=2) * FRACTIONS
     for salt, (kinds, *item) in enumerate(OBJECTS):
         y, x = np.nonzero(np.isin(quarter[0][:-1, :-2], kinds))
-        near, frame = _place(lattice, r[y, 0], c[0, x], [v[y, x] for v in quarter], salt, item)
+        near, frame = _place(ground, r[y, 0], c[0, x], [v[y, x] for v in quarter], salt, item)
         y, x = y[near], x[near]
         nodes[:2, y, x] = _draw(nodes[:, y, x], frame, item)
     return nodes[:2].reshape(2, rows.size, -1)
@@ -173,11 +227,12 @@ def _ground(lattice: Array, r: Array, c: Array, grain: Array, quarter: Arrays) -
     return np.where(kerb > -2, np.where(kerb > 0, 0.15, 0.26) * (1 + 0.08 * grain), soil)
 
 
-def _place(lattice: Array, r: Array, c: Array, quarter: Arrays, salt: int, item: Sequence[float]) -> Arrays:
+def _place(ground: Ground, r: Array, c: Array, quarter: Arrays, salt: int, item: Sequence[float]) -> Arrays:
     """Return which of the positions (n,) are near an object, and the frame (6, m) of those.
 
     Frame: px along and across from the object's centre, its angle, its base (m), two random numbers (0 to 1).
     """
+    lattice = ground.lattice
     along, lanes, shift, stray, length, width, *_, share, shape = item
     kind, _, angle, number = quarter
     angle, across = angle + salt * (shape == FOREST), STREET[kind] / lanes
@@ -189,7 +244,7 @@ def _place(lattice: Array, r: Array, c: Array, quarter: Arrays, salt: int, item:
     frame = np.stack([p - p0, q - q0, angle, 0 * p, dice[3] / 2 + 0.5, dice[4] / 2 + 0.5])[:, near]
     column, row = _turned(q0[near], p0[near], -frame[2])
     _, border, _, home = _quarter(lattice, row, column)
-    frame[3] = _terrain(lattice, row, column)
+    frame[3] = _terrain(ground, row, column)
     free = (home == number[near]) & (border > 7 + length) & (frame[3] > 1)
     return np.flatnonzero(near)[free], frame[:, free]
 
@@ -228,11 +283,16 @@ def _turned(r: Array, c: Array, angle: Array) -> tuple[Array, Array]:
     return c * np.cos(angle) + r * np.sin(angle), r * np.cos(angle) - c * np.sin(angle)
 
 
-def _terrain(lattice: Array, r: Array, c: Array) -> Array:
-    """Return the height (m) of the ground: hills, and 0 on a river through the image."""
-    away = np.abs(0.95 * r - 0.3 * c - 380 + 110 * _noise(lattice, r, c, 400, 3))
-    rise = np.clip((away - 18) / 150, 0, 1)
-    return np.asarray(rise * (2 - rise) * np.maximum(7 + 5 * _noise(lattice, r, c, 280, 4), 1))
+def _terrain(ground: Ground, r: Array, c: Array) -> Array:
+    """Return the height (m) of the ground: hills, a mountain if there is one, and 0 on a river through the image."""
+    rise = np.clip((_from_river(ground.lattice, r, c) - BANK) / 150, 0, 1)
+    hills = rise * (2 - rise) * np.maximum(7 + 5 * _noise(ground.lattice, r, c, 280, 4), 1)
+    return np.asarray(hills + ground.height(r, c) if ground.relief else hills)
+
+
+def _from_river(lattice: Array, r: Array, c: Array) -> Array:
+    """Return the px to the middle of the river."""
+    return np.asarray(np.abs(0.95 * r - 0.3 * c - 380 + 110 * _noise(lattice, r, c, 400, 3)))
 
 
 def _noise(lattice: Array, r: Array, c: Array, spacing: float, octaves: int) -> Array:

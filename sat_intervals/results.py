@@ -99,7 +99,8 @@ class Run:
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
         """Raise if an output would replace a file of the run, one of its inputs, the truth, or one of ``inputs``."""
         own = [self.out / name for name in (*_BANDS, "run.json")]
-        check_not_replaced([*own, *_input_files(self.report["inputs"]), self.truth_beside, *inputs], outputs)
+        grid = self.config.disparity.grid
+        check_not_replaced([*own, *_input_files(self.report["inputs"]), grid, self.truth_beside, *inputs], outputs)
 
     def layer(self, path: str | Path) -> Layer:
         """Open another raster of the same pixels, such as the truth."""

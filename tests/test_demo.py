@@ -90,6 +90,12 @@ def test_make_scene__range_is_that_of_a_city_with_3_px_to_spare(scene):
     assert 40 <= scene.maximum - scene.minimum <= 60
 
 
+def test_make_scene__relief_adds_a_mountain_of_that_height(scene):
+    mountain = make_scene(ROWS, COLUMNS, relief=150)
+    assert scene.maximum + 130 <= mountain.maximum <= scene.maximum + 155
+    assert mountain.minimum < 0  # the river
+
+
 def test_make_scene__the_empty_corner_has_no_truth(scene):
     empty = scene.left == 0
     assert 0.01 < empty.mean() < 0.04

@@ -57,10 +57,10 @@ class LocalRanges:
         row, column = window.row - rows.start * self.height, window.column - columns.start * self.width
         return Cells(first, last, self.height, self.width, row, column)
 
-    def at(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
-        """First and last disparity of the cell of each pixel of a window."""
-        rows = np.arange(window.row, window.row_stop) // self.height
-        columns = np.arange(window.column, window.column_stop) // self.width
+    def at(self, window: Window, step: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """First and last disparity of the cell of each pixel, or of every n-th row and column, of a window."""
+        rows = np.arange(window.row, window.row_stop, step) // self.height
+        columns = np.arange(window.column, window.column_stop, step) // self.width
         return self.minimum[np.ix_(rows, columns)], self.maximum[np.ix_(rows, columns)]
 
     def report(self) -> dict[str, Any]:

@@ -112,7 +112,7 @@ def write_rows(
     shape: tuple[int, int, int],
     georeferencing: Georeferencing,
 ) -> None:
-    """Write int16 rows, ``(bands, some, columns)`` from the top, as a tiled, compressed GeoTIFF; replaces a file.
+    """Write int16 rows, ``(bands, some, columns)`` from the top, as a tiled, compressed GeoTIFF with `MARK`.
 
     ``shape`` has the numbers of bands, rows and columns.
     """
@@ -123,6 +123,7 @@ def write_rows(
         Env(),
         gdal.create(str(new), height=height, width=width, **kind, **georeferencing.creation_options()) as dataset,
     ):
+        dataset.update_tags(**MARK)
         first = 0
         for part in rows:
             dataset.write(part, window=RasterioWindow(0, first, width, part.shape[1]))

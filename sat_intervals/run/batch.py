@@ -72,9 +72,10 @@ def match_batch(
     RunError
         An error that stops all pairs, such as a full disk.
     """
-    _check_not_replaced(pairs, [config] if isinstance(config, (str, Path)) else [], out, overwrite)
-    ended: dict[str, dict[str, Any]] = {}
-    cluster = load_config(config, overrides).cluster
+    common = load_config(config, overrides)
+    read = [config if isinstance(config, (str, Path)) else None, common.disparity.grid]
+    _check_not_replaced(pairs, read, out, overwrite)
+    ended, cluster = dict[str, dict[str, Any]](), common.cluster
     _raise_file_limit()
     with ExitStack() as stack:
         stack.enter_context(LocalFolder(out).locked())
@@ -108,7 +109,9 @@ def match_batch(
     return ended
 
 
-def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Path], out: Path, overwrite: bool) -> None:
+def _check_not_replaced(
+    pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path, overwrite: bool
+) -> None:
     """Raise if an input of any pair, or another file that is read, is an output of any pair."""
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
     names = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]

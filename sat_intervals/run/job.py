@@ -200,7 +200,7 @@ def prepare(
     config = fitted_to_jobs(config)
     check_tiles(config, region)
     check_space(out, RUN_FILES, region.height, region.width)
-    read = [*files, inputs["weights"]["path"]] if "weights" in inputs else files
+    read = [*files, config.disparity.grid, inputs["weights"]["path"] if "weights" in inputs else None]
     run = digest(_manifest(config, inputs, region, marked))
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
         name = "-".join(filter(None, (pair, run)))

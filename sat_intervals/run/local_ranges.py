@@ -9,7 +9,7 @@ from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
-from sat_intervals.raster import Image, open_image, read_shape, read_window, write_rows
+from sat_intervals.raster import Image, check_marked, open_image, other_files, read_shape, read_window, write_rows
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.tiling import Window
 
@@ -48,9 +48,21 @@ def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
     return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
 
 
-def write_ranges(path: str | Path, ranges: LocalRanges, left: Image) -> None:
+def check_replaceable(path: Path, left: Image, right: Image) -> None:
+    """Raise if `write_ranges` would replace a file of the images, or one that this tool did not make.
+
+    Raises
+    ------
+    SatIntervalsError
+        Names the file.
+    """
+    names = [name for image in (left, right) for name in (image.path, image.mask) if name]
+    check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
+    check_marked(path)
+
+
+def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
     """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
-    check_not_replaced([left.path], [Path(path)])
     rows = (
         np.stack(ranges.at(Window(row, 0, min(_STRIP, left.height - row), left.width)))
         for row in range(0, left.height, _STRIP)

@@ -35,16 +35,18 @@ def quality_of(job: Job, records: Records) -> dict[str, Any]:
     if job.found:
         return job.found.quality
     looks = [Look(**look) for _, record in sorted(records.items()) for look in record["looks"]]
-    collars = {side: _collar(image) for side, image in (("left", job.left), ("right", job.right))}
+    region = job.store.grid.region
+    collars = {side: _collar(image, region) for side, image in (("left", job.left), ("right", job.right))}
     return summary(looks) | {"collars": {side: collar for side, collar in collars.items() if collar}}
 
 
-def _collar(image: Image) -> dict[str, float] | None:
-    """Return value and share of the pixels of the smallest value that begin or end some rows; None without a collar."""
-    if not is_plain(image):
+def _collar(image: Image, region: Window) -> dict[str, float] | None:
+    """Return value and share of the pixels of the smallest value that begin or end rows of a region, None if few do."""
+    inside = region.clipped(Window(0, 0, image.height, image.width))
+    if not is_plain(image) or inside.width <= 0:
         return None
-    rows = np.unique(np.linspace(0, image.height - 1, _ROWS).astype(int))
-    pixels = np.concatenate([read_window(image, Window(int(row), 0, 1, image.width))[0] for row in rows])
+    rows = np.unique(np.linspace(inside.row, inside.row_stop - 1, _ROWS).astype(int))
+    pixels = np.concatenate([read_window(image, Window(int(row), inside.column, 1, inside.width))[0] for row in rows])
     smallest = pixels.min()
     has = pixels == smallest
     runs = np.logical_and.accumulate(has, 1) | np.logical_and.accumulate(has[:, ::-1], 1)[:, ::-1]

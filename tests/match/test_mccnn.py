@@ -17,11 +17,11 @@ from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.config.weights import weights_file
 from sat_intervals.demo import make_scene
 from sat_intervals.kernels.matching import cost_volume
-from sat_intervals.match.whole import _view
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import kernel_settings
+from sat_intervals.match.whole import _view
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.results import open_results
 from sat_intervals.run.batch import match_batch

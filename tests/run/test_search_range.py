@@ -1,18 +1,23 @@
 """The search range of a run: found, kept, resumed, local, and the warnings about its ends."""
 
+import base64
+import gzip
 import json
 
 import numpy as np
 import pytest
 import rasterio
 from helpers import PLACE, bands, invoke, write_pair
+from matplotlib.image import imread
 
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
+from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.run.pair import prepare
+from sat_intervals.show.report.contents import Pixels
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +122,40 @@ def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):
     (disparity, *_), _ = bands(tmp_path / "out")
     assert report["local_ranges"]["share"] < 0.95
     assert np.isfinite(disparity).mean() > 0.5
+    assert str(tmp_path / "out/range.png") in invoke("plot", tmp_path / "out").stdout.split()
+    picture = imread(tmp_path / "out/range.png")
+    halves = picture[:, : picture.shape[1] // 2], picture[:, picture.shape[1] // 2 :]
+    assert all(len(np.unique(half.reshape(-1, picture.shape[2]), axis=0)) > 20 for half in halves)
+    pixels = Pixels(open_results(tmp_path / "out"))
+    for row, each in open_results(tmp_path / "out").strips():
+        pixels.add(row, each, np.zeros(each.validity.shape, bool))
+    codes = gzip.decompress(base64.b64decode(pixels.report()["layers"]["searched"]["codes"]))
+    searched = np.frombuffer(codes, "<u2").reshape(low.shape)
+    assert (searched >= high - low + 1).all()  # a cell of 64 pixels searches the hull of smaller ones
+    assert len(np.unique(searched)) > 1
+
+
+def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
+    images = folder / "left.tif", folder / "right.tif"
+    before = images[1].read_bytes()
+    result = invoke("range", *images, "--output", images[1])
+    assert result.exit_code == 2
+    assert "is an input" in result.stderr
+    assert images[1].read_bytes() == before
+    write_bands(tmp_path / "other.tif", *np.zeros((2, 180, 420)))
+    result = invoke("range", *images, "--output", tmp_path / "other.tif")
+    assert result.exit_code == 2
+    assert "was not made by sat-intervals" in result.stderr
+
+
+def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
+    grid = tmp_path / "tiles/range.tif"
+    grid.parent.mkdir()
+    write_bands(grid, *np.stack([np.full((180, 420), -5), np.full((180, 420), 5)]))
+    result = invoke("match", folder / "left.tif", folder / "right.tif", tmp_path, "--range-grid", grid, "--overwrite")
+    assert result.exit_code == 2
+    assert "is an input" in result.stderr
+    assert grid.exists()
 
 
 def test_match__names_a_wider_range_and_is_strict(folder, tmp_path):

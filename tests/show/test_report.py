@@ -185,6 +185,9 @@ def test_page__tells_what_the_run_tells(page):
     assert "intervals that contain the truth" in page.text("#headline")
     for selector, words in (
         ("#validity", "rejected by cross-checking: occlusion"),
+        ("#search", "Disparities \u221220 to 10 px, given. Of the valid pixels, 0.0 % lie at the minimum"),
+        ("#search", "5.0 % of its pixels are 0"),
+        ("#search", "left.tif: 5 % of the pixels are exactly 0"),
         ("#tiles", "6 tiles of 27 x 27 pixels"),
         ("#tiles", "5.0 % of the disparities, 10.0 % of the bounds of 100 pixels"),
         ("#evaluation", "high confidence"),

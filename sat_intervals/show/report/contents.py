@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.products import Bands
 from sat_intervals.results import Results
 from sat_intervals.show.legend import FIRST_INVALID, PIXEL_CLASSES, classify
@@ -64,6 +65,9 @@ class Pixels:
         self._step = max(1, math.ceil(math.sqrt(height * width / _PIXELS)))
         self._search = results.config.disparity
         self._strips: list[list[np.ndarray]] = []
+        self._region = results.region
+        local = results.report.get("local_ranges")
+        self._ranges = LocalRanges.of_report(local) if local else None
 
     def add(self, row: int, bands: Bands, low: np.ndarray) -> None:
         """Keep every n-th of the rows from ``row`` on; ``low`` is the mask of low confidence."""
@@ -72,8 +76,8 @@ class Pixels:
 
     def report(self) -> dict[str, Any]:
         """Return layers of codes: a code means ``first + code * step``, the largest one a missing value."""
-        *layers, low = (np.concatenate(strips) for strips in zip(*self._strips, strict=True))
-        bands = Bands(*layers)
+        *values, low = (np.concatenate(strips) for strips in zip(*self._strips, strict=True))
+        bands = Bands(*values)
         kind = classify(bands.validity)
         valid = kind < FIRST_INVALID
         missed = np.where(bands.truth > bands.upper, 1, np.where(bands.truth < bands.lower, 2, 0))
@@ -84,12 +88,16 @@ class Pixels:
         first = self._search.minimum - self._search.count
         step = max(_FINEST, 3 * self._search.count / 65534)
         black, white = _ends(bands.image)
+        layers = {name: _coded(values, first, step, "<u2") for name, values in disparities.items()}
+        if self._ranges:
+            minimum, maximum = self._ranges.at(self._region, self._step)
+            layers["searched"] = _coded(maximum - minimum + 1.0, 0, 1, "<u2")
         return {
             "step": self._step,
             "rows": kind.shape[0],
             "columns": kind.shape[1],
             "layers": {
-                **{name: _coded(values, first, step, "<u2") for name, values in disparities.items()},
+                **layers,
                 "image": _coded(bands.image, black, (white - black) / 254, "u1"),
                 "confidence": _coded(bands.confidence, 0, 1 / 250, "u1"),
                 "kind": _coded(kind, 0, 1, "u1"),

@@ -67,6 +67,7 @@ function makeLayers() {
     const shown = [0, quantiles(width, WIDEST)[0] || 1];
     layers.splice(2, 0, { name: "Interval width", unit: "px, square-root scale", values: width, colours: COLOURS.magma, shown, power: 0.5 });
   }
+  if (data.searched) layers.push({ name: "Disparities searched", unit: "count", values: data.searched, colours: COLOURS.viridis, shown: [0, search.maximum - search.minimum + 1] });
   if (data.truth && hasIntervals) layers.push({ name: "Misses", values: data.missed, kinds: [null, ...MISSES] });
   return layers;
 }

@@ -114,6 +114,23 @@ function showValidity() {
   );
 }
 
+function showSearch() {
+  const { valid, range_ends: ends } = run.counts;
+  const { search: found, local_ranges: local, quality, warnings } = run;
+  const place = find("search");
+  const origin = found ? `found from matches on ${percent(found.matched)} of the pixels` : "given";
+  place.append(element("p", {}, `Disparities ${short(search.minimum)} to ${short(search.maximum)} px, ${origin}` +
+    `${local ? `; each cell searches ${percent(local.share)} of them in the mean, see the map` : ""}. Of the valid pixels, ` +
+    `${percent(ends.minimum / valid)} lie at the minimum and ${percent(ends.maximum / valid)} at the maximum.`));
+  const rows = [
+    ["distance of matches, 1 = random pixels", quality.noise === null ? "none" : fixed(quality.noise, 2)],
+    ["offset of the rows", quality.row_offset === null ? "none" : `${fixed(quality.row_offset, 1)} px`],
+    ...Object.entries(quality.collars).map(([side, collar]) => [`border of the ${side} image`, `${percent(collar.share)} of its pixels are ${short(collar.value)}`]),
+    ...warnings.map((line) => ["warning", line]),
+  ];
+  place.append(table([], rows));
+}
+
 function showTiles() {
   const { rows, columns, size, overlap } = run.tiles;
   const seams = run.overlap_left;
@@ -193,5 +210,6 @@ showHeadline();
 showHistograms();
 showEvaluation();
 showValidity();
+showSearch();
 showTiles();
 showRun();

@@ -1,0 +1,60 @@
+"""Draw how the search range of a run was found, and the local ranges."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.results import Results
+from sat_intervals.show.canvas import DPI, INK, page
+from sat_intervals.show.legend import BLUE, SKY
+
+
+def has_range(results: Results) -> bool:
+    """Return whether the search range of a run was found, or is local."""
+    return bool(results.report.get("search") or results.report.get("local_ranges"))
+
+
+def draw_range(results: Results, path: Path, dpi: int = DPI) -> None:
+    """Draw the matches of the search by disparity, and first and last disparity of the cells."""
+    report, search = results.report, results.config.disparity
+    found = report.get("search")
+    local = report.get("local_ranges") or (found and found["cells"])
+    ends, valid = report["counts"]["range_ends"], max(1, report["counts"]["valid"])
+    title = (
+        f"{Path(results.left.path).name}: disparities {search.minimum} to {search.maximum} px searched, "
+        f"{100 * ends['minimum'] / valid:.2g} % of the valid ones at the minimum, "
+        f"{100 * ends['maximum'] / valid:.2g} % at the maximum"
+    )
+    panels = (1 if found else 0) + (2 if local else 0)
+    with page(path, (4.6 * panels, 4.2), dpi, title) as figure:
+        charts = iter(figure.subplots(1, panels, squeeze=False)[0])
+        if found:
+            _draw_matches(next(charts), found, (search.minimum, search.maximum))
+        if local:
+            ranges, shown = LocalRanges.of_report(local), (search.minimum, search.maximum)
+            used = "" if report.get("local_ranges") else ", not used"
+            for name in ("minimum", "maximum"):
+                panel = next(charts)
+                height, width = ranges.height * ranges.minimum.shape[0], ranges.width * ranges.minimum.shape[1]
+                drawn = panel.imshow(
+                    getattr(ranges, name), vmin=shown[0], vmax=shown[1], extent=(-0.5, width - 0.5, height - 0.5, -0.5)
+                )
+                panel.set(title=f"Local {name}{used}", xlabel="column of the left image", ylabel="row")
+                figure.colorbar(drawn, ax=panel, shrink=0.8).set_label("px")
+            panel.set_title(f"Local maximum{used}: {100 * ranges.share:.0f} % searched")
+
+
+def _draw_matches(chart: Axes, found: dict[str, Any], searched: tuple[int, int]) -> None:
+    """Draw the histogram of the consistent matches, and the range."""
+    edges, counts = np.array(found["histogram"]["edges"]), np.array(found["histogram"]["counts"])
+    chart.stairs(np.maximum(counts, 0.5), edges, baseline=0.5, fill=True, color=BLUE)
+    chart.axvspan(*searched, color=SKY, alpha=0.25, lw=0)
+    chart.set(yscale="log", ylabel="matches")
+    chart.set_title(f"Matches on {100 * found['matched']:.0f} % of the pixels")
+    levels = ", ".join(f"{level['step']} px: {level['minimum']} to {level['maximum']}" for level in found["levels"])
+    chart.text(
+        0.02, 0.98, f"searched at {levels}", transform=chart.transAxes, va="top", fontsize=8, color=INK, wrap=True
+    )
