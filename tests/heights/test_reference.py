@@ -249,9 +249,8 @@ def write_vectors(path, points):
     return path
 
 
+@pytest.mark.peer("laspy", "pyogrio", "shapely")
 def test_make_truth__points_of_all_files_give_their_disparities(tmp_path):
-    pytest.importorskip("laspy")
-    pytest.importorskip("pyogrio")
     out, files, disparity = run_of(tmp_path, seen_of(hills, VIEWS[0]))
     points = places(hills, 1500)
     truths = {}
