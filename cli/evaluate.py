@@ -64,8 +64,8 @@ def evaluate(
     Prints figures over valid pixels: accuracy (share of intervals that contain the truth), relative size (median width
     / width of the search range) and, for low confidence, relative overestimation (median of 1 - largest error of the
     area / width). If a run kept rejected pixels, also prints figures over all pixels with an interval. For several OUT,
-    prints means over the scenes of each group (the paper's table 1); `group` is read from meta.json beside the left
-    image.
+    prints means over the scenes of each group (the paper's table 1), and the coverage of each scene; `group` is read
+    from meta.json beside the left image.
 
     Without --truth, the truth is truth.tif beside the left image. OUT may also be a pair, which is matched first: a
     folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum], `group`), or a CSV file
@@ -85,9 +85,9 @@ def evaluate(
         surface.check_alone(folders, others)
         surface.evaluate(as_json)
         return
-    from sat_intervals.cli.tables import show_groups, show_missed, show_scene
+    from sat_intervals.cli.tables import show_scene, show_scenes
     from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.evaluate.paper import SceneMetrics, table_1
+    from sat_intervals.evaluate.paper import SceneMetrics
 
     sources = _sources(folders, truth, mask, cost)
     configs = _configs(sources, config_file, preset, accurate, cost)
@@ -103,8 +103,7 @@ def evaluate(
     elif len(scenes) == 1:
         show_scene(scenes[0])
     else:
-        show_groups(table_1(scenes), "means over scenes, valid pixels")
-        show_missed(scenes)
+        show_scenes(scenes)
 
 
 def _warn_of_whole_truth(scenes: "list[SceneMetrics]", tolerance: float) -> None:

@@ -105,7 +105,7 @@ class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         try:
             return "exact" if value == "exact" else int(value)
         except ValueError:
-            self.fail(f"{value!r} is neither exact nor a number of pixels", param, ctx)
+            self.fail(f"{value!r} is neither exact nor a number of pixels: give exact, or 100", param, ctx)
 
 
 _OF_SETTINGS = ("preset", "cost", "coverage", "calibration", "tile_size", "overlap", "workers", "cluster", "store")

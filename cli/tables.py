@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up
+from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up, table_1
 
 if TYPE_CHECKING:
     from sat_intervals.config import Calibration
@@ -56,7 +56,23 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
         )
 
 
-def show_missed(scenes: Sequence[SceneMetrics]) -> None:
+def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
+    """Print the paper's table 1, and each scene's coverage beside the nominal one, with widths and interval scores."""
+    show_groups(table_1(scenes), "means over scenes, valid pixels")
+    _show_missed(scenes)
+    paths = [
+        ("nominal",), ("all", "accuracy"), ("high", "accuracy"), ("low", "accuracy"), ("all", "mean_width"),
+        ("all", "median_width"), ("all", "interval_score"),
+    ]  # fmt: skip
+    figures = {scene.name: [look_up(scene.report, path) for path in paths] for scene in scenes}
+    known = [[value for value in column if value is not None] for column in zip(*figures.values(), strict=True)]
+    figures["mean"] = [sum(column) / len(column) if column else None for column in known]
+    header = ["", "nominal", "coverage", "high", "low", "mean width", "median width", "score"]
+    rows = [[name, *map(_figure, values)] for name, values in figures.items()]
+    show(header, rows, "coverage asked for (or alpha) and measured, widths and interval score (px), valid pixels")
+
+
+def _show_missed(scenes: Sequence[SceneMetrics]) -> None:
     """List the scenes below the paper's objective."""
     accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
     missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]

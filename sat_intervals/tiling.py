@@ -1,6 +1,6 @@
 """Windows, their pixels, and tiles: which pixels a tile owns and which it needs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -62,6 +62,10 @@ class View(NamedTuple):
         """Crop ``pixels`` or ``state`` to a window."""
         return np.ascontiguousarray(array[window.relative_to(self.window).slices])
 
+    def cropped(self, window: Window) -> "View":
+        """Crop the view to a window."""
+        return View(window, self.inner(self.pixels, window), self.inner(self.state, window))
+
 
 Views = tuple[View, View]
 """Views of the left and of the right image."""
@@ -110,6 +114,13 @@ class Grid:
         column = self.region.column + grid_column * self.size
         return Tile(grid_row, grid_column, Window(row, column, self.size, self.size).clipped(self.region))
 
+    def within(self, window: Window) -> list[Tile]:
+        """Return the tiles of a window of whole tiles, row by row."""
+        inside = window.relative_to(self.region)
+        rows = range(inside.row // self.size, -(-inside.row_stop // self.size))
+        columns = range(inside.column // self.size, -(-inside.column_stop // self.size))
+        return [self.tile(row, column) for row in rows for column in columns]
+
 
 def strips(height: int, width: int, pixels: int) -> Iterator[Window]:
     """Yield windows of whole rows from the top: at most ``pixels`` pixels and 512 rows, if possible 64 n rows."""
@@ -117,6 +128,13 @@ def strips(height: int, width: int, pixels: int) -> Iterator[Window]:
     rows = rows // 64 * 64 or rows
     for row in range(0, height, rows):
         yield Window(row, 0, min(rows, height - row), width)
+
+
+def hull(windows: Sequence[Window]) -> Window:
+    """Return the smallest window that contains all windows."""
+    row, column = min(window.row for window in windows), min(window.column for window in windows)
+    row_stop = max(window.row_stop for window in windows)
+    return Window(row, column, row_stop - row, max(window.column_stop for window in windows) - column)
 
 
 def facing(window: Window, minimum: int, maximum: int) -> Window:

@@ -39,6 +39,7 @@ from sat_intervals.kernels.sgm import (
     WALL,
     WAVEFRONTS,
     Borders,
+    Edge,
     Paths,
     Ring,
     add_curve,
@@ -163,7 +164,7 @@ class Matched(NamedTuple):
 
     raw: Raw
     right: RightView
-    leaving: Ring
+    leaving: Edge
 
 
 class _Buffers(NamedTuple):
@@ -199,7 +200,7 @@ class _Buffers(NamedTuple):
     curve: np.ndarray
     inside: Rectangle
     rings: tuple[Ring, ...]
-    leaving: Ring
+    leaving: Edge
     down: bool
 
 
@@ -212,10 +213,9 @@ def _prepare(
     down: bool = True,
 ) -> _Buffers:
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
-    left = borders.inside if borders else Window(0, 0, 0, 0)
+    left, slots = borders.inside if borders else Window(0, 0, 0, 0), 1 + 3 * columns
     inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
-    cells = cells or one_cell(rows, columns, settings.count)
-    k, slots = np.arange(size), 1 + 3 * columns
+    cells, k = cells or one_cell(rows, columns, settings.count), np.arange(size)
     walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
     return _Buffers(
         Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
@@ -228,7 +228,7 @@ def _prepare(
         np.zeros(size, np.uint16),
         rectangle_of(inside),
         rings[:2] if down else rings[2:],
-        Ring(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
+        Edge(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
         down,
     )
 
@@ -339,9 +339,9 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     size = padded_to_lanes(settings.count)
     buffers = _prepare(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
+    of_low = shape if settings.low >= 0 else (0, 0)
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     volume = np.empty((*shape, size), np.uint16)
-    of_low = shape if settings.low >= 0 else (0, 0)
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -375,11 +375,10 @@ def trace(
     wavefront: int,
     gradients: Gradients | None = None,
     cells: Cells | None = None,
-) -> Ring:
+) -> Edge:
     """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
 
     Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
-    Returns the ring of a neighbour, of the rows and columns of ``borders.inside``.
     """
     down, wave = WAVEFRONTS[wavefront]
     buffers = _prepare(costs, gradients, settings, borders, cells, down)

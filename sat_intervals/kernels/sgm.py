@@ -197,6 +197,21 @@ class Ring(NamedTuple):
     row: np.ndarray
 
 
+class Edge(NamedTuple):
+    """Path states of one wavefront on the last pixels of a tile, which it hands on; empty if nobody takes them over.
+
+    Attributes
+    ----------
+    column
+        ``(rows, 2, size)`` uint16: states in the column that the wavefront goes to, for each row of the tile.
+    row
+        ``(columns, 2, size)`` uint16: states in the row that it goes to, for each column of the tile.
+    """
+
+    column: np.ndarray
+    row: np.ndarray
+
+
 class Borders(NamedTuple):
     """Path states around the pixels of a patch that are computed.
 
@@ -245,7 +260,7 @@ def _set_wave(paths, slots, wave, states):
 
 @part
 def hand_on(paths, inside, r, falling, rising, wave, down, target):
-    """Copy the states of a wave that leave the patch in row ``r`` to ``target``, the ring of a neighbour."""
+    """Copy the states of a wave that leave the patch in row ``r`` to ``target``, an edge."""
     columns = paths.lowest.size // 3
     c = inside.column_stop - 1 if down == (wave == 0) else inside.column
     slots = path_slots(c, columns, falling, rising)

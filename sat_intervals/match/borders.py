@@ -4,7 +4,7 @@ A wavefront, see `WAVEFRONTS`, visits the tiles from one corner of the grid to t
 the states of the pixels around it and hands on those of its own last pixels (METHOD.md, section 11).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +12,11 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.matching import trace
-from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Ring
+from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Edge, Ring
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import MatchingCost
 from sat_intervals.match.patch import Frame, frame_area, mirrored_settings, patch_settings, path_window
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Tile, Window
 
 Place = tuple[int, int]
 """Row and column of a tile in its grid, or what to add to them."""
@@ -26,7 +26,7 @@ class Border(NamedTuple):
     """What a tile hands on in one wavefront: the pixels whose paths it computed, and the states of the last ones."""
 
     inside: Window
-    ring: Ring
+    edge: Edge
 
 
 def sources(wavefront: int) -> tuple[Place, Place, Place]:
@@ -35,6 +35,12 @@ def sources(wavefront: int) -> tuple[Place, Place, Place]:
     row = -1 if down else 1
     column = -1 if down == (wave == 0) else 1
     return (0, column), (row, 0), (row, column)
+
+
+def in_order(wavefront: int, tiles: Iterable[Tile]) -> list[Tile]:
+    """Sort tiles so that each comes after its `sources`."""
+    (_, column), (row, _), _ = sources(wavefront)
+    return sorted(tiles, key=lambda tile: (-row * tile.grid_row, -column * tile.grid_column))
 
 
 def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size: int) -> Ring:
@@ -49,26 +55,26 @@ def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
         row = np.zeros((patch.width, 2, size), np.uint16)
         for place in before:
             if place in borders:
-                inside, ring = borders[place]
+                inside, edge = borders[place]
                 shared = inside.clipped(Window(inside.row, patch.column, inside.height, patch.width))
-                row[shared.relative_to(patch).slices[1]] = ring.row[shared.relative_to(inside).slices[1]]
-    return Ring(borders[beside].ring.column if beside in borders else nothing, row)
+                row[shared.relative_to(patch).slices[1]] = edge.row[shared.relative_to(inside).slices[1]]
+    return Ring(borders[beside].edge.column if beside in borders else nothing, row)
 
 
-def rehulled(ring: Ring, minimum: int, config: Config) -> Ring:
+def rehulled(edge: Edge, minimum: int, config: Config) -> Edge:
     """States of a neighbour, whose first disparity is ``minimum``, over the search range of ``config``.
 
     What one of both does not search is beyond the cells of the pixels that they share: a wall.
     """
     size, shift = padded_to_lanes(config.disparity.count), config.disparity.minimum - minimum
     found = []
-    for states in ring:
+    for states in edge:
         both = np.full((*states.shape[:2], size), WALL, np.uint16)
         first, last = max(0, -shift), min(size, states.shape[2] - shift)
         both[..., first : max(first, last)] = states[..., first + shift : max(first, last) + shift]
         both[..., config.disparity.count :] = WALL
         found.append(both)
-    return Ring(*found)
+    return Edge(*found)
 
 
 def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Border]]) -> Borders:
@@ -85,7 +91,7 @@ def trace_area(
     wavefront: int,
     config: Config,
     ranges: LocalRanges | None = None,
-) -> Ring:
+) -> Edge:
     """Path states that a tile hands on in a wavefront.
 
     Parameters

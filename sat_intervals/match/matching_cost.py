@@ -13,7 +13,7 @@ from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, pad
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
-from sat_intervals.tiling import View, Views, Window, facing
+from sat_intervals.tiling import View, Views, Window, facing, hull
 
 # Rows that go through the network at once; few, which limits the memory for features.
 STRIP = 64
@@ -76,15 +76,8 @@ class MatchingCost(NamedTuple):
 def view_windows(areas: Sequence[Area], config: Config) -> tuple[Window, Window]:
     """Windows of both images that the costs of areas need; the areas are in the same rows."""
     radius = config.cost.window // 2
-    left, right = (_around(windows) for windows in zip(*((area.left, area.right) for area in areas), strict=True))
+    left, right = (hull(windows) for windows in zip(*((area.left, area.right) for area in areas), strict=True))
     return left.grown(radius, radius), right.grown(radius, radius)
-
-
-def _around(windows: Sequence[Window]) -> Window:
-    """Smallest window that contains all windows, which are in the same rows."""
-    column = min(window.column for window in windows)
-    width = max(window.column_stop for window in windows) - column
-    return Window(windows[0].row, column, windows[0].height, width)
 
 
 def cost_areas(

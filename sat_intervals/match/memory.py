@@ -1,5 +1,7 @@
 """Estimates of the memory that matching needs, and the largest tile that fits in a given memory."""
 
+from math import isqrt
+
 from sat_intervals.config import Config, ConfigError, Mccnn
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.cost import padded_to_lanes
@@ -10,8 +12,21 @@ PROCESS_BYTES = 300 * 10**6
 # Per pixel of a tile with its overlap: pixels as float32 and float64, states, codes of both images, and temporary
 # arrays; per pixel of the core: raw products and their compressed copies.
 _PATCH_BYTES, _CORE_BYTES = 40, 60
+# Per pixel of a block of tiles: pixels and states of both images.
+_VIEW_BYTES = 20
 # Per column of a patch: layers of MC-CNN's network for a strip of rows, and the features of both images.
 _NETWORK_BYTES = 140_000
+
+
+# Side in pixels of a block of small tiles, at most: that of one tile of the default size.
+_BLOCK = 1024
+
+
+def tiles_together(config: Config, size: int) -> int:
+    """Tiles along each side of a block, at most, whose path states take less memory than the volume of one tile."""
+    if not config.hands_states_on or config.cost.precomputed:
+        return 1
+    return max(1, min(_BLOCK // size, isqrt(size // 16)))
 
 
 def volume_bytes(height: int, width: int, config: Config) -> int:
@@ -23,7 +38,7 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     """Bytes that matching a tile needs on top of its process; ``size`` replaces ``tiles.size`` of the settings."""
     size = size or config.tiles.size
     lanes = padded_to_lanes(config.disparity.count)
-    patch = size + 2 * config.tiles.margin
+    patch = size + 2 * config.tiles.support  # a tile alone in its region has support on all sides
     volume = 2 * (size + 2) ** 2 * lanes
     accurate = config.matches_right_view
     if accurate:
@@ -33,6 +48,13 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     if isinstance(config.cost, Mccnn):
         volume += _NETWORK_BYTES * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes
+    together = tiles_together(config, size)
+    if (
+        config.hands_states_on
+    ):  # of four wavefronts: two lines of two paths, of three neighbours and of tiles in a block
+        paths += (1 + accurate) * 4 * (3 + together) * 8 * together * size * lanes
+    if together > 1:
+        paths += _VIEW_BYTES * together * size * (together * size + config.disparity.count)
     return volume + paths + _PATCH_BYTES * patch * (patch + config.disparity.count) + _CORE_BYTES * size**2
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from sat_intervals.config import Config, CosineSgm, Disparity, Sgm
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
-from sat_intervals.kernels.sgm import Borders, Ring
+from sat_intervals.kernels.sgm import Borders, Edge
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, textureless, view_windows
 from sat_intervals.match.normalization import PairStatistics
@@ -59,7 +59,7 @@ class Patch(NamedTuple):
     raw: Raw
     output: Window
     right: RightView
-    leaving: list[Ring]
+    leaving: list[Edge]
 
 
 def kernel_settings(config: Config) -> Settings:
@@ -308,7 +308,7 @@ def mirrored_settings(settings: Settings) -> Settings:
 
 def match_right(
     cost: MatchingCost, area: Area, core: Window, settings: Settings, borders: Borders | None = None
-) -> tuple[RightView, Ring]:
+) -> tuple[RightView, Edge]:
     """Match right pixels, ``core``, with a volume of their own: the images swap; return also the leaving states."""
     inside = core.relative_to(area.base)
     raw, _, leaving = match_costs(cost.costs, mirrored_settings(settings), inside, inside, cost.gradients, borders)

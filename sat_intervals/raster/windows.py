@@ -46,7 +46,11 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
         place = inside.relative_to(window).slices
         values, state[place] = read_inside(image, inside)
         _check_exact(image.path, values, state[place] == 0)
-        np.copyto(pixels[place], values, where=state[place] == 0)
+        unusable = state[place] != 0
+        with np.errstate(over="ignore", invalid="ignore"):
+            pixels[place] = values
+        if unusable.any():
+            pixels[place][unusable] = 0
     return pixels, state
 
 
@@ -72,7 +76,7 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
             usable &= dataset.read_masks(image.band, window=area, out_shape=shape) != 0
         if image.alpha is not None:
             usable &= dataset.read(image.alpha, window=area, out_shape=shape) != 0
-    state = np.where(usable, 0, NO_DATA).astype(np.uint8)
+    state = ~usable * np.uint8(NO_DATA)
     if image.mask is not None:
         with opened(image.mask, window) as dataset:
             state[dataset.read(1, window=area, out_shape=shape) != 0] |= MASKED

@@ -70,7 +70,7 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     config, store, region = job.config, job.store, job.store.grid.region
     records, statistics = store.records(), job.statistics()
     check_done(job, records)
-    histogram, seams = store.histogram(records), store.seams(records)
+    histogram, seams = store.histogram(records), store.seams(records) if store.has_seams else None
     check_matched(job, records, int(histogram.sum()))
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count, config.disparity.minimum)
@@ -179,10 +179,11 @@ def _versions() -> dict[str, str]:
 
 def _calibration(config: Config) -> dict[str, Any] | None:
     """Return what the run took from its calibration, whose content is in the settings."""
-    if config.interval is None or config.interval.coverage is None or config.cuts is None:
+    levels = config.cuts
+    if levels is None or levels.coverage is None:
         return None
     calibration = calibration_of(config)
-    return {"name": calibration.name, "sha256": calibration.sha256, **config.cuts._asdict()}
+    return {"name": calibration.name, "sha256": calibration.sha256, **levels.model_dump()}
 
 
 def _report(
@@ -191,7 +192,7 @@ def _report(
     scale: ConfidenceScale,
     tally: Tally,
     seconds: dict[str, float],
-    seams: np.ndarray,
+    seams: np.ndarray | None,
 ) -> dict[str, Any]:
     """Return the content of run.json."""
     grid, config = job.store.grid, job.config
@@ -218,7 +219,7 @@ def _report(
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },
-        "overlap_left": None if config.tiles.overlap == "exact" else seam_report(seams, grid),
+        "overlap_left": None if seams is None else seam_report(seams, grid),
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": dict(_versions()),
     }

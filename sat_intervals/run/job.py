@@ -23,6 +23,7 @@ from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
+from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
@@ -87,6 +88,11 @@ class Job:
         return self.config.hands_states_on and len(self.store.grid) > 1
 
     @property
+    def blocks(self) -> Grid:
+        """Return the blocks of tiles that are one task, see `blocks_of`; single tiles if they are independent."""
+        return blocks_of(self.store.grid, self.config) if self.hands_states_on else self.store.grid
+
+    @property
     def name(self) -> str:
         """Return a unique name of the run: a digest of all that decides the bytes of its files."""
         return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster", "preset"})})
@@ -106,6 +112,7 @@ class Job:
         check_output(self.out, overwrite)
         restore(self.out, RUN_FILES)
         self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
+        self.store.steps.check_space(handed_bytes(self.store.grid, self.config))
         if self.found or self.local:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
             self.store.write_search(search, _origin(self.inputs))
@@ -212,7 +219,8 @@ def prepare(
         check_replaceable(out)
     grid = Grid(region, config.tiles.size)
     levels = config.subpixel_levels
-    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, run, elsewhere)
+    has_seams = config.tiles.overlap != "exact"
+    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, has_seams, run, elsewhere)
     return Job(left, right, config, store, out, inputs, files, requested, found, marked, local)
 
 
@@ -241,13 +249,16 @@ def _version() -> str:
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
-    """Return all that decides the bytes of a tile."""
+    """Return all that decides the bytes of a tile; of a calibration only its levels."""
+    settings, levels = config.model_dump(mode="json", exclude=_NOT_OF_TILES), config.cuts
+    if levels is not None:
+        settings["interval"] = {"high": levels.high, "low": levels.low, "steps": config.bound_steps}
     return {
         **({"local_ranges": grid} if grid else {}),
         "version": _version(),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,
-        "settings": config.model_dump(mode="json", exclude=_NOT_OF_TILES),
+        "settings": settings,
         "inputs": inputs,
         "region": asdict(region),
     }

@@ -25,10 +25,9 @@ from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.search_range import search_range
 from sat_intervals.run.submit import Submission, Task, reason
-from sat_intervals.run.tile import match_tile, measure_block, trace_tile
+from sat_intervals.run.tile import match_block, measure_block, trace_block
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.removal import BORDERS
-from sat_intervals.store.steps import intact_steps
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Tile, Window
 
@@ -248,24 +247,28 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
         if error is None:
             schedules[i].ended(step)
             add_seconds(matched[i].seconds, seconds or {})  # of tracing; a tile keeps its own in its record
-        else:
-            matched[i].failures.setdefault(step.tile.name, error)
-            schedules[i].failed(step)
-            jobs[i].store.write_failure(step.tile.name, reason(error))
+        elif schedules[i].failed(step):
+            if step.wavefront is not None and not isinstance(error, ChangedInputError):
+                error = RunError(f"tracing its path states, wavefront {step.wavefront}: {reason(error)}")
+            for tile in jobs[i].store.grid.within(step.block.core):
+                matched[i].failures.setdefault(tile.name, error)
+                jobs[i].store.write_failure(tile.name, reason(error))
         _LOG.debug("%s: tile %s %s", jobs[i].out, step.name, f"failed: {reason(error)}" if error else "done")
         done = total - sum(map(len, schedules))
         progress("tiles", done, total)
         if not schedules[i]:
             if not matched[i].failures:
-                jobs[i].store.drop_costs()
+                jobs[i].store.steps.drop_costs()
             yield matched[i]
     assert not any(schedules)  # else steps would wait for each other
 
 
 def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:
-    store = job.store
-    is_done = intact_steps(store.folder, store.run, BORDERS) if job.hands_states_on else None
-    return Schedule(store.grid, tiles, is_done, 1 + job.config.matches_right_view)
+    store, blocks = job.store, job.blocks
+    is_done = store.steps.intact(BORDERS) if job.hands_states_on else None
+    together = blocks.size // store.grid.size
+    places = {(tile.grid_row // together, tile.grid_column // together) for tile in tiles}
+    return Schedule(blocks, [blocks.tile(*place) for place in sorted(places)], is_done, together)
 
 
 def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task | None]:
@@ -276,5 +279,6 @@ def _tasks(jobs: Sequence[Job], schedules: Sequence[Schedule]) -> Iterator[Task 
         if step is None:
             yield None
         else:
-            function, rest = (match_tile, ()) if step.wavefront is None else (trace_tile, step[1:])
-            yield Task((i, step), function, (jobs[i], step.tile, *rest), jobs[i].config.cluster.retries)
+            function = match_block if step.wavefront is None else trace_block
+            arguments = step if step.wavefront is not None else step[:1]
+            yield Task((i, step), function, (jobs[i], *arguments), jobs[i].config.cluster.retries)

@@ -6,12 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.kernels.cost import padded_to_lanes
-from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
 from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
@@ -21,6 +17,7 @@ from sat_intervals.run.cluster import tiles_at_once
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
+from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
 from sat_intervals.run.submit import reason
 from sat_intervals.tiling import Grid, Window
@@ -119,20 +116,9 @@ def plan(
         together=together,
         together_bytes=PROCESS_BYTES + together * tile_bytes(config),
         disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels + _STRIP_BYTES + _FILE_BYTES)
-        + _handed_bytes(grid, config),
+        + handed_bytes(grid, config),
         seconds=seconds,
     )
-
-
-def _handed_bytes(grid: Grid, config: Config) -> int:
-    """Return the bytes that steps hand to each other: path states on the tiles' borders, and precomputed costs."""
-    if not config.hands_states_on:
-        return 0
-    height, width = grid.region.height, grid.region.width
-    lines = grid.columns * height + grid.rows * width
-    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(config.disparity.count) * np.dtype(np.uint16).itemsize
-    costs = config.cost.precomputed * height * width * config.disparity.count
-    return (1 + config.matches_right_view) * (states + costs)
 
 
 def _traced(grid: Grid, whole: Window, config: Config) -> int:
@@ -195,7 +181,8 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
     files = (seconds["bands"] + seconds["files"]) * pixels / sampled
     images = seconds["tiles.images"]  # the sample already measures whole images
-    parallel = (tiles + paths) / min(workers, len(grid))
+    blocks = blocks_of(grid, config)
+    parallel = time_of(blocks, min(workers, len(grid)), paths / max(1, 3 * len(blocks)), tiles / len(blocks))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
     return float(seconds["start"] + seconds["kernels"] + images + parallel + files), extra
 

@@ -1,79 +1,98 @@
-"""Order of the steps of a job: tiles and, with exact seams, the borders that they take over from their neighbours."""
+"""Order of the steps of a job: blocks of tiles and, with exact seams, the path states that they hand to each other.
+
+A block is a tile, or several small ones: reading, opening files and submitting take time for each step.
+"""
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from heapq import heappop, heappush
 from typing import NamedTuple
 
+import numpy as np
+
+from sat_intervals.config import Config
+from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS
 from sat_intervals.match.borders import sources
+from sat_intervals.match.memory import tiles_together
 from sat_intervals.tiling import Grid, Tile
+
+# Blocks along each side of the grid, at least, if there are as many tiles: for several workers.
+_BLOCKS = 4
+# Blocks, at most, whose order `time_of` follows step by step, in a second; workers hardly wait for each other in more.
+_SIMULATED = 1000
+
+
+def blocks_of(grid: Grid, config: Config) -> Grid:
+    """Return the blocks of a grid of tiles; it depends only on what a run must not change when it resumes."""
+    tiles = min(tiles_together(config, grid.size), grid.rows // _BLOCKS, grid.columns // _BLOCKS)
+    return Grid(grid.region, grid.size * max(1, tiles))
 
 
 class Step(NamedTuple):
-    """A tile to match or, with a wavefront, the path states that it hands on in the left or right view."""
+    """A block to match or, with a wavefront, the path states that it hands on in all views."""
 
-    tile: Tile
+    block: Tile
     wavefront: int | None = None
-    mirrored: bool = False
 
     @property
     def name(self) -> str:
-        """Name of the tile, followed by view and wavefront."""
-        view = "_right" if self.mirrored else ""
-        return self.tile.name if self.wavefront is None else f"{self.tile.name}{view}_{self.wavefront}"
+        """Name of the block, followed by the wavefront."""
+        return self.block.name if self.wavefront is None else f"{self.block.name}_{self.wavefront}"
 
 
-def needs(grid: Grid, step: Step, views: int = 1) -> list[Step]:
-    """Steps whose results a step takes over: borders of neighbours, in one wavefront or, for a tile, in all of them.
+def needs(blocks: Grid, step: Step, together: int = 1) -> list[Step]:
+    """Steps whose results a step takes over: borders of neighbours, in one wavefront or, to match, in all of them.
 
-    ``views`` is the number of views that are matched, of which a tile needs all.
+    A block of several tiles, ``together`` along each side, also takes over those inside it, but for the last wavefront.
     """
-    of_views = [step.mirrored] if step.wavefront is not None else [False, True][:views]
-    wavefronts = range(len(WAVEFRONTS)) if step.wavefront is None else (step.wavefront,)
-    found = []
-    for wavefront in wavefronts:
+    found = (
+        [Step(step.block, wavefront) for wavefront in range(LAST)] if together > 1 and step.wavefront is None else []
+    )
+    for wavefront in range(len(WAVEFRONTS)) if step.wavefront is None else (step.wavefront,):
         for rows, columns in sources(wavefront):
-            row, column = step.tile.grid_row + rows, step.tile.grid_column + columns
-            if 0 <= row < grid.rows and 0 <= column < grid.columns:
-                found += [Step(grid.tile(row, column), wavefront, mirrored) for mirrored in of_views]
+            row, column = step.block.grid_row + rows, step.block.grid_column + columns
+            if 0 <= row < blocks.rows and 0 <= column < blocks.columns:
+                found.append(Step(blocks.tile(row, column), wavefront))
     return found
 
 
 class Schedule:
     """Steps in an order in which each comes after those that it needs.
 
-    Matching a tile also gives its borders of the last wavefront. So these are traced only if few tiles are ready: one
+    Matching a block also gives its borders of the last wavefront. So these are traced only if few blocks are ready: one
     worker hardly ever traces them, many workers need not wait.
     """
 
     def __init__(
-        self, grid: Grid, tiles: Iterable[Tile], is_done: Callable[[str], bool] | None, views: int = 1
+        self, blocks: Grid, waiting: Iterable[Tile], is_done: Callable[[str], bool] | None, together: int = 1
     ) -> None:
-        """``is_done`` tells by their names which borders are done; None: tiles are independent of each other."""
-        self._views = views
+        """Order the steps that ``waiting`` blocks need.
+
+        ``is_done`` tells by their names which borders are done; None: blocks are independent of each other.
+        ``together`` is the number of tiles along each side of a block.
+        """
         self._open: dict[Step, int] = {}  # number of unfinished steps that each needs
         self._dependents: dict[Step, list[Step]] = {}
-        waiting = [Step(tile) for tile in tiles]
-        while waiting:
-            step = waiting.pop()
+        steps = [Step(block) for block in waiting]
+        while steps:
+            step = steps.pop()
             if step in self._open:
                 continue
-            others = needs(grid, step, views) if is_done else []
+            others = needs(blocks, step, together) if is_done else []
             needed = [other for other in others if not (is_done and is_done(other.name))]
             self._open[step] = len(needed)
             for other in needed:
                 self._dependents.setdefault(other, []).append(step)
-            waiting += needed
-        self._taken: set[Step] = set()  # started, or given by a tile that is
-        self._also_done: dict[Step, list[Step]] = {}
-        self._under_way = 0
-        self._traces, self._tiles, self._last = deque[Step](), deque[Step](), deque[Step]()
+            steps += needed
+        self._under_way: set[Step] = set()
+        self._traces, self._blocks, self._last = deque[Step](), deque[Step](), deque[Step]()
         for step in sorted((step for step, count in self._open.items() if not count), key=_order):
             self._queue(step).append(step)
 
     def _queue(self, step: Step) -> deque[Step]:
         if step.wavefront is None:
-            return self._tiles
+            return self._blocks
         return self._last if step.wavefront == LAST else self._traces
 
     def __len__(self) -> int:
@@ -82,47 +101,76 @@ class Schedule:
 
     def next(self) -> Step | None:
         """A step to start, None while all others wait for those under way."""
-        # Two steps per worker are under way, and few tiles wait: tiles alone would not unlock enough others.
-        is_short = len(self._tiles) <= self._under_way // 2
-        for queue in (self._traces, *((self._last, self._tiles) if is_short else (self._tiles, self._last))):
+        # Two steps per worker are under way, and few blocks wait: blocks alone would not unlock enough others.
+        is_short = len(self._blocks) <= len(self._under_way) // 2
+        for queue in (self._traces, *((self._last, self._blocks) if is_short else (self._blocks, self._last))):
             while queue:
                 step = queue.popleft()
-                if step in self._open and step not in self._taken:
-                    self._start(step)
+                is_given = step.wavefront == LAST and Step(step.block) in self._under_way
+                if step in self._open and step not in self._under_way and not is_given:
+                    self._under_way.add(step)
                     return step
         return None
 
-    def _start(self, step: Step) -> None:
-        self._taken.add(step)
-        self._under_way += 1
-        if step.wavefront is None:
-            borders = (Step(step.tile, LAST, mirrored) for mirrored in [False, True][: self._views])
-            self._also_done[step] = [border for border in borders if border in self._open and border not in self._taken]
-            self._taken.update(self._also_done[step])
-
     def ended(self, step: Step) -> None:
         """Note that a step has been done."""
-        self._under_way -= 1
-        for done in (*self._also_done.pop(step, ()), step):
-            del self._open[done]
+        self._under_way.discard(step)
+        for done in (step, Step(step.block, LAST)) if step.wavefront is None else (step,):
+            if self._open.pop(done, None) is None:  # borders that its block has given meanwhile
+                continue
             for other in self._dependents.pop(done, ()):
                 if other in self._open:  # else another step that it needs has failed
                     self._open[other] -= 1
                     if not self._open[other]:
                         self._queue(other).append(other)
 
-    def failed(self, step: Step) -> None:
-        """Note that a step cannot be done, nor those that need it; what a tile would have given is traced."""
-        self._under_way -= 1
-        for border in self._also_done.pop(step, ()):
-            self._taken.discard(border)
-            self._last.append(border)
+    def failed(self, step: Step) -> bool:
+        """Note that a step cannot be done, nor those that need it; return False if its block under way makes up for it.
+
+        What a block would have given is traced instead.
+        """
+        self._under_way.discard(step)
+        last = Step(step.block, LAST)
+        if step == last and (step not in self._open or Step(step.block) in self._under_way):
+            return False
+        if step.wavefront is None and last not in self._under_way and self._open.get(last) == 0:
+            self._last.append(last)
         lost = [step]
         while lost:
             step = lost.pop()
             if self._open.pop(step, None) is not None:
                 lost += self._dependents.pop(step, ())
+        return True
 
 
 def _order(step: Step) -> tuple[int, int, int]:
-    return step.tile.grid_row, step.tile.grid_column, -1 if step.wavefront is None else step.wavefront
+    return step.block.grid_row, step.block.grid_column, -1 if step.wavefront is None else step.wavefront
+
+
+def time_of(blocks: Grid, workers: int, trace: float, match: float) -> float:
+    """Return the time that workers take for the steps of blocks, from that of tracing and of matching one block."""
+    if not trace or len(blocks) > _SIMULATED:
+        return len(blocks) * (LAST * trace + match) / workers
+    schedule, now, count = Schedule(blocks, blocks, set[str]().__contains__), 0.0, 0
+    queue, running = deque[Step](), list[tuple[float, int, Step]]()
+    while schedule:
+        # as in a run, two steps per worker are submitted
+        while len(queue) + len(running) < 2 * workers and (step := schedule.next()) is not None:
+            queue.append(step)
+        while queue and len(running) < workers:
+            step, count = queue.popleft(), count + 1
+            heappush(running, (now + (match if step.wavefront is None else trace), count, step))
+        now, _, step = heappop(running)
+        schedule.ended(step)
+    return now
+
+
+def handed_bytes(grid: Grid, config: Config) -> int:
+    """Return the bytes that steps hand to each other: path states on the tiles' borders, and precomputed costs."""
+    if not config.hands_states_on or len(grid) == 1:
+        return 0
+    height, width = grid.region.height, grid.region.width
+    lines = grid.columns * height + grid.rows * width
+    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(config.disparity.count) * np.dtype(np.uint16).itemsize
+    costs = config.cost.precomputed * height * width * config.disparity.count
+    return (1 + config.matches_right_view) * (states + costs)

@@ -1,7 +1,7 @@
-"""Match one tile on a worker, or trace its paths: read, compute, write the intermediate products."""
+"""Match the tiles of a block on a worker, or trace its paths: read, compute, write the intermediate products."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -10,8 +10,8 @@ import numpy as np
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.cost import padded_to_lanes
-from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Ring
-from sat_intervals.match.borders import Border, Place, borders_of, rehulled, trace_area
+from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Edge
+from sat_intervals.match.borders import Border, Place, borders_of, in_order, rehulled, sources, trace_area
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
 from sat_intervals.match.normalization import Moments, PairStatistics, moments
@@ -21,7 +21,6 @@ from sat_intervals.match.patch import (
     frame_area,
     frames_of,
     match_costed,
-    mirrored_frame,
     patch_areas,
     path_window,
 )
@@ -34,10 +33,13 @@ from sat_intervals.run.job import Job
 from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
 from sat_intervals.store.removal import BORDERS, COSTS
-from sat_intervals.tiling import Tile, Views, Window
+from sat_intervals.tiling import Tile, Views, Window, hull
 
 # Tiles along each side of the grid, at most, in which the quality of a pair is looked at.
 _LOOKS = 4
+
+Handed = dict[Place, list[Edge]]
+"""What tiles hand on in a wavefront: for each view, by place in the grid of tiles."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -54,16 +56,16 @@ def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]])
         raise
 
 
-def match_tile(job: Job, tile: Tile) -> None:
-    """Match one tile and write its intermediate products; runs on a worker."""
-    with _logged_failure(job, tile.name):
-        _match_tile(job, tile)
+def match_block(job: Job, block: Tile) -> None:
+    """Match the tiles of a block and write their intermediate products; runs on a worker."""
+    with _logged_failure(job, block.name):
+        _match_block(job, block)
 
 
-def trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[str, float]:
-    """Write the path states that a tile hands on in a wavefront; return seconds by stage; runs on a worker."""
-    with _logged_failure(job, Step(tile, wavefront, mirrored).name):
-        return _trace_tile(job, tile, wavefront, mirrored)
+def trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
+    """Write the path states that a block hands on in a wavefront; return seconds by stage; runs on a worker."""
+    with _logged_failure(job, f"{block.name}, wavefront {wavefront},"):
+        return _trace_block(job, block, wavefront)
 
 
 @contextmanager
@@ -77,26 +79,44 @@ def _logged_failure(job: Job, step: str) -> Iterator[None]:
         raise
 
 
-def _match_tile(job: Job, tile: Tile) -> None:
-    job.store.check_space(tile)
-    frame, borders = _frame(job, tile), None
-    seconds: dict[str, float] = {}
-    ranges = job.ranges()
-    costed = _costs(job, patch_areas(*frame[:3], job.config, ranges), tile, seconds)
+def _match_block(job: Job, block: Tile) -> None:
+    read: dict[str, float] = {}
+    tiles, ranges = job.store.grid.within(block.core), job.ranges()
+    for tile in tiles:
+        job.store.check_space(tile)
+    source = _read(job, tiles, ranges, read)
+    handed: list[Handed] = []
     if job.hands_states_on:
-        with timed(seconds, "read"):
-            frames = frames_of(*frame[:3], job.config)
-            borders = [_borders(job, tile, of_view, range(len(WAVEFRONTS)), ranges) for of_view in frames]
+        with timed(read, "read"):
+            handed = [
+                _handed(job, block, wavefront, inside=len(tiles) > 1 and wavefront != LAST)
+                for wavefront in range(len(WAVEFRONTS))
+            ]
+        tiles = in_order(LAST, tiles)  # whose states come with the matched tiles
+    for tile in tiles:
+        seconds = {"read": read["read"] / len(tiles)}
+        _match_tile(job, tile, source, handed, ranges, seconds)
+    if job.hands_states_on:
+        _write_states(job, block, LAST, handed[LAST])
+
+
+def _match_tile(
+    job: Job, tile: Tile, source: "_Source", handed: list[Handed], ranges: LocalRanges | None, seconds: dict[str, float]
+) -> None:
+    """Match a tile and write its products; add the states of the last wavefront that it hands on to ``handed``."""
+    views, costs = _costed(job, tile, source, ranges, seconds)
     seconds["match"] = seconds.get("match", 0.0) + seconds.pop("costs", 0.0)
+    frame, borders = _frame(job, tile), None
     with timed(seconds, "match"):
-        patch = match_costed(costed.views, frame, costed.made, job.config, borders, ranges)
-    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), costed.views, strict=True)}
-    with timed(seconds, "write"):
         if job.hands_states_on:
-            for mirrored, ring in enumerate(patch.leaving):
-                job.store.write_step(BORDERS, Step(tile, LAST, bool(mirrored)).name, *ring)
+            borders = [_borders(job, tile, view, handed, ranges) for view in range(len(costs))]
+        patch = match_costed(views, frame, costs, job.config, borders, ranges)
+    usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
+    if handed:
+        handed[LAST][_place(tile)] = patch.leaving
+    with timed(seconds, "write"):
         files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    looks = [look._asdict() for look in _looks(costed.views, tile, job)]
+    looks = [look._asdict() for look in _looks(views, tile, job)]
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files, "looks": looks})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
@@ -109,92 +129,151 @@ def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
     return look_in_tile(views, tile.core, search.minimum, search.maximum)
 
 
-def _trace_tile(job: Job, tile: Tile, wavefront: int, mirrored: bool) -> dict[str, float]:
-    frame, ranges = _frame(job, tile), job.ranges()
-    if mirrored:
-        frame = mirrored_frame(frame, job.config)
+def _trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
     seconds: dict[str, float] = {}
     with timed(seconds, "trace"):
-        (cost,) = _costs(job, [frame_area(frame, job.config, ranges)], tile, seconds).made
-        borders = _borders(job, tile, frame, [wavefront], ranges)
-        ring = trace_area(cost, frame, borders, wavefront, job.config, ranges)
-        job.store.write_step(BORDERS, Step(tile, wavefront, mirrored).name, *ring)
-    costs = seconds.get("costs", 0.0)
-    return {"tiles.costs": costs, "tiles.trace": seconds["trace"] - costs}
+        tiles, ranges = job.store.grid.within(block.core), job.ranges()
+        source = _read(job, tiles, ranges, seconds)
+        handed = _handed(job, block, wavefront)
+        for tile in in_order(wavefront, tiles):
+            _, costs = _costed(job, tile, source, ranges, seconds)
+            of_wavefronts = [handed if other == wavefront else {} for other in range(len(WAVEFRONTS))]
+            handed[_place(tile)] = [
+                trace_area(cost, frame, _borders(job, tile, view, of_wavefronts, ranges), wavefront, job.config, ranges)
+                for view, (cost, frame) in enumerate(zip(costs, _frames(job, tile), strict=True))
+            ]
+        _write_states(job, block, wavefront, handed)
+    costs_seconds = seconds.get("costs", 0.0)
+    return {"tiles.costs": costs_seconds, "tiles.trace": seconds["trace"] - costs_seconds}
+
+
+def _place(tile: Tile) -> Place:
+    return tile.grid_row, tile.grid_column
 
 
 def _frame(job: Job, tile: Tile) -> Frame:
     return Frame(tile.core, job.store.grid.region, Window(0, 0, job.left.height, job.left.width))
 
 
-def _read(job: Job, windows: tuple[Window, Window], seconds: dict[str, float]) -> tuple[Views, PairStatistics | None]:
-    """Read both images; return them with the image statistics if the matching cost needs these."""
+def _frames(job: Job, tile: Tile) -> list[Frame]:
+    return frames_of(*_frame(job, tile)[:3], job.config)
+
+
+# ---- Pixels and costs --------------------------------------------------------------------------------------
+class _Source(NamedTuple):
+    """Both images in windows that contain those of some tiles, and the image statistics if the cost needs these."""
+
+    views: Views
+    statistics: PairStatistics | None
+
+
+def _areas(job: Job, tile: Tile, ranges: LocalRanges | None) -> list[Area]:
+    return patch_areas(*_frame(job, tile)[:3], job.config, ranges)
+
+
+def _read(job: Job, tiles: Sequence[Tile], ranges: LocalRanges | None, seconds: dict[str, float]) -> _Source:
+    """Read both images in the windows of tiles."""
     job.store.check(job.manifest)
     job.check_inputs()  # before any work
     statistics = job.statistics()
+    windows = [view_windows(_areas(job, tile, ranges), job.config) for tile in tiles]
     try:
         with timed(seconds, "read"):
-            views = read_views((job.left, job.right), windows)
+            views = read_views((job.left, job.right), map(hull, zip(*windows, strict=True)))
     finally:  # a changed input explains a read error
         job.check_inputs()
-    return views, statistics
+    return _Source(views, statistics)
 
 
-class _Costed(NamedTuple):
-    """Both images in the windows of some areas, and the costs of these."""
-
-    views: Views
-    made: list[MatchingCost]
-
-
-def _costs(job: Job, areas: Sequence[Area], tile: Tile, seconds: dict[str, float]) -> _Costed:
-    """Read both images and compute the costs of a tile's areas.
+def _costed(
+    job: Job, tile: Tile, source: _Source, ranges: LocalRanges | None, seconds: dict[str, float]
+) -> tuple[Views, list[MatchingCost]]:
+    """Crop both images to a tile, and compute the costs of its areas.
 
     Precomputed costs take longer than SGM: the first of the tile's steps keeps them for the others, uncompressed, since
-    those of noisy images do not shrink.
+    those of noisy images hardly shrink.
     """
-    views, statistics = _read(job, view_windows(areas, job.config), seconds)
-    if not (job.config.cost.precomputed and job.hands_states_on):
+    areas, statistics, config, name = _areas(job, tile, ranges), source.statistics, job.config, tile.name
+    left, right = zip(source.views, view_windows(areas, config), strict=True)
+    views = left[0].cropped(left[1]), right[0].cropped(right[1])
+    if not (config.cost.precomputed and job.hands_states_on):
         with timed(seconds, "match"):
-            return _Costed(views, cost_areas(views, areas, job.config, statistics))
-    names = [f"{tile.name}_right" if area.mirrored else tile.name for area in areas]
+            return views, cost_areas(views, areas, config, statistics)
     with timed(seconds, "read"):
-        kept = [costs for name in names for costs in job.store.read_step(COSTS, name) or ()]
-    if len(kept) == len(names):
-        missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
-        made = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
-        with timed(seconds, "match"):
-            return _Costed(views, cost_areas(views, areas, job.config, statistics, made))
-    with timed(seconds, "costs"):
-        costed = cost_areas(views, areas, job.config, statistics)
-        for name, area, cost in zip(names, areas, costed, strict=True):
-            job.store.write_step(COSTS, name, cost.costs.left[:, :, : area.disparities])
-    return _Costed(views, costed)
+        kept = job.store.steps.read(COSTS, name)
+    if kept is None:
+        with timed(seconds, "costs"):
+            costed = cost_areas(views, areas, config, statistics)
+            kept = [cost.costs.left[:, :, : area.disparities] for area, cost in zip(areas, costed, strict=True)]
+            job.store.steps.write(COSTS, name, *kept)
+        return views, costed
+    missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
+    made = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
+    with timed(seconds, "match"):
+        return views, cost_areas(views, areas, config, statistics, made)
 
 
-def _borders(job: Job, tile: Tile, frame: Frame, wavefronts: Iterable[int], ranges: LocalRanges | None) -> Borders:
-    """Read the path states that a tile takes over from its neighbours in a view."""
+# ---- Path states -------------------------------------------------------------------------------------------
+def _write_states(job: Job, block: Tile, wavefront: int, handed: Handed) -> None:
+    """Write what the tiles of a block hand on: for each tile and view the states of its last column and row."""
+    edges = [edge for tile in job.store.grid.within(block.core) for edge in handed[_place(tile)]]
+    job.store.steps.write(BORDERS, Step(block, wavefront).name, *(states for edge in edges for states in edge))
+
+
+def _handed(job: Job, block: Tile, wavefront: int, *, inside: bool = False) -> Handed:
+    """Read what neighbours hand on to a block in a wavefront and, with ``inside``, its own tiles to each other."""
+    grid, found = job.store.grid, Handed()
+    sought = {
+        (tile.grid_row + row, tile.grid_column + column)
+        for tile in grid.within(block.core)
+        for row, column in sources(wavefront)
+    }
+    steps = needs(job.blocks, Step(block, wavefront))
+    for step in [*steps, Step(block, wavefront)] if inside else steps:
+        tiles = grid.within(step.block.core)
+        wanted = [i for i, tile in enumerate(tiles) if _place(tile) in sought]
+        for i, states in zip(wanted, _states_of(job, step, wanted), strict=True):
+            found[_place(tiles[i])] = states
+    return found
+
+
+def _states_of(job: Job, step: Step, wanted: Sequence[int]) -> list[list[Edge]]:
+    """Read what some tiles of a step hand on in each view; trace it again if the file is missing or damaged."""
+    count = 2 * (1 + job.config.matches_right_view)  # arrays of a tile
+    numbers = [number for i in wanted for number in range(i * count, (i + 1) * count)]
+    file = f"{job.store.folder}/{BORDERS}/{step.name}"
+    arrays = job.store.steps.read(BORDERS, step.name, numbers) if numbers else []
+    if arrays is None:
+        assert step.wavefront is not None
+        _LOG.warning("%s is missing or damaged: it is traced again", file)
+        _trace_block(job, step.block, step.wavefront)
+        arrays = job.store.steps.read(BORDERS, step.name, numbers)
+    if arrays is None:
+        raise RunError(
+            f"{file} was damaged as soon as it was written: check the disk, then rerun the same command: it resumes"
+        )
+    edges = [Edge(*arrays[i : i + 2]) for i in range(0, len(arrays), 2)]
+    return [edges[i : i + count // 2] for i in range(0, len(edges), count // 2)]
+
+
+def _borders(job: Job, tile: Tile, view: int, handed: Sequence[Handed], ranges: LocalRanges | None) -> Borders:
+    """Path states that a tile takes over from its neighbours in a view, by wavefront."""
+    frame = _frames(job, tile)[view]
     here = narrowed(ranges, frame_area(frame, job.config).base, job.config)
     found: list[dict[Place, Border]] = [{} for _ in WAVEFRONTS]
-    for wavefront in wavefronts:
-        for step in needs(job.store.grid, Step(tile, wavefront, frame.mirrored)):
-            states = job.store.read_step(BORDERS, step.name)
-            if states is None:
-                raise RunError(
-                    f"the path states of tile {step.tile.name} in {job.store.folder} are missing or damaged: rerun the "
-                    "same command: it resumes"
-                )
-            place = step.tile.grid_row - tile.grid_row, step.tile.grid_column - tile.grid_column
-            there = _frame(job, step.tile)
-            if frame.mirrored:
-                there = mirrored_frame(there, job.config)
-            ring = Ring(*states)
-            if ranges:
-                ring = rehulled(ring, frame_area(there, job.config, ranges).minimum, here)
-            found[wavefront][place] = Border(path_window(there, job.config), ring)
+    for wavefront, of_tiles in enumerate(handed):
+        for row, column in sources(wavefront):
+            place = tile.grid_row + row, tile.grid_column + column
+            if place in of_tiles:
+                there = _frames(job, job.store.grid.tile(*place))[view]
+                edge = of_tiles[place][view]
+                if ranges:
+                    edge = rehulled(edge, frame_area(there, job.config, ranges).minimum, here)
+                found[wavefront][row, column] = Border(path_window(there, job.config), edge)
     return borders_of(frame, here, found)
 
 
+# ---- Products ----------------------------------------------------------------------------------------------
 def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     """Return the products of the tile's core for the store."""
     raw = patch.raw
@@ -206,5 +285,6 @@ def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.store.ambiguities)
     if job.config.cross_check:
         arrays |= {"right_cost": patch.right.cost, "right_winner": patch.right.winner}
-    seams = seam_lines(raw, patch.output, tile.core, job.store.grid.size)
-    return arrays | {"ambiguity": ambiguity, "histogram": histogram, "seams": seams}
+    if job.store.has_seams:
+        arrays["seams"] = seam_lines(raw, patch.output, tile.core, job.store.grid.size)
+    return arrays | {"ambiguity": ambiguity, "histogram": histogram}

@@ -15,8 +15,8 @@ _GROUP = f"{ARRAYS}/zarr.json"
 _OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
-    rf"|{BORDERS}/(\d+)_(\d+)(?:_right)?_[0-3]"
-    rf"|{COSTS}/(\d+)_(\d+)(?:_right)?"
+    rf"|{BORDERS}/(\d+)_(\d+)_[0-3]"
+    rf"|{COSTS}/(\d+)_(\d+)"
     rf"|{ARRAYS}/(?:u?int\d+/c/0|right/c|seams/c|histogram/c)/(\d+)/(\d+)(?:/0)*"
 )
 # Folders of a run. If one of them were a link, writing would replace the user's files behind it.

@@ -1,57 +1,105 @@
-"""What a step of a run hands to later ones, path states and matching costs: one file each, with its own checksum."""
+"""What steps of a run hand to later ones, path states and matching costs: one file each, with its own checksums."""
 
-import io
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from sat_intervals.store.folder import Folder
+from sat_intervals.store.manifest import MANIFEST, StoreError, sealed, unsealed
+from sat_intervals.store.removal import BORDERS, COSTS
 
-_CHECKSUM = struct.Struct("<I")
-
-
-def write_step(folder: Folder, run: str, kind: str, name: str, *arrays: np.ndarray) -> None:
-    """Write arrays as a whole; ``kind`` is their folder, BORDERS or COSTS, and ``run`` the run that they belong to."""
-    content = io.BytesIO()
-    content.write(_CHECKSUM.pack(0))
-    for array in arrays:
-        np.lib.format.write_array(content, array, allow_pickle=False)
-    with content.getbuffer() as written:
-        _CHECKSUM.pack_into(written, 0, _checksum(written[_CHECKSUM.size :], run, kind, name))
-    folder.write_bytes(f"{kind}/{name}", content.getvalue())
+# A file is the length of its header, the header, a sealed text, and the bytes of all arrays.
+_LENGTH = struct.Struct("<I")
 
 
-def read_step(folder: Folder, run: str, kind: str, name: str) -> list[np.ndarray] | None:
-    """Read what `write_step` wrote; None if the file is missing.
+@dataclass(frozen=True)
+class Steps:
+    """Files of the steps of a run.
 
-    None after its removal if it is damaged, or belongs to another run, tile or wavefront.
+    Attributes
+    ----------
+    folder
+        Folder of the tiles.
+    run
+        Digest of the manifest: what belongs to another run is not taken for a part of this one.
     """
-    content = folder.read_bytes(f"{kind}/{name}")
-    if content is None:
+
+    folder: Folder
+    run: str
+
+    def write(self, kind: str, name: str, *arrays: np.ndarray) -> None:
+        """Write arrays as a whole; ``kind`` is their folder, BORDERS or COSTS."""
+        whole = [np.ascontiguousarray(array) for array in arrays]
+        about = [[array.dtype.str, list(array.shape), zlib.crc32(array.data)] for array in whole]
+        header, file = sealed({"arrays": about}, f"{self.run}/{kind}/{name}").encode(), f"{kind}/{name}"
+        self.folder.write_bytes(file, b"".join([_LENGTH.pack(len(header)), header, *(array.data for array in whole)]))
+        if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
+            self.folder.delete(file)
+
+    def read(self, kind: str, name: str, wanted: Iterable[int] | None = None) -> list[np.ndarray] | None:
+        """Read what `write` wrote, or only the ``wanted`` arrays; None if the file is missing.
+
+        None after its removal if it is damaged, or belongs to another run, tile or wavefront.
+        """
+        content = self.folder.read_bytes(f"{kind}/{name}")
+        found = None if content is None else _parsed(content, f"{self.run}/{kind}/{name}", wanted)
+        if content is not None and found is None:
+            self.folder.delete(f"{kind}/{name}")
+        return found
+
+    def intact(self, kind: str) -> Callable[[str], bool]:
+        """Return a function that tells whether a file was written and is not damaged; a damaged one is removed."""
+        there = self.folder.inside(kind).sizes().keys()
+
+        @cache
+        def is_intact(name: str) -> bool:
+            return name in there and self.read(kind, name) is not None
+
+        return is_intact
+
+    def drop_costs(self) -> None:
+        """Delete precomputed costs, which nothing needs once all tiles are matched."""
+        self.folder.delete_all([f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes()], [COSTS])
+
+    def check_space(self, needed: int) -> None:
+        """Raise if the disk has no room for the bytes that a run needs for its steps and does not have yet.
+
+        Raises
+        ------
+        StoreError
+            Gives free and needed space.
+        """
+        needed -= sum(sum(self.folder.inside(kind).sizes().values()) for kind in (BORDERS, COSTS)) if needed else 0
+        free = self.folder.free_bytes()
+        if free is not None and free < needed:
+            raise StoreError(
+                f"{self.folder} has {free / 1e6:,.1f} MB free, path states and matching costs need {needed / 1e6:,.1f} "
+                "MB: free disk space, choose another --store, or give --overlap 100"
+            )
+
+
+def _parsed(content: bytes, of: str, wanted: Iterable[int] | None) -> list[np.ndarray] | None:
+    """Return the wanted arrays of a file; None if it is damaged or belongs to something else."""
+    if len(content) < _LENGTH.size:
         return None
-    payload = memoryview(content)[_CHECKSUM.size :]
-    if not payload or _CHECKSUM.unpack_from(content) != (_checksum(payload, run, kind, name),):
-        folder.delete(f"{kind}/{name}")
+    place = _LENGTH.size + _LENGTH.unpack_from(content)[0]
+    header = unsealed(content[_LENGTH.size : place].decode(errors="replace"), of)
+    if header is None:
         return None
-    stream, arrays = io.BytesIO(payload), []
-    while stream.tell() < len(payload):
-        arrays.append(np.lib.format.read_array(stream, allow_pickle=False))
-    return arrays
-
-
-def _checksum(payload: memoryview, *of: str) -> int:
-    return zlib.crc32(payload, zlib.crc32("/".join(of).encode()))
-
-
-def intact_steps(folder: Folder, run: str, kind: str) -> Callable[[str], bool]:
-    """Return a function that tells whether a file was written and is not damaged; a damaged one is removed."""
-    there = folder.inside(kind).sizes().keys()
-
-    @cache
-    def is_intact(name: str) -> bool:
-        return name in there and read_step(folder, run, kind, name) is not None
-
-    return is_intact
+    places = []
+    for dtype, shape, checksum in header["arrays"]:
+        size = np.dtype(dtype).itemsize * int(np.prod(shape))
+        places.append((place, place + size, dtype, shape, checksum))
+        place += size
+    if place != len(content):
+        return None
+    found, view = [], memoryview(content)
+    for start, stop, dtype, shape, checksum in places if wanted is None else [places[i] for i in wanted]:
+        if zlib.crc32(view[start:stop]) != checksum:
+            return None
+        found.append(np.frombuffer(view[start:stop], dtype).reshape(shape).copy())  # kernels take writable arrays
+    return found

@@ -25,7 +25,6 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, diges
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
-    COSTS,
     FAILURES,
     FOLDERS,
     NORMALIZATION,
@@ -36,7 +35,7 @@ from sat_intervals.store.removal import (
     final_name,
     is_of_run,
 )
-from sat_intervals.store.steps import read_step, write_step
+from sat_intervals.store.steps import Steps
 from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
@@ -44,7 +43,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 8
+LAYOUT = 9
 
 # Marker files in the folder of a run: present while it replaces an earlier run; its name, from the publication of its
 # files to the removal of its tiles.
@@ -74,6 +73,8 @@ class Store:
         Largest possible ambiguity of a pixel.
     levels
         Levels of sub-pixel bounds, see `TileArrays`.
+    has_seams
+        Whether the lines along the tiles' borders are kept: with overlaps.
     run
         Digest of the manifest: what belongs to another run is not taken for a part of this one.
     elsewhere
@@ -85,6 +86,7 @@ class Store:
     count: int
     ambiguities: int
     levels: int
+    has_seams: bool
     run: str
     elsewhere: str | None = None
 
@@ -95,7 +97,14 @@ class Store:
 
     @property
     def _arrays(self) -> TileArrays:
-        return TileArrays(self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels)
+        return TileArrays(
+            self.folder.inside(ARRAYS), self.grid, self.count, self.ambiguities, self.levels, self.has_seams
+        )
+
+    @property
+    def steps(self) -> Steps:
+        """Return what steps hand to later ones."""
+        return Steps(self.folder, self.run)
 
     def open(
         self, manifest: Mapping[str, Any], *, overwrite: bool = False, replaceable: Mapping[str, str] | None = None
@@ -222,20 +231,6 @@ class Store:
         self.folder.write(name, sealed(record, f"{self.run}/{tile.name}"))
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
             self.folder.delete(name)
-
-    def write_step(self, kind: str, name: str, *arrays: np.ndarray) -> None:
-        """Write what a step hands to later ones, see `steps.write_step`."""
-        write_step(self.folder, self.run, kind, name, *arrays)
-        if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
-            self.folder.delete(f"{kind}/{name}")
-
-    def read_step(self, kind: str, name: str) -> list[np.ndarray] | None:
-        """Read what `write_step` wrote; None if it is missing or damaged."""
-        return read_step(self.folder, self.run, kind, name)
-
-    def drop_costs(self) -> None:
-        """Delete precomputed costs, which nothing needs once all tiles are matched."""
-        self.folder.delete_all([f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes()], [COSTS])
 
     def write_normalization(self, normalization: Mapping[str, Any]) -> None:
         """Write the statistics of the whole images, so that all tiles use the same."""
@@ -403,4 +398,5 @@ def store_of(home: Path, store: str | None = None) -> Store:
     if text is None:
         raise StoreError(f"{home.parent} has no run: give the folder that match was given")
     manifest = parsed(text, folder)
-    return Store(home, grid_of(manifest, folder), 1, 0, 0, digest(manifest), str(folder))
+    grid, has_seams = grid_of(manifest, folder), manifest["settings"]["tiles"].get("overlap") != "exact"
+    return Store(home, grid, 1, 0, 0, has_seams, digest(manifest), str(folder))

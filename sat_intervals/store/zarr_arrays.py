@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -10,9 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 import numpy.typing as npt
 import zarr
+from numcodecs import blosc
 from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store
 from zarr.codecs import BloscCodec
 from zarr.core.buffer import Buffer, BufferPrototype
@@ -31,6 +34,8 @@ _RIGHT = "right"
 # Rank of a right pixel without candidates.
 _UNSEEN = np.uint32(0xFFFFFFFF)
 SIDES = ("top", "bottom", "left", "right")
+# Arrays with one chunk a tile.
+_TABLES: dict[str, type[np.generic]] = {"seams": np.int16, "histogram": np.uint32}
 
 # Rows of a shard that are compressed together; strips of these rows read only what they need.
 _ROWS_TOGETHER = 128
@@ -62,6 +67,8 @@ class TileArrays:
         Largest possible ambiguity of a pixel.
     levels
         Levels of sub-pixel bounds, each with a lower and an upper one; 0 for bounds in whole pixels.
+    has_seams
+        Whether there are lines along the tiles' borders.
     """
 
     folder: Folder
@@ -69,6 +76,7 @@ class TileArrays:
     count: int
     ambiguities: int
     levels: int
+    has_seams: bool
 
     @property
     def _reach(self) -> int:
@@ -76,7 +84,7 @@ class TileArrays:
 
     def create(self) -> None:
         """Write missing or damaged metadata of the arrays; every run writes the same."""
-        texts, _ = _descriptions(self.grid, self.count, self.ambiguities, self.levels)
+        texts, _ = _descriptions(self.grid, self.count, self.ambiguities, self.levels, self.has_seams)
         for name, text in texts.items():
             if self.folder.read(name) != text:
                 self.folder.make(name.rpartition("/")[0])
@@ -84,10 +92,8 @@ class TileArrays:
 
     def _array(self, name: str, store: Store) -> zarr.Array[Any]:
         """Open an array of a store without reading its metadata there, which are for other tools."""
-        _, metadata = _descriptions(self.grid, self.count, self.ambiguities, self.levels)
-        array = zarr.Array(zarr.AsyncArray(metadata[name], StorePath(store, name)))
-        # Write blocks of fill values too, so that every finished tile has all its files.
-        return array.with_config({"write_empty_chunks": True})
+        _, metadata = _descriptions(self.grid, self.count, self.ambiguities, self.levels, self.has_seams)
+        return zarr.Array(zarr.AsyncArray(metadata[name], StorePath(store, name)))
 
     def _store(self) -> Store:
         place = self.folder.place("")
@@ -95,11 +101,17 @@ class TileArrays:
 
     def files_of(self, tile: Tile) -> set[str]:
         """Return the names of a tile's files."""
-        place = f"{tile.grid_row}/{tile.grid_column}"
-        return {
-            *(f"{dtype}/c/0/{place}" for dtype in _planes(self.levels)),
-            f"{_RIGHT}/c/{place}", f"seams/c/{place}/0/0/0/0", f"histogram/c/{place}/0",
-        }  # fmt: skip
+        return {self._file(name, tile) for name in (*_planes(self.levels), _RIGHT, *self._tables)}
+
+    @property
+    def _tables(self) -> tuple[str, ...]:
+        """Return the names of the arrays with one chunk a tile."""
+        return tuple(_TABLES) if self.has_seams else ("histogram",)
+
+    def _file(self, name: str, tile: Tile) -> str:
+        """Return the name of a tile's file of an array."""
+        before, after = {"seams": ("", "/0/0/0/0"), "histogram": ("", "/0"), _RIGHT: ("", "")}.get(name, ("/0", ""))
+        return f"{name}/c{before}/{tile.grid_row}/{tile.grid_column}{after}"
 
     def bytes_of(self, tile: Tile) -> int:
         """Return the size of a tile's products before compression."""
@@ -118,20 +130,40 @@ class TileArrays:
             with two levels ``lower_low`` and ``upper_low``; optionally ``right_cost`` and ``right_winner``; ``seams``
             (SIDES, own line or ring, winner and bounds, size); ``histogram``.
         """
-        size, row, column = self.grid.size, tile.grid_row, tile.grid_column
-        height, width = arrays["winner"].shape
-        rows = slice(row * size, row * size + height)
-        store = _WrittenStore(self._store())
+        height, contents = arrays["winner"].shape[0], {}
         for dtype, planes in _planes(self.levels).items():
-            made = np.stack([arrays[name].view(dtype) for name in planes])
-            self._array(dtype, store)[:, rows, column * size : column * size + width] = made
+            contents[dtype] = self._shard(np.stack([arrays[name].view(dtype) for name in planes]), self.grid.size)
         rank = np.full((height, self._reach), _UNSEEN)
         if "right_cost" in arrays:
             rank[:, : arrays["right_cost"].shape[1]] = _rank(arrays["right_cost"], arrays["right_winner"])
-        self._array(_RIGHT, store)[rows, column * self._reach : (column + 1) * self._reach] = rank
-        for name in ("seams", "histogram"):
-            self._array(name, store)[row, column] = arrays[name]
-        return store.checksums
+        contents[_RIGHT] = self._shard(rank, self._reach)
+        contents |= {name: _compressed(arrays[name].astype(_TABLES[name])) for name in self._tables}
+        checksums = {}
+        for name, content in contents.items():
+            file = self._file(name, tile)
+            try:
+                self.folder.write_bytes(file, content)
+            except FileNotFoundError:
+                self.folder.make(file.rpartition("/")[0])
+                self.folder.write_bytes(file, content)
+            checksums[file] = checksum(content)
+        return checksums
+
+    def _shard(self, array: np.ndarray, width: int) -> bytes:
+        """Encode an array ``(..., rows, columns)`` as zarr's codec ``sharding_indexed`` does, in chunks of whole rows.
+
+        zarr itself takes some ms for each file, which is more than matching a small tile.
+        """
+        together = math.gcd(self.grid.size, _ROWS_TOGETHER)
+        chunks, index, place = [], [], 0
+        for row in range(0, self.grid.size, together):
+            rows = array[..., row : row + together, :]
+            more = [(0, 0)] * (array.ndim - 2) + [(0, together - rows.shape[-2]), (0, width - array.shape[-1])]
+            chunks.append(_compressed(np.pad(rows, more)))
+            index += [place, len(chunks[-1])]
+            place += len(chunks[-1])
+        table = struct.pack(f"<{len(index)}Q", *index)
+        return b"".join([*chunks, table, struct.pack("<I", google_crc32c.value(table))])
 
     def drop(self, tile: Tile) -> None:
         """Delete the files of a tile."""
@@ -198,7 +230,9 @@ def _planes(levels: int) -> dict[str, dict[str, type[np.generic]]]:
 
 
 @lru_cache(maxsize=16)
-def _descriptions(grid: Grid, count: int, ambiguities: int, levels: int) -> tuple[dict[str, str], dict[str, Any]]:
+def _descriptions(
+    grid: Grid, count: int, ambiguities: int, levels: int, has_seams: bool
+) -> tuple[dict[str, str], dict[str, Any]]:
     """Return the metadata of the group and arrays as texts by file name, and as objects by array name."""
     texts: dict[str, Any] = {}
     group = zarr.create_group(MemoryStore(texts), zarr_format=3, attributes=MADE_BY)
@@ -229,8 +263,9 @@ def _descriptions(grid: Grid, count: int, ambiguities: int, levels: int) -> tupl
         )
     describe(_RIGHT, (height, grid.columns * reach), (size, reach), (together, reach), np.uint32, _UNSEEN)
     lines, counts = (len(SIDES), 2, 5 if levels == 2 else 3, size), ambiguities + 1
-    describe("seams", (grid.rows, grid.columns, *lines), None, (1, 1, *lines), np.int16, NO_DISPARITY)
-    describe("histogram", (grid.rows, grid.columns, counts), None, (1, 1, counts), np.uint32)
+    if has_seams:
+        describe("seams", (grid.rows, grid.columns, *lines), None, (1, 1, *lines), _TABLES["seams"], NO_DISPARITY)
+    describe("histogram", (grid.rows, grid.columns, counts), None, (1, 1, counts), _TABLES["histogram"])
     return {name: text.to_bytes().decode() for name, text in texts.items()}, metadata
 
 
@@ -239,27 +274,15 @@ def _reach(grid: Grid, count: int) -> int:
     return grid.size + count - 1
 
 
+def _compressed(chunk: np.ndarray) -> bytes:
+    """Compress a chunk as ``_COMPRESSOR`` does."""
+    chunk = np.ascontiguousarray(chunk)
+    return bytes(blosc.compress(chunk, b"lz4", 1, blosc.SHUFFLE, 0, chunk.itemsize))
+
+
 def checksum(content: bytes | memoryview) -> list[int]:
     """Return size in bytes and CRC-32 of a file."""
     return [len(content), zlib.crc32(content)]
-
-
-class _WrittenStore(WrapperStore[Store]):
-    """A zarr store that records checksums of written files and hides existing ones.
-
-    Otherwise zarr would merge an existing file, even a damaged one, into what it writes.
-    """
-
-    def __init__(self, store: Store) -> None:
-        super().__init__(store)
-        self.checksums: dict[str, list[int]] = {}
-
-    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        return None
-
-    async def set(self, key: str, value: Buffer) -> None:
-        self.checksums[key] = await asyncio.to_thread(checksum, value.to_bytes())
-        await self._store.set(key, value)
 
 
 class _CheckedStore(WrapperStore[Store]):

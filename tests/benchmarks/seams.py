@@ -1,25 +1,21 @@
-"""Exact seams against overlaps: processor time of the command, and idle workers of a cluster.
+"""Exact seams against overlaps: processor time and memory of the command, and lost time of a cluster.
 
 Run as ``python tests/benchmarks/seams.py``; it takes about five minutes. Prints the tables of docs/speed.md.
 """
 
-import heapq
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections import deque
-from itertools import count
 from pathlib import Path
 
 from candidates import search_range
 
 from sat_intervals.demo import make_scene
 from sat_intervals.raster import north_up, write_layer
-from sat_intervals.run.schedule import Schedule
+from sat_intervals.run.schedule import time_of
 from sat_intervals.tiling import Grid, Window
 
 SIDE, COUNT, RUNS = 4000, 64, 3
@@ -37,56 +33,43 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         runs = measured(Path(folder))
     base = statistics.median(runs["overlap 100"][0])
-    print(f"| {SIDE} x {SIDE} x {COUNT}, one core | processor time | relative |\n|---|---|---|")
-    for name, (seconds, _) in runs.items():
-        print(f"| {name} | {statistics.median(seconds):.1f} s | {statistics.median(seconds) / base:.2f} |")
-    stages, tiles = runs["exact"][1]["seconds"], (-(-SIDE // 1024)) ** 2
+    print(f"| {SIDE} x {SIDE} x {COUNT}, one core | processor time | relative | peak memory |\n|---|---|---|---|")
+    for name, (seconds, memory, _) in runs.items():
+        time = statistics.median(seconds)
+        print(f"| {name} | {time:.1f} s | {time / base:.2f} | {max(memory) / 1e3:.0f} MB |")
+    stages, tiles = runs["exact"][2]["seconds"], (-(-SIDE // 1024)) ** 2
     match = sum(stages[f"tiles.{stage}"] for stage in ("read", "match", "write")) / tiles
     trace = stages["tiles.trace"] / (3 * (tiles - 1))
     grid = Grid(Window(0, 0, 40 * 1024, 40 * 1024), 1024)
-    print(f"\nTracing takes {trace:.3f} s, matching {match:.3f} s.\n\n| workers | idle time |\n|---|---|")
+    print(f"\nTracing takes {trace:.3f} s, matching {match:.3f} s.\n\n| workers | lost time |\n|---|---|")
     for workers in (1, 8, 64):
         print(f"| {workers} | {100 * idle(grid, workers, trace, match):.1f} % |")
 
 
 def measured(folder):
-    """Processor seconds of the command and the last run.json, by setting; runs alternate."""
+    """Processor seconds and peak memory in kB of the command, and the last run.json, by setting; runs alternate."""
     scene, place = make_scene(SIDE, SIDE, seed=1), north_up(32633, 0, 0, 0.5)
     for name in ("left", "right"):
         write_layer(folder / f"{name}.tif", getattr(scene, name), 0, place)
     images = [str(folder / f"{name}.tif") for name in ("left", "right")]
     search = [str(end) for end in search_range(COUNT)]
-    found = {name: ([], None) for name in SETTINGS}
+    found = {name: ([], [], None) for name in SETTINGS}
     for _ in range(RUNS):
         for name, options in SETTINGS.items():
-            before = resource.getrusage(resource.RUSAGE_CHILDREN)
             command = [Path(sys.executable).with_name("sat-intervals"), "match", *images, folder / "out"]
             command += ["--overwrite", "--quiet", "--workers", "1", "--disparity", *search, *options]
-            subprocess.run(
-                command,
-                check=True,
-                preexec_fn=lambda: os.sched_setaffinity(0, {0}),
-            )
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            found[name][0].append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-            found[name] = found[name][0], json.loads((folder / "out" / "run.json").read_text())
+            process = subprocess.Popen(command, preexec_fn=lambda: os.sched_setaffinity(0, {0}))
+            _, status, used = os.wait4(process.pid, 0)
+            assert status == 0
+            seconds, memory, _ = found[name]
+            report = json.loads((folder / "out" / "run.json").read_text())
+            found[name] = [*seconds, used.ru_utime + used.ru_stime], [*memory, used.ru_maxrss], report
     return found
 
 
 def idle(grid, workers, trace, match):
-    """Share of the workers' time without work; as in a run, two steps per worker are submitted."""
-    schedule, now, busy = Schedule(grid, grid, set().__contains__), 0.0, 0.0
-    queue, running, number = deque(), [], count()
-    while schedule:
-        while len(queue) + len(running) < 2 * workers and (step := schedule.next()) is not None:
-            queue.append(step)
-        while queue and len(running) < workers:
-            seconds = match if queue[0].wavefront is None else trace
-            busy += seconds
-            heapq.heappush(running, (now + seconds, next(number), queue.popleft()))
-        now, _, step = heapq.heappop(running)
-        schedule.ended(step)
-    return 1 - busy / (workers * now)
+    """Share of the workers' time without work that one worker would do."""
+    return 1 - time_of(grid, 1, trace, match) / (workers * time_of(grid, workers, trace, match))
 
 
 if __name__ == "__main__":

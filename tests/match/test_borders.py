@@ -1,14 +1,24 @@
 """With exact seams any tiling gives the result of the whole image, byte for byte."""
 
+import itertools
 import shutil
+import tempfile
+from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
-from helpers import hashes, write_pair
+from helpers import PLACE, hashes, write_pair
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sat_intervals import RunError, Window, match_pair
+from sat_intervals import RunError, SatIntervalsError, Window, match_pair
 from sat_intervals.demo import make_scene
+from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
+from sat_intervals.run import schedule
+from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.tiles import Store
 
 SETTINGS = {
     "satellite": {"preset": "satellite"},
@@ -67,40 +77,99 @@ def test_match_pair__of_exact_tiles_of_a_window_equals_one_tile(folder, tmp_path
     assert hashes(tmp_path / "64") == hashes(tmp_path / "1024")
 
 
+@pytest.mark.parametrize("method", ["fast", "accurate"])
+def test_match_pair__of_blocks_of_exact_tiles_equals_the_whole(folder, tmp_path, monkeypatch, method):
+    monkeypatch.setattr(schedule, "_BLOCKS", 1)  # of 2 x 2 tiles, at the ends of 1 x 2, 2 x 1 and 1 x 1
+    for size in (64, 1024):
+        match(folder, tmp_path / str(size), size, {"cross_check": {"method": method}})
+    assert hashes(tmp_path / "64") == hashes(tmp_path / "1024")
+
+
+def test_match_pair__resumes_inside_a_block(folder, whole, tmp_path, monkeypatch):
+    def write_record(store, tile, record):
+        if tile.name == "1_0":
+            raise RunError("killed inside a block")
+        return original(store, tile, record)
+
+    original = Store.write_record
+    monkeypatch.setattr(schedule, "_BLOCKS", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write_record", write_record)
+        with pytest.raises(RunError, match=r"tiles failed(.|\n)*tile 1_1: killed inside a block"):
+            match(folder, tmp_path / "out", 64, {"cluster": {"retries": 0}})
+    match(folder, tmp_path / "out", 64, {"cluster": {"retries": 0}})
+    assert hashes(tmp_path / "out") == hashes(whole)
+
+
+def test_match_pair__names_the_wavefront_that_cannot_be_traced(folder, tmp_path, monkeypatch):
+    def fail(job, block, wavefront):
+        raise RunError("no reason")
+
+    monkeypatch.setattr(run, "trace_block", fail)
+    with pytest.raises(RunError, match="tile 0_0: tracing its path states, wavefront 0: no reason"):
+        match(folder, tmp_path / "out", 64, {})
+
+
 def flip(files):
     for file in files:
         file.write_bytes(file.read_bytes()[:-1] + b"x")
 
 
 def exchange(files):
-    if len(files) > 1:  # else one was found to be damaged, and removed
-        first, second = sorted(files)  # of the same shape
-        content = first.read_bytes()
-        first.write_bytes(second.read_bytes())
-        second.write_bytes(content)
+    first, second, *_ = sorted(files)  # of the same shape
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
 
 
 DAMAGES = {
-    "short": lambda files: [file.write_bytes(b"short") for file in files],
+    "missing": lambda files: [file.unlink() for file in files],
+    "empty": lambda files: [file.write_bytes(b"") for file in files],
+    "short": lambda files: [file.write_bytes(file.read_bytes()[:-1]) for file in files],
     "flipped": flip,
     "exchanged": exchange,
 }
 
 
-@pytest.mark.parametrize("how", DAMAGES)
-def test_match_pair__computes_damaged_path_states_again(folder, whole, tmp_path, monkeypatch, how):
-    def damage_and_match(job, tile):
-        DAMAGES[how](list((tmp_path / "out" / "tiles" / "borders").glob("1_[01]_0")))
-        return match_tile(job, tile)
+def damage_once(monkeypatch, names, how):
+    """Damage files of a store as soon as all are there when a tile is about to be matched."""
 
-    match_tile = run.match_tile
+    def damage_and_match(job, block):
+        files, done = [job.store.home / name for name in names], job.store.home.with_name("damaged")
+        if not done.exists() and all(file.exists() for file in files):
+            done.touch()
+            DAMAGES[how](files)
+        return match_block(job, block)
+
+    match_block = run.match_block
+    monkeypatch.setattr(run, "match_block", damage_and_match)
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_match_pair__traces_damaged_path_states_again(folder, whole, tmp_path, monkeypatch, how):
+    damage_once(monkeypatch, ["borders/1_0_0", "borders/1_1_0", "borders/1_1_1"], how)
+    match(folder, tmp_path / "out", 64, {"cluster": {"workers": 1}})
+    assert hashes(tmp_path / "out") == hashes(whole)
+    assert (tmp_path / "out" / "damaged").exists()
+
+
+def test_match_pair__that_resumes_traces_damaged_path_states_again(folder, whole, tmp_path, monkeypatch):
+    def end(job, block):
+        raise RunError("before the first tile")
+
     with monkeypatch.context() as patch:
-        patch.setattr(run, "match_tile", damage_and_match)
-        with pytest.raises(RunError, match="missing or damaged: rerun the same command: it resumes"):
+        patch.setattr(run, "match_block", end)
+        with pytest.raises(RunError, match="before the first tile"):
             match(folder, tmp_path / "out", 64, {})
+    flip(list((tmp_path / "out" / "tiles" / "borders").glob("*_[02]")))
     match(folder, tmp_path / "out", 64, {})
     assert hashes(tmp_path / "out") == hashes(whole)
-    assert not (tmp_path / "out" / "tiles").exists()
+
+
+def test_match_pair__needs_space_for_path_states_before_it_starts(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(LocalFolder, "free_bytes", lambda folder: 10**5)
+    with pytest.raises(SatIntervalsError, match=r"has 0\.1 MB free, path states and matching costs need 0\.4 MB"):
+        match(folder, tmp_path / "out", 64, {})
 
 
 def test_match_pair__takes_no_path_states_of_another_run(folder, whole, tmp_path, monkeypatch):
@@ -109,7 +178,7 @@ def test_match_pair__takes_no_path_states_of_another_run(folder, whole, tmp_path
 
     borders = tmp_path / "out" / "tiles" / "borders"
     with monkeypatch.context() as patch:
-        patch.setattr(run, "match_tile", end)
+        patch.setattr(run, "match_block", end)
         for settings in ({"sgm": {"p2": 30}}, {}):
             if borders.exists():
                 shutil.move(tmp_path / "out", tmp_path / "other")
@@ -124,8 +193,7 @@ def test_match_pair__takes_no_path_states_of_another_run(folder, whole, tmp_path
 @pytest.mark.peer("onnxruntime", "mc_cnn")
 @pytest.mark.parametrize(
     ("preset", "method"),
-    [(preset, method) for preset in ("paper", "satellite") for method in ("fast", "accurate")]
-    + [("mccnn", "fast"), ("satellite-mccnn", "accurate")],
+    list(itertools.product(("paper", "satellite", "mccnn", "satellite-mccnn"), ("fast", "accurate"))),
 )
 def test_match_pair__of_exact_tiles_equals_the_whole_on_a_real_pair(shared_data, tmp_path, preset, method):
     settings = {
@@ -138,3 +206,39 @@ def test_match_pair__of_exact_tiles_equals_the_whole_on_a_real_pair(shared_data,
         more = {"tiles": {"size": size}, "cluster": {"workers": workers}}
         match_pair(*files, tmp_path / str(size), settings | more, window=Window(300, 400, 150, 240))
     assert hashes(tmp_path / "64") == hashes(tmp_path / "128") == hashes(tmp_path / "256")
+
+
+@pytest.mark.peer("onnxruntime", "mc_cnn")
+@pytest.mark.parametrize("how", DAMAGES)
+def test_match_pair__computes_damaged_costs_again(folder, tmp_path, monkeypatch, how):
+    settings = {"preset": "mccnn", "cross_check": {"method": "accurate"}, "cluster": {"workers": 1}}
+    with monkeypatch.context() as patch:
+        damage_once(patch, ["costs/0_0", "costs/0_1"], how)
+        match(folder, tmp_path / "out", 64, settings)
+    match(folder, tmp_path / "whole", 1024, settings)
+    assert (tmp_path / "out" / "damaged").exists()
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "whole")
+
+
+@given(random=st.randoms(use_true_random=False))
+@hypothesis.settings(max_examples=4, deadline=None)
+def test_match_pair__of_exact_tiles_equals_the_whole_on_random_pairs(random):
+    rows, columns, seed = random.randint(65, 190), random.randint(65, 190), random.randint(0, 2**32)
+    p1 = random.randint(1, 40)
+    search = random.randint(-20, 5)
+    settings = {
+        "cost": {"window": random.choice([3, 5, 7])},
+        "sgm": {"p1": p1, "p2": random.randint(p1 + 1, 400)},
+        "disparity": {"minimum": search, "maximum": search + random.randint(1, 40)},
+        "cross_check": {"method": random.choice(["fast", "accurate"])},
+    }
+    noise = np.random.default_rng(seed)
+    left = noise.integers(1, 255, (rows, columns), np.uint8)
+    right = np.roll(left, -search, 1) + noise.integers(0, 3, left.shape, np.uint8)
+    left[noise.random(left.shape) < 0.01] = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for name, image in (("left", left), ("right", right)):
+            write_layer(Path(folder) / f"{name}.tif", image, 0, PLACE)
+        for size in (64, 256):
+            match(Path(folder), Path(folder) / str(size), size, settings)
+        assert hashes(Path(folder) / "64") == hashes(Path(folder) / "256")

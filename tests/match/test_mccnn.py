@@ -26,7 +26,7 @@ from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.results import open_results
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
-from sat_intervals.run.tile import match_tile
+from sat_intervals.run.tile import match_block
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.tiling import Window
 
@@ -373,7 +373,7 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     job.store.write_normalization(PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 80.0)).report())
     write_network(file, random_weights(seed=1))
     with pytest.raises(SatIntervalsError, match=r"network\.onnx differs in sha256 from .* of the run"):
-        match_tile(job, next(iter(job.store.grid)))
+        match_block(job, next(iter(job.store.grid)))
 
 
 @pytest.mark.parametrize("name", ["int8", "fp32"])

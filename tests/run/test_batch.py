@@ -29,7 +29,7 @@ from sat_intervals.run.cluster import connected, parse_memory
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
-from sat_intervals.run.tile import match_tile
+from sat_intervals.run.tile import match_block
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import mark_finished
 
@@ -320,7 +320,7 @@ def test_match_jobs__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(
     def progress(stage, done, total):
         if done == 3:  # as one that outlived the run before
             for tile in jobs[1].waiting()[-4:]:
-                match_tile(jobs[1], tile)
+                match_block(jobs[1], tile)
 
     with connected(Cluster(workers=1), tmp_path) as client:
         for job, failures, _ in match_jobs(client, jobs, progress):

@@ -19,7 +19,7 @@ from sat_intervals.run import pair as run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
-from sat_intervals.run.tile import match_tile
+from sat_intervals.run.tile import match_block
 from sat_intervals.store.tiles import DamagedTilesError, Store
 
 SHARDS = ["arrays.zarr/int16/c/0/1/0", "arrays.zarr/uint32/c/0/1/0", "arrays.zarr/right/c/1/0"]
@@ -125,13 +125,13 @@ def test_match__heals_what_is_damaged_before_it_is_assembled(scene, tmp_path, mo
     log.touch()
 
     def and_damage(job, tile):
-        match_tile(job, tile)
+        match_block(job, tile)
         if tile.name == "1_0" and tile.name not in log.read_text():
             damage(job.store.home / name, "bit")
         with log.open("a") as file:
             print(tile.name, file=file)
 
-    monkeypatch.setattr(run, "match_tile", and_damage)
+    monkeypatch.setattr(run, "match_block", and_damage)
     said = match(scene, tmp_path / "out")
     assert f"tiles 1_0 in {tmp_path}/out/tiles are damaged" in said
     assert sorted(log.read_text().split()) == ["0_0", "0_1", "0_2", "1_0", "1_0", "1_1", "1_2"]
@@ -140,12 +140,12 @@ def test_match__heals_what_is_damaged_before_it_is_assembled(scene, tmp_path, mo
 
 def test_match__ends_where_a_disk_damages_all_files_written(scene, tmp_path, monkeypatch):
     def and_damage(job, tile):
-        match_tile(job, tile)
+        match_block(job, tile)
         damage(job.store.home / f"arrays.zarr/uint32/c/0/{tile.grid_row}/{tile.grid_column}", "bit")
 
     settings = yaml.safe_load((scene / "settings.yaml").read_text())
     with monkeypatch.context() as patch:
-        patch.setattr(run, "match_tile", and_damage)
+        patch.setattr(run, "match_block", and_damage)
         with pytest.raises(
             RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged: rerun the same command: it matches them"
         ):

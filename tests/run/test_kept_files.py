@@ -39,7 +39,7 @@ from sat_intervals.run import assemble
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
-from sat_intervals.run.tile import match_tile
+from sat_intervals.run.tile import match_block
 from sat_intervals.show.maps import draw_overview
 from sat_intervals.show.report import write_report
 from sat_intervals.store.folder import LocalFolder
@@ -193,7 +193,7 @@ def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
     (folder / "left.tif").unlink()
     monkeypatch.setattr("sat_intervals.run.tile.cost_areas", None)
     with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed"):
-        match_tile(job, next(iter(job.store.grid)))
+        match_block(job, next(iter(job.store.grid)))
 
 
 # Inputs among the outputs

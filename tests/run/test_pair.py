@@ -24,7 +24,7 @@ from sat_intervals.run import pair as run
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import prepare
 from sat_intervals.run.output import is_complete
-from sat_intervals.run.tile import match_tile
+from sat_intervals.run.tile import match_block
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import digest
 from sat_intervals.tiling import Window
@@ -218,9 +218,9 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
             print(tile.name, file=file)
         if tile.name == "1_2" and log.read_text().split().count("1_2") <= 3:
             raise OSError("disk gone")
-        return match_tile(job, tile)
+        return match_block(job, tile)
 
-    monkeypatch.setattr(run, "match_tile", fail_once)
+    monkeypatch.setattr(run, "match_block", fail_once)
     with pytest.raises(RunError, match=r"1 of 12 tiles failed.*\n.*tile 1_2: disk gone"):
         match_pair(left, right, tmp_path / "out", settings)
     assert not list((tmp_path / "out").glob("*.*"))
@@ -253,11 +253,11 @@ def test_match_pair__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(p
     def fail(job, tile):
         if tile.name == "1_2":
             raise OSError("disk gone")
-        return match_tile(job, tile)
+        return match_block(job, tile)
 
     for settings in (old, new):
         with monkeypatch.context() as patch:
-            patch.setattr(run, "match_tile", fail)
+            patch.setattr(run, "match_block", fail)
             with pytest.raises(RunError, match="tile 1_2: disk gone"):
                 match_pair(left, right, out, settings, overwrite=True)
         assert {name: (out / name).read_bytes() for name in before} == before
@@ -340,16 +340,16 @@ def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_p
     before = prepare(left, right, tmp_path, in_tiles(settings, 128))
     before.begin()
     tile = next(iter(before.store.grid))
-    match_tile(before, tile)
+    match_block(before, tile)
     now = prepare(left, right, tmp_path, in_tiles(settings, 128, sgm={"p1": 7, "p2": 32}))
     now.begin(overwrite=True)
     with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: settings\.sgm\.p1 was 7, now 8"):
-        match_tile(before, tile)
+        match_block(before, tile)
     assert now.store.done() == set()
     assert not list((tmp_path / "tiles" / "arrays.zarr" / "int16").glob("c/*/*/*"))
     now.store.remove()
     with pytest.raises(RunError, match=r"the tiles in .*tiles are gone"):
-        match_tile(before, tile)
+        match_block(before, tile)
     assert not (tmp_path / "tiles" / "arrays.zarr").exists()
 
 

@@ -2,8 +2,9 @@
 
 import pytest
 
+from sat_intervals.config import load_config
 from sat_intervals.kernels.sgm import LAST
-from sat_intervals.run.schedule import Schedule, Step, needs
+from sat_intervals.run.schedule import Schedule, Step, blocks_of, needs, time_of
 from sat_intervals.tiling import Grid, Window
 
 GRID = Grid(Window(10, 20, 4 * 64, 5 * 64 - 7), 64)
@@ -37,14 +38,12 @@ def test_schedule__draws_the_order_of_a_grid():
 
 
 def test_schedule__of_one_worker_leaves_the_last_wavefront_to_the_tiles():
-    schedule, done = Schedule(GRID, GRID, set().__contains__, views=2), []
+    schedule, done = Schedule(GRID, GRID, set().__contains__), []
     while (step := schedule.next()) is not None:
         done.append(step)
         schedule.ended(step)
     assert [step.wavefront for step in done].count(None) == 20
-    assert {(step.wavefront, step.mirrored) for step in done if step.wavefront is not None} == {
-        (wavefront, mirrored) for wavefront in range(3) for mirrored in (False, True)
-    }
+    assert {step.wavefront for step in done} == {None, 0, 1, 2}
 
 
 @pytest.mark.parametrize("borders", [set(), {"0_0_0", "1_1_2"}])
@@ -53,11 +52,11 @@ def test_schedule__comes_after_what_it_needs_and_does_nothing_twice(borders):
     for steps in in_turn(Schedule(GRID, GRID, borders.__contains__)):
         for step in steps:
             for other in needs(GRID, step):
-                is_given = other.wavefront == LAST and Step(other.tile) in done
+                is_given = other.wavefront == LAST and Step(other.block) in done
                 assert is_given or other in done or other.name in borders
         done += steps
     assert len(done) == len(set(done))
-    assert {step.tile for step in done if step.wavefront is None} == set(GRID)
+    assert {step.block for step in done if step.wavefront is None} == set(GRID)
     assert not borders & {step.name for step in done}
 
 
@@ -87,6 +86,67 @@ def test_schedule__traces_what_a_failed_tile_would_have_given():
         else:
             schedule.ended(step)
             done.add(step)
-    assert Step(failed.tile, LAST) in done
-    assert {step.tile for step in done if step.wavefront is None} == set(GRID) - {failed.tile}
+    assert Step(failed.block, LAST) in done
+    assert {step.block for step in done if step.wavefront is None} == set(GRID) - {failed.block}
     assert not schedule
+
+
+@pytest.mark.parametrize("block_fails", [False, True])
+def test_schedule__takes_from_a_block_under_way_what_cannot_be_traced(block_fails):
+    schedule, under_way = Schedule(GRID, GRID, set().__contains__), []
+    while (step := schedule.next()) is None or step.wavefront != LAST:
+        if step is None:
+            schedule.ended(under_way.pop(0))
+        elif step.wavefront is None:
+            under_way.append(step)
+        else:
+            schedule.ended(step)
+    last, block, others = step, Step(step.block), []
+    while (step := schedule.next()) != block:
+        others.append(step)
+    assert not schedule.failed(last)  # its block gives it
+    if block_fails:
+        assert schedule.failed(block)
+    else:
+        schedule.ended(block)
+    for step in under_way + others:
+        schedule.ended(step)
+    traced = []
+    while (step := schedule.next()) is not None:
+        traced.append(step)
+        schedule.ended(step)
+    assert (last in traced) == block_fails
+    assert not schedule
+
+
+def test_schedule__of_blocks_traces_inside_each():
+    turns = list(in_turn(Schedule(GRID, GRID, set().__contains__, together=2)))
+    traced = [step for steps in turns for step in steps if step.wavefront in (0, 1, 2)]
+    assert len(traced) == len(set(traced)) == 3 * len(GRID)
+
+
+@pytest.mark.parametrize(
+    ("tiles", "size", "settings", "block"),
+    [
+        ((16, 16), 256, {}, 1024),
+        ((8, 16), 256, {}, 512),
+        ((3, 16), 256, {}, 256),
+        ((40, 40), 64, {}, 128),
+        ((40, 40), 1024, {}, 1024),
+        ((16, 16), 256, {"tiles": {"overlap": 100}}, 256),
+        ((16, 16), 256, {"preset": "satellite-mccnn"}, 256),
+    ],
+)
+def test_blocks_of__are_as_large_as_a_default_tile_and_at_least_four_along_a_side(tiles, size, settings, block):
+    grid = Grid(Window(3, 5, tiles[0] * size, tiles[1] * size - 1), size)
+    blocks = blocks_of(grid, load_config({"disparity": {"minimum": 0, "maximum": 9}} | settings))
+    assert (blocks.size, blocks.region) == (block, grid.region)
+    inside = [tile for there in blocks for tile in grid.within(there.core)]
+    assert len(inside) == len(set(inside)) == len(grid)
+
+
+def test_time_of__is_that_of_all_steps_for_one_worker_and_of_the_longest_chain_for_many():
+    assert time_of(GRID, 1, 1.0, 4.0) == 4 * 20 + 3 * 19
+    assert time_of(GRID, 1000, 1.0, 4.0) >= 7 + 4
+    assert time_of(GRID, 1, 1.0, 4.0) > time_of(GRID, 4, 1.0, 4.0) > time_of(GRID, 1, 1.0, 4.0) / 4
+    assert time_of(GRID, 4, 0.0, 4.0) == 20

@@ -15,6 +15,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
+from sat_intervals.run import schedule
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.run.pair import prepare
 from sat_intervals.show.report.contents import Pixels
@@ -76,14 +77,16 @@ OF_MCCNN = pytest.param({"preset": "satellite-mccnn"}, marks=pytest.mark.peer("o
 
 
 @pytest.mark.parametrize("settings", [{}, {"interval": {"coverage": 0.9}}, OF_MCCNN])
-def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path, settings):
-    reports = []
-    for size in (64, 512):
+def test_match_pair__local_ranges_give_the_same_in_any_tiling(folder, tmp_path, monkeypatch, settings):
+    names = "tiles", "blocks", "whole"
+    for name, size, blocks in zip(names, (64, 64, 512), (4, 1, 4), strict=True):
+        monkeypatch.setattr(schedule, "_BLOCKS", blocks)
         tiles = {"size": size, "overlap": "exact"}
-        reports.append(run(folder, tmp_path / str(size), disparity={"local": True}, tiles=tiles, **settings))
-    assert reports[0]["local_ranges"]["share"] < 0.95
-    for one, other in zip(bands(tmp_path / "64"), bands(tmp_path / "512"), strict=True):
-        np.testing.assert_array_equal(one, other)
+        report = run(folder, tmp_path / name, disparity={"local": True}, tiles=tiles, **settings)
+        assert report["local_ranges"]["share"] < 0.95
+    for tiled, in_blocks, whole in zip(*(bands(tmp_path / name) for name in names), strict=True):
+        np.testing.assert_array_equal(tiled, whole)
+        np.testing.assert_array_equal(in_blocks, whole)
 
 
 def write_bands(file, low, high):

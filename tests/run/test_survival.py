@@ -369,7 +369,7 @@ def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tm
             started(uneven, out, "--cluster", address, "--log-file", str(log)) as command,
         ):
             assert command.end() == 1, command.output
-            alone = r"match_tile of \(0, Step\(tile=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
+            alone = r"match_block of \(0, Step\(tile=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
             assert re.search(alone, log.read_text())
             assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
             assert "give workers more memory, or choose smaller tiles" in command.output
@@ -424,14 +424,14 @@ def test_match__refuses_a_folder_where_another_run_is_at_work(pair, tmp_path):
 
 
 def test_match_jobs__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_path, monkeypatch):
-    def record_only(job, tile):
-        job.store.write_record(tile, {})
+    def record_only(job, block):
+        job.store.write_record(block, {})
 
-    monkeypatch.setattr(run, "match_tile", record_only)
-    monkeypatch.setattr(run, "trace_tile", lambda *step: {})
+    monkeypatch.setattr(run, "match_block", record_only)
+    monkeypatch.setattr(run, "trace_block", lambda *step: {})
     futures, known = [], []
     image = tmp_path / "wide.tif"
-    write_layer(image, np.ones((64 * 20, 64 * 25), np.uint16), 0, PLACE)
+    write_layer(image, np.ones((64 * 40, 64 * 50), np.uint16), 0, PLACE)
     job = prepare(image, image, tmp_path / "out", yaml.safe_load((pair / "settings.yaml").read_text()))
     with LocalFolder(job.store.home).locked():
         job.begin()
@@ -448,6 +448,6 @@ def test_match_jobs__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_
 
             for matched in run.match_jobs(client, [job], progress):
                 assert not matched.failures
-    assert len(futures) >= 1 + 500 + 3 * 499  # tiles and three wavefronts, one before the first ends
+    assert len(futures) >= 1 + 500 + 3 * 500  # blocks of 2 x 2 tiles and three wavefronts, one before the first ends
     assert max(futures) <= 6  # two a core, and those that are just being released
     assert max(known) <= 12
