@@ -18,7 +18,9 @@ from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.tiling import Window
 
 # Side of a tile in pixels, fewer for fine references: at most this many cells of the reference below its pixels.
-_TILE, _LEAST, _CELLS = 256, 32, 2048
+_TILE, _LEAST, _CELLS = 256, 32, 1024
+# Tiles at once: their windows of a fine reference are most of the memory.
+_THREADS = 3
 # Degrees: a pixel on a steeper patch between four heights has no disparity, as the place of a wall is known to a cell.
 _STEEPEST = 70.0
 # Cells around a window of the reference, for interpolation and the curvature of lines of sight.
@@ -77,7 +79,7 @@ class RasterSight:
         side = int(_CELLS * self._raster.cell / pixel) // _LEAST * _LEAST
         side = min(_TILE, max(_LEAST, side))
         height, width = self._scene.region.height, self._scene.region.width
-        with ThreadPoolExecutor() as threads:
+        with ThreadPoolExecutor(_THREADS) as threads:
             for row in range(0, height, side):
                 window = Window(row, 0, min(side, height - row), width)
                 yield row, self._strip(threads, window, side)
