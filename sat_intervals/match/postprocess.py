@@ -234,6 +234,28 @@ def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config
         yield postprocess_rows(rows, first, last, scale, config)
 
 
+def postprocess_strip(
+    pieces: Iterable[RawRows], above: int, height: int, scale: ConfidenceScale, config: Config
+) -> Iterator[Bands]:
+    """Final bands of a strip of a region, the same in every bit as those of the whole region.
+
+    Parameters
+    ----------
+    pieces
+        Raw products from the top: the strip with `halo` rows above and below it, inside the region.
+    above, height
+        Rows above the strip, and rows of the strip.
+    scale, config
+        See `postprocess_rows`.
+    """
+    row = -above
+    for final in postprocess_strips(pieces, scale, config):
+        rows = len(final.validity)
+        if row + rows > 0 and row < height:
+            yield cut_rows(final, max(0, -row), min(rows, height - row))
+        row += rows
+
+
 def with_halo(strips: Iterable[Rows], margin: int) -> Iterator[tuple[Rows, int, int]]:
     """Add rows above and below to records of full-width rows, given strip by strip from the top.
 

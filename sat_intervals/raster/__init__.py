@@ -1,6 +1,7 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file, truth_file
+from sat_intervals.raster.cog import BLOCK, Copy, Part, codec_versions, compressed, factors
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.heightfield import HeightRaster
@@ -27,10 +28,12 @@ from sat_intervals.raster.windows import read_views, read_window
 from sat_intervals.raster.writer import OutputWriter, check_space, remove_scratch, restore
 
 __all__ = [
+    "BLOCK",
     "MARK",
     "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
+    "Copy",
     "File",
     "Frame",
     "Georeferencing",
@@ -39,12 +42,16 @@ __all__ = [
     "InputError",
     "OutputError",
     "OutputWriter",
+    "Part",
     "Projection",
     "Vertical",
     "check_marked",
     "check_pair",
     "check_reference",
     "check_space",
+    "codec_versions",
+    "compressed",
+    "factors",
     "is_marked",
     "is_surface",
     "north_up",
@@ -63,6 +70,7 @@ __all__ = [
     "remove_scratch",
     "resolution_of",
     "restore",
+    "run_files",
     "stamps",
     "surface_file",
     "truth_file",

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from distributed import Client
 
 from sat_intervals.config import Calibration, Config, Interval, key_of
 from sat_intervals.config.calibration import COVERAGES
@@ -32,10 +31,10 @@ from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image
 from sat_intervals.results import Layer
-from sat_intervals.run.assemble import STRIP_PIXELS, check_done, check_matched
-from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
+from sat_intervals.run.strips import STRIP_PIXELS, check_done, check_matched
+from sat_intervals.run.workers import Workers, connected
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
 
@@ -145,7 +144,7 @@ def _of_all(progress: Progress, number: int, total: int, *_: object) -> None:
 
 
 def _of_subject(
-    client: Client, subject: Subject, levels: np.ndarray, folder: Path, in_blocks: bool, progress: Progress
+    client: Workers, subject: Subject, levels: np.ndarray, folder: Path, in_blocks: bool, progress: Progress
 ) -> list[Measured]:
     """Match a subject, with two levels of the ladder at a time, and measure it."""
     gauge: _Gauge | None = None

@@ -64,6 +64,32 @@ def write_pair(folder, size):
     return paths
 
 
+# Prints the processor time of the command itself, without its workers, from the first strip on, and the bytes it wrote.
+CLIENT = """
+import json, sys, time
+from sat_intervals import match_pair
+def progress(stage, done, total):
+    if stage in ("bands", "files"):
+        marks.setdefault(stage, time.process_time())
+        marks["end"] = time.process_time()
+if __name__ == "__main__":
+    left, right, out, minimum, maximum = sys.argv[1:]
+    marks, search = {}, {"minimum": int(minimum), "maximum": int(maximum)}
+    settings = {"disparity": search, "cluster": {"kind": "processes", "workers": 2}}
+    report = match_pair(left, right, out, settings, overwrite=True, progress=progress)
+    print(json.dumps([marks["end"] - marks["bands"], sum(file["bytes"] for file in report["files"].values())]))
+"""
+
+
+def client(pair, folder):
+    """Processor time of the command while workers finish strips and copy them, and gigabytes written."""
+    (folder / "client.py").write_text(CLIENT)
+    ends = map(str, search_range(64))
+    command = [sys.executable, folder / "client.py", *pair, folder / "client", *ends]
+    seconds, written = json.loads(run([str(part) for part in command], CORES)[-1].splitlines()[-1])
+    return seconds, written / 1e9
+
+
 def match(pair, out, workers, disparities=64, environment=None, more=()):
     """Seconds, peak memory in MB, processor seconds and run.json of a whole `sat-intervals match`."""
     ends = map(str, search_range(disparities))
@@ -73,9 +99,10 @@ def match(pair, out, workers, disparities=64, environment=None, more=()):
     return *figures, json.loads((out / "run.json").read_text())
 
 
-def median_run(pair, out, workers, runs):
+def median_run(pair, out, workers, runs, more=()):
     """Return the result of `match` of the run with the median time."""
-    return sorted((match(pair, out, workers) for _ in range(runs)), key=lambda run: run[0])[runs // 2]
+    results = (match(pair, out, workers, more=more) for _ in range(runs))
+    return sorted(results, key=lambda run: run[0])[runs // 2]
 
 
 def row(*cells):
@@ -144,7 +171,10 @@ def file_to_file(folder):
         f"files {stages['files']:.1f} s, starting {starting:.1f} s",
     )
     row("what all but the kernels adds to them", f"{100 * (one[0] / kernels - 1):.0f} %")
-    row("rows, with reading and writing", f"{16 / stages['bands']:.0f} Mpx/s")
+    (folder / "none.yaml").write_text("products: {compression: none}\n")
+    plain = median_run(pairs[4000], folder / "out", 1, 3, ["--config", folder / "none.yaml"])
+    row("the same without compression", f"{100 * (plain[0] / plain[3]['seconds']['tiles.match'] - 1):.0f} %")
+    row("strips, with reading, compressing and writing", f"{16 / stages['bands']:.0f} Mpx/s")
     if len(CORES) > 1:
         two = median_run(pairs[4000], folder / "out", 2, 3)
         tiles = stages["tiles"] / two[3]["seconds"]["tiles"]
@@ -152,6 +182,9 @@ def file_to_file(folder):
     small, large = median_run(pairs[2000], folder / "out", 1, RUNS), median_run(pairs[8000], folder / "out", 1, 1)
     row("cost a pixel, 8000 x 8000 against 2000 x 2000", f"{large[0] / small[0] / 16:.2f}")
     row("peak memory, the same", f"{large[1] / small[1]:.2f} ({large[1]:.0f} and {small[1]:.0f} MB)")
+    if len(CORES) > 1:
+        seconds, written = client(pairs[8000], folder)
+        row("the command itself after its tiles, 8000 x 8000, two processes", f"{seconds:.2f} s for {written:.2f} GB")
 
 
 def with_coverage(folder):
