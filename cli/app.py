@@ -28,6 +28,7 @@ from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
 from sat_intervals.cli.project import project
 from sat_intervals.cli.range import search_range
+from sat_intervals.cli.reference import reference
 from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
@@ -46,7 +47,7 @@ STEPS: dict[str, tuple[click.Command, ...]] = {
     "Match": (match, batch, status),
     "Look": (plot, report, project),
     "Heights": (triangulate, dsm),
-    "Compare with a truth": (evaluate, calibrate, ablate),
+    "Compare with a truth": (reference, evaluate, calibrate, ablate),
     "Use elsewhere": (export, stac),
 }
 # Commands of every day, which the command without arguments shows.

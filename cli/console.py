@@ -25,6 +25,9 @@ STAGES = {
     "points": "triangulating rows",
     "extent": "reading points",
     "cells": "filling rows of cells",
+    "registration": "registering the reference",
+    "reference": "reading points",
+    "truth": "finding disparities of rows",
     "files": "writing files",
     "compared": "matching again, to compare",
 }

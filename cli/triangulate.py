@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, sensor_options
 
 # Metres between lines of sight above which models are suspect.
 _SUSPECT = 0.1
@@ -12,24 +12,11 @@ _SUSPECT = 0.1
 
 @click.command(short_help="Compute points and height bounds of a run with sensor models.")
 @click.argument("out", callback=path)
-@click.option("--left-model", required=True, callback=path, metavar="FILE", help="RPC model of the left sensor image.")
-@click.option(
-    "--right-model", required=True, callback=path, metavar="FILE", help="RPC model of the right sensor image."
-)
-@click.option("--left-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the left image.")
-@click.option("--right-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the right image.")
+@sensor_options
 @json_option
 @quiet_option
 @log_options
-def triangulate(
-    out: Path,
-    left_model: Path,
-    right_model: Path,
-    left_grid: Path,
-    right_grid: Path,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], as_json: bool, quiet: bool) -> None:
     """Triangulate the disparity and both bounds of the finished run in the folder OUT.
 
     \b
@@ -46,7 +33,7 @@ def triangulate(
     from sat_intervals.heights.triangulate import triangulate
 
     with Console(quiet or as_json) as console:
-        report = triangulate(out, left_model, right_model, left_grid, right_grid, progress=console.progress)
+        report = triangulate(out, *sensor_files, progress=console.progress)
     if as_json:
         say_json(report)
     elif report["points"]:

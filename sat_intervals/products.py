@@ -153,6 +153,9 @@ POINTS = (
     Band("latitude_upper", "degree", "of the point at height_upper"),
 )
 
+# The band of true disparities made from reference heights.
+TRUTH = (Band("disparity", "px", "of the reference height that the left sensor sees at the pixel's centre"),)
+
 # Bands of a surface model.
 SURFACE = (
     Band("height", "m", "mean of the points that reach the cell, the nearer the heavier"),

@@ -79,6 +79,10 @@ def test_code__cites_sections_that_exist() -> None:
     assert old == []
 
 
+# What three dots at the end of a command stand for.
+SENSORS = " --left-model left.geom --right-model right.geom --left-grid left_grid.tif --right-grid right_grid.tif"
+
+
 def blocks(document: Path, language: str) -> Iterator[str]:
     """Yield the code blocks of a document in a language."""
     found = re.findall(r"^```(\w*)\n(.*?)^```$", document.read_text(), re.MULTILINE | re.DOTALL)
@@ -91,7 +95,8 @@ def commands() -> list[tuple[str, str]]:
     for document in DOCUMENTS:
         for line in "".join(blocks(document, "")).splitlines():
             if line.removeprefix("$ ").startswith("sat-intervals "):
-                found.append((document.name, re.sub(r"\s+(#|>).*", "", line.removeprefix("$ "))))
+                line = re.sub(r"\s+(#|>).*", "", line.removeprefix("$ "))
+                found.append((document.name, re.sub(r" \.\.\.$", SENSORS, line)))
     return found
 
 
@@ -110,6 +115,9 @@ NOT_RUN = {
     "--tune": "tests/run/test_calibrate.py",
     "--cost mccnn": "tests/match/test_mccnn.py",
     "lidar.tif": "tests/evaluate/test_dsm.py: there are no heights of others for the demo scene",
+    "sat-intervals reference": "tests/heights/test_reference.py, likewise",
+    "--truth out/truth.tif": "tests/heights/test_reference.py, with the truth of reference",
+    "peer_dsm": "tests/heights/test_reference.py, on a real pair",
 }
 
 

@@ -1,9 +1,11 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
 from sat_intervals.raster.cog import BLOCK, Copy, Part, codec_versions, compressed, factors
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
 from sat_intervals.raster.footprint import footprint
+from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
+from sat_intervals.raster.heightfield import HeightRaster
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
 from sat_intervals.raster.layers import (
     MARK,
@@ -34,13 +36,16 @@ __all__ = [
     "ControlPoint",
     "Copy",
     "File",
+    "Frame",
     "Georeferencing",
+    "HeightRaster",
     "Image",
     "InputError",
     "OutputError",
     "OutputWriter",
     "Part",
     "Projection",
+    "Vertical",
     "check_marked",
     "check_pair",
     "check_reference",
@@ -71,6 +76,7 @@ __all__ = [
     "run_files",
     "stamps",
     "surface_file",
+    "truth_file",
     "utm_of",
     "whole_file",
     "write_layer",

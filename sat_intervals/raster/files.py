@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, Band
+from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, TRUTH, Band
 
 
 @dataclass(frozen=True)
@@ -52,3 +52,8 @@ def run_files(compression: str) -> tuple[File, File]:
 def surface_file(name: str) -> File:
     """Return the properties of a surface model's file."""
     return File(name, "float32", float("nan"), SURFACE)
+
+
+def truth_file(name: str) -> File:
+    """Return the properties of a file of true disparities."""
+    return File(name, "float32", float("nan"), TRUTH)
