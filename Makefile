@@ -13,7 +13,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lint bench bench-seams tune calibration coverage pictures clean
+.PHONY: demo test test-all lint bench bench-seams tune calibration coverage pictures docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -66,6 +66,22 @@ pictures: $(VENV)/.has-dsm,plot
 	$(BIN)/python docs/pictures/wavefronts.py demo-out/wavefronts.png
 	for name in overview profile dsm wavefronts; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
+# The documentation site, in site/; a warning is an error. Pictures of the gallery are made by running the commands.
+docs: $(VENV)/.has-docs,plot
+	$(BIN)/python docs/site.py
+
+# Wheel and sdist in dist/, checked; the wheel is installed and run in an empty environment.
+dist:
+	rm -rf dist
+	$(PYTHON) -m venv --clear build/tools
+	build/tools/bin/python -m pip install --quiet --disable-pip-version-check build cffconvert twine
+	build/tools/bin/python -m build
+	build/tools/bin/twine check --strict dist/*
+	build/tools/bin/cffconvert --validate
+	$(PYTHON) -m venv --clear build/wheel
+	build/wheel/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+	cd build && wheel/bin/sat-intervals demo demo --size 300 300 --overwrite
+
 # --no-compile saves time: Python compiles a module when it is first imported, and most never are.
 $(VENV)/.has-%: pyproject.toml $(VENV)/.made
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '.[$*]'
@@ -77,4 +93,4 @@ $(VENV)/.made:
 	touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info demo-out
+	rm -rf $(VENV) build dist site *.egg-info demo-out

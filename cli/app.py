@@ -8,6 +8,7 @@ import errno
 import gc
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, TextIO
 
@@ -25,11 +26,13 @@ from sat_intervals.cli.match import match
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
+from sat_intervals.cli.project import project
 from sat_intervals.cli.range import search_range
 from sat_intervals.cli.reference import reference
 from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
+from sat_intervals.cli.stac import stac
 from sat_intervals.cli.status import status
 from sat_intervals.cli.triangulate import triangulate
 
@@ -39,10 +42,24 @@ _ITEM = "\n  "
 READER_GONE = 141
 _NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
 RESUMED = ("match", "demo", "batch")
+STEPS: dict[str, tuple[click.Command, ...]] = {
+    "Try and prepare": (demo, search_range, plan, config),
+    "Match": (match, batch, status),
+    "Look": (plot, report, project),
+    "Heights": (triangulate, dsm),
+    "Compare with a truth": (reference, evaluate, calibrate, ablate),
+    "Use elsewhere": (export, stac),
+}
+# Commands of every day, which the command without arguments shows.
+_DAILY = (demo, match, status, report, project, triangulate, dsm, evaluate, export)
 
 
 class _Commands(click.Group):
     """Group of commands; turns every error into one line and an exit status."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write all commands, grouped by step."""
+        _write_steps(formatter, [command for commands in STEPS.values() for command in commands])
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         try:
@@ -93,6 +110,17 @@ class _Commands(click.Group):
             return _end(*_explained(error))
 
 
+def _write_steps(formatter: click.HelpFormatter, chosen: Sequence[click.Command]) -> None:
+    widest = max(len(command.name or "") for command in chosen)
+    for step, commands in STEPS.items():
+        rows = [
+            (f"{command.name:<{widest}}", command.get_short_help_str(90)) for command in commands if command in chosen
+        ]
+        if rows:
+            with formatter.section(step):
+                formatter.write_dl(rows)
+
+
 def _is_of_stdout(error: OSError) -> bool:
     """Return whether printing failed: the error has no file name and was raised by code that prints."""
     trace = error.__traceback__
@@ -138,25 +166,19 @@ def _end(status: int, message: str) -> None:
     raise click.exceptions.Exit(status)
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=_Commands, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="sat-intervals")
-def main() -> None:
+@click.pass_context
+def main(context: click.Context) -> None:
     """Match epipolar satellite images: a disparity for every pixel, with its interval."""
+    if context.invoked_subcommand is None:
+        formatter = context.make_formatter()
+        formatter.write_text(main.help or "")
+        _write_steps(formatter, _DAILY)
+        formatter.write_paragraph()
+        formatter.write_text("sat-intervals demo OUT tries everything; sat-intervals --help lists all commands.")
+        click.echo(formatter.getvalue().rstrip())
 
 
-main.add_command(match)
-main.add_command(config)
-main.add_command(demo)
-main.add_command(batch)
-main.add_command(search_range)
-main.add_command(plan)
-main.add_command(status)
-main.add_command(plot)
-main.add_command(report)
-main.add_command(evaluate)
-main.add_command(ablate)
-main.add_command(calibrate)
-main.add_command(triangulate)
-main.add_command(dsm)
-main.add_command(reference)
-main.add_command(export)
+for _command in (command for commands in STEPS.values() for command in commands):
+    main.add_command(_command)

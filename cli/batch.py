@@ -5,18 +5,20 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import check_strict, path, run_options, settings_options
+from sat_intervals.cli.options import check_strict, json_option, path, run_options, say_json, settings_options
 
 
 @click.command(short_help="Match many pairs; a rerun does what is missing.")
 @click.argument("pairs", callback=path)
 @click.argument("out", callback=path)
+@json_option
 @settings_options
 @run_options
 def batch(
     pairs: Path,
     out: Path,
     config_file: Path | None,
+    as_json: bool,
     given: dict[str, Any],
     keep_tiles: bool,
     overwrite: bool,
@@ -36,7 +38,7 @@ def batch(
 
     check_not_replaced([pairs, config_file], [out / REPORT])
     rows = read_batch(pairs)
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         report = match_batch(
             rows,
             out,
@@ -46,6 +48,8 @@ def batch(
             keep_tiles=keep_tiles,
             progress=console.progress,
         )
+    if as_json:
+        say_json(report)
     console.batch_summary(report)
     done = ("done", "done before")
     failed = {name: end.get("error", end["state"]) for name, end in report.items() if end["state"] not in done}

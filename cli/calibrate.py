@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import log_options, path, quiet_option, settings_options
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, settings_options
 from sat_intervals.cli.pairs import finite
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ _SETTINGS = """\
 @click.option(
     "--tune", is_flag=True, help="Compare presets and penalties; write the best as settings for match --config."
 )
+@json_option
 @settings_options
 @quiet_option
 @log_options
@@ -56,6 +57,7 @@ def calibrate(
     by_group: bool,
     name: str | None,
     tune: bool,
+    as_json: bool,
     config_file: Path | None,
     given: dict[str, Any],
     quiet: bool,
@@ -87,14 +89,16 @@ def calibrate(
     check_not_replaced([*inputs, config_file], [output])
     folder = _checked_folder(output)
     check_subjects(subjects)
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         if tune:
-            _tune(subjects, output, folder, name, console)
+            _tune(subjects, output, folder, name, console, as_json)
             return
         parts = measure_subjects(subjects, folder, console.progress)
     calibration, expected = calibration_from(parts, subjects, name or output.stem)
     write_calibration(output, calibration)
-    if not quiet:
+    if as_json:
+        say_json({"calibration": calibration.model_dump(mode="json"), "expected": expected})
+    elif not quiet:
         show_calibration(calibration, expected)
         click.echo(str(output))
 
@@ -202,7 +206,9 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
 
 
-def _tune(subjects: "list[Subject]", output: Path, folder: Path, name: str | None, console: "Console") -> None:
+def _tune(
+    subjects: "list[Subject]", output: Path, folder: Path, name: str | None, console: "Console", as_json: bool
+) -> None:
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
     from sat_intervals.errors import RunError, SatIntervalsError
@@ -220,7 +226,9 @@ def _tune(subjects: "list[Subject]", output: Path, folder: Path, name: str | Non
         except SatIntervalsError as error:
             console.say(f"{label} is left out: {error}")
     best = best_of(found)
-    if not console.quiet:
+    if as_json:
+        say_json([{"name": one.name, "kept": one.kept, "good": one.good, **one.figures} for one in found])
+    elif not console.quiet:
         show_tuned(found, best)
     _write(output, _SETTINGS, settings_of(best, name or best.name))
     console.say(str(output))

@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from shlex import quote
 from types import TracebackType
 from typing import Any, Self
 
@@ -101,8 +102,8 @@ class Console:
         """Print a line."""
         self._terminal.print(text, soft_wrap=True)
 
-    def summary(self, report: dict[str, Any], out: Path) -> None:
-        """Print the table at the end of a run."""
+    def summary(self, report: dict[str, Any], out: Path, then: str | None = None) -> None:
+        """Print the table at the end of a run, its files, and the next command to try, if any."""
         counts = report["counts"]
         table = Table(show_header=False, box=None, pad_edge=False)
         table.add_column(style="bold")
@@ -123,6 +124,8 @@ class Console:
         self._terminal.print(table)
         for name in ("intervals.tif", "validity.tif", "run.json"):
             self._terminal.print(str(out / name), soft_wrap=True)
+        if then:
+            self.say(f"next: sat-intervals {then} {quote(str(out))}")
 
     def batch_summary(self, report: dict[str, dict[str, Any]]) -> None:
         """Print the table at the end of a batch: the state of each pair."""

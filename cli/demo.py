@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import check_strict, local_option, path, run_options, settings_options, with_range
+from sat_intervals.cli.options import (
+    check_strict,
+    json_option,
+    local_option,
+    path,
+    run_options,
+    say_json,
+    settings_options,
+    with_range,
+)
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -28,6 +37,7 @@ if TYPE_CHECKING:
     help="Height of a mountain under the city; 1 m is a disparity of 1 px.",
 )
 @local_option
+@json_option
 @settings_options
 @run_options
 def demo(
@@ -36,6 +46,7 @@ def demo(
     seed: int,
     relief: float,
     local_range: bool,
+    as_json: bool,
     config_file: Path | None,
     given: dict[str, Any],
     strict: bool,
@@ -63,7 +74,7 @@ def demo(
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
     overwrite = run["overwrite"] or is_replacing(out / "tiles")
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
-    with Console(quiet) as console, put_back(layers if overwrite else (), out / "run.json"):
+    with Console(quiet or as_json) as console, put_back(layers if overwrite else (), out / "run.json"):
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
         config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum), local_range))
@@ -72,8 +83,17 @@ def demo(
             write_once(path, pixels, value, somewhere, overwrite=overwrite)
         console.progress("scene", 1, 1)
         report = match_pair(out / "left.tif", out / "right.tif", out, config, progress=console.progress, **run)
-    console.summary(report, out)
     figures = evaluate_run(out, out / "truth.tif")["all"]
+    if as_json:
+        say_json({"run": report, "truth": figures})
+    else:
+        console.summary(report, out)
+        _judge(config, out, figures, console, quiet)
+    check_strict(strict, report["warnings"])
+
+
+def _judge(config: "Config", out: Path, figures: dict[str, Any], console: "Console", quiet: bool) -> None:
+    """Print how often the interval contains the truth, and compare alpha with a coverage."""
     if figures["count"]:
         console.say(
             f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
@@ -81,7 +101,6 @@ def demo(
         )
         if not quiet:
             _compare(config, out, figures, console)
-    check_strict(strict, report["warnings"])
 
 
 def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Console") -> None:

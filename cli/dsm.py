@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from sat_intervals.cli.options import log_options, path, quiet_option
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
 
 
 @click.command(short_help="Make a surface model with height intervals from one or several runs.")
@@ -27,6 +27,7 @@ from sat_intervals.cli.options import log_options, path, quiet_option
     metavar="FILE",
     help="File to write; default dsm.tif in the first OUT. An existing surface model is replaced.",
 )
+@json_option
 @quiet_option
 @log_options
 def dsm(
@@ -37,6 +38,7 @@ def dsm(
     interval: Literal["envelope", "mean"],
     geoid: Path | None,
     output: Path | None,
+    as_json: bool,
     quiet: bool,
 ) -> None:
     """Make a surface model from the points that `triangulate` wrote to the folders OUT.
@@ -52,7 +54,7 @@ def dsm(
     from sat_intervals.heights.dsm import make_surface
 
     output = output or outs[0] / "dsm.tif"
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         report = make_surface(
             outs,
             output,
@@ -63,6 +65,8 @@ def dsm(
             geoid=geoid,
             progress=console.progress,
         )
+    if as_json:
+        say_json(report)
     console.say(
         f"{report['rows']} x {report['columns']} cells in {report['crs']} from {report['points']} points, "
         f"{100 * report['filled']:.1f} % with a height"

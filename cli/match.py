@@ -11,10 +11,12 @@ from sat_intervals.cli.options import (
     disparity_option,
     grid_option,
     image_options,
+    json_option,
     local_option,
     named,
     path,
     run_options,
+    say_json,
     settings_options,
     with_range,
 )
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 @grid_option
 @image_options
 @click.option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
+@json_option
 @settings_options
 @run_options
 def match(
@@ -45,6 +48,7 @@ def match(
     open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     dry_run: bool,
+    as_json: bool,
     config_file: Path | None,
     given: dict[str, Any],
     keep_tiles: bool,
@@ -71,20 +75,16 @@ def match(
 
         click.echo(job_script(config.cluster, out))
         return
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         from sat_intervals.raster.identity import check_not_replaced
         from sat_intervals.run.output import OUTPUTS
         from sat_intervals.run.pair import match_pair
 
         check_not_replaced([config_file], [out / name for name in OUTPUTS], [out / "tiles"])
-        report = match_pair(
-            *open_images(left, right),
-            out,
-            config,
-            window=window,
-            keep_tiles=keep_tiles,
-            overwrite=overwrite,
-            progress=console.progress,
-        )
-    console.summary(report, out)
+        images = open_images(left, right)
+        kept: dict[str, Any] = {"keep_tiles": keep_tiles, "overwrite": overwrite}
+        report = match_pair(*images, out, config, window=window, progress=console.progress, **kept)
+    if as_json:
+        say_json(report)
+    console.summary(report, out, then="report")
     check_strict(strict, report["warnings"])

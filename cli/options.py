@@ -197,6 +197,24 @@ def settings_options(command: Command) -> Command:
     return _with(with_settings, *_SETTINGS_OPTIONS)
 
 
+json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
+
+
+def say_json(content: Any) -> None:
+    """Print figures as JSON; NaN and infinity are null."""
+    import json
+    import math
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {str(key): plain(one) for key, one in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(one) for one in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    click.echo(json.dumps(plain(content), indent=1, default=str))
+
+
 def run_options(command: Command) -> Command:
     """Add options of commands that match pairs."""
     return _with(

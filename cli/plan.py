@@ -1,6 +1,7 @@
 """``sat-intervals plan``: estimate tiles, memory, disk and time of a run."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -9,9 +10,11 @@ from sat_intervals.cli.options import (
     disparity_option,
     grid_option,
     image_options,
+    json_option,
     local_option,
     log_options,
     named,
+    say_json,
     settings_options,
     with_range,
 )
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 @click.option(
     "--memory", metavar="SIZE", help="Memory of a worker, such as 4GB: tiles are made smaller until one fits."
 )
+@json_option
 @settings_options
 @log_options
 def plan(
@@ -45,6 +49,7 @@ def plan(
     open_images: "Callable[[str, str], tuple[Image, Image]]",
     window: "Window | None",
     memory: str | None,
+    as_json: bool,
     config_file: "Path | None",
     given: dict[str, Any],
 ) -> None:
@@ -59,8 +64,11 @@ def plan(
 
     config = load_config(config_file, with_range(given, disparity, local_range, range_grid))
     limit = parse_memory(memory) if memory else None
-    with Console(quiet=False) as console:
+    with Console(quiet=as_json) as console:
         made = make_plan(*open_images(left, right), config, window=window, memory=limit, progress=console.progress)
+    if as_json:
+        say_json(asdict(made))
+        return
     smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
     one, together = _verdicts(made, limit, config.cluster.kind)
     is_exact = config.tiles.overlap == "exact"

@@ -1,12 +1,11 @@
 """``sat-intervals range``: find the search range of a pair, with its evidence."""
 
-import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import image_options, log_options, named, path, quiet_option
+from sat_intervals.cli.options import image_options, json_option, log_options, named, path, quiet_option, say_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +22,7 @@ _BARS = 8
 @click.argument("right", callback=named)
 @image_options
 @click.option("--output", callback=path, metavar="FILE", help="Write the local ranges, for --range-grid of match.")
-@click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
+@json_option
 @quiet_option
 @log_options
 def search_range(
@@ -53,7 +52,7 @@ def search_range(
         if output:
             write_ranges(output, found.local, images[0])
     if as_json:
-        click.echo(json.dumps(found.report(), indent=1))
+        say_json(found.report())
         return
     for name, value in _rows(found):
         click.echo(f"{name:<36}{value}")

@@ -1,56 +1,77 @@
 """``sat-intervals status``: show the progress of a run or a batch."""
 
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 
-from sat_intervals.cli.options import store_option
+from sat_intervals.cli.options import json_option, say_json, store_option
 
 
 @click.command(short_help="Show the progress of a run or a batch.")
 @click.argument("out", type=click.Path(path_type=Path))
 @store_option
-def status(out: Path, store: str | None) -> None:
+@json_option
+def status(out: Path, store: str | None, as_json: bool) -> None:
     """Show how many tiles of the run in OUT are done, failed and left, during the run or after it ended.
 
     The files of a complete run are compared with their checksums. For the folder of a batch, show the progress of each
     pair, and why pairs failed, without reading the files.
     """
-    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_run
     from sat_intervals.run.output import is_complete
-    from sat_intervals.run.status import ElsewhereError, read_report
+    from sat_intervals.run.status import read_report
 
     pairs = read_report(out)
     if pairs is None:
         if is_complete(out):
             open_run(out)  # raises if a file was damaged since
-        _show(out, store)
+        found = {str(out): _state(out, store)}
+    else:
+        found = {str(out / name): _state_of_pair(out / name, store, ended) for name, ended in pairs.items()}
+    if as_json:
+        say_json(found)
         return
-    for name, ended in pairs.items():
-        if ended["state"] == "failed":
-            click.echo(f"{out / name}: failed: {ended['error']}")
-            continue
-        try:
-            _show(out / name, store)
-        except ElsewhereError as error:
-            click.echo(f"{out / name}: {ended['state']}; {error}")
-        except SatIntervalsError:  # no run yet, or already removed
-            click.echo(f"{out / name}: {ended['state']}")
+    for name, state in found.items():
+        for line in _lines(name, state):
+            click.echo(line)
 
 
-def _show(out: Path, store: str | None) -> None:
+def _state_of_pair(out: Path, store: str | None, ended: dict[str, Any]) -> dict[str, Any]:
+    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.run.status import ElsewhereError
+
+    if ended["state"] == "failed":
+        return {"state": "failed", "error": ended["error"]}
+    try:
+        return _state(out, store)
+    except ElsewhereError as error:
+        return {"state": ended["state"], "error": str(error)}
+    except SatIntervalsError:  # no run yet, or already removed
+        return {"state": ended["state"]}
+
+
+def _state(out: Path, store: str | None) -> dict[str, Any]:
+    """Return the state of a run: complete, or how many tiles are done."""
     from sat_intervals.run.output import is_complete
     from sat_intervals.run.status import read_status
 
-    if is_complete(out):
-        click.echo(f"{out}: complete")
+    return (
+        {"state": "complete"} if is_complete(out) else {"state": "tiles", **asdict(read_status(out / "tiles", store))}
+    )
+
+
+def _lines(name: str, state: dict[str, Any]) -> Iterator[str]:
+    if state["state"] != "tiles":
+        separator = ": " if state["state"] == "failed" else "; "
+        yield f"{name}: {state['state']}" + (f"{separator}{state['error']}" if "error" in state else "")
         return
-    now = read_status(out / "tiles", store)
-    left = now.total - now.done - len(now.failed)
-    state = "a run is active" if now.running else "no run is active, the same command resumes it"
-    if now.handed_on:
-        state += f"; {now.handed_on} path states are handed on"
-    click.echo(f"{out}: {now.done} of {now.total} tiles done, {len(now.failed)} failed, {left} left; {state}")
-    for name, reason in now.failed.items():
-        click.echo(f"  tile {name}: {reason}")
+    left = state["total"] - state["done"] - len(state["failed"])
+    what = "a run is active" if state["running"] else "no run is active, the same command resumes it"
+    if state["handed_on"]:
+        what += f"; {state['handed_on']} path states are handed on"
+    yield f"{name}: {state['done']} of {state['total']} tiles done, {len(state['failed'])} failed, {left} left; {what}"
+    for tile, reason in state["failed"].items():
+        yield f"  tile {tile}: {reason}"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import log_options, path, quiet_option, sensor_options
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, sensor_options
 
 # Metres between lines of sight above which models are suspect.
 _SUSPECT = 0.1
@@ -13,9 +13,10 @@ _SUSPECT = 0.1
 @click.command(short_help="Compute points and height bounds of a run with sensor models.")
 @click.argument("out", callback=path)
 @sensor_options
+@json_option
 @quiet_option
 @log_options
-def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], quiet: bool) -> None:
+def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], as_json: bool, quiet: bool) -> None:
     """Triangulate the disparity and both bounds of the finished run in the folder OUT.
 
     \b
@@ -31,9 +32,11 @@ def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], quiet: b
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.triangulate import triangulate
 
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         report = triangulate(out, *sensor_files, progress=console.progress)
-    if report["points"]:
+    if as_json:
+        say_json(report)
+    elif report["points"]:
         (lowest, highest), residual = report["height"], report["residual"][1]
         console.say(
             f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid, "

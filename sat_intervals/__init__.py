@@ -14,6 +14,7 @@ if typing.TYPE_CHECKING:
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.heights.dsm import make_surface
     from sat_intervals.heights.triangulate import triangulate
+    from sat_intervals.interop.dataset import decode_flags, open
     from sat_intervals.match.in_memory import match_arrays
     from sat_intervals.raster import open_image
     from sat_intervals.run.pair import match_pair
@@ -27,11 +28,13 @@ __all__ = [
     "SatIntervalsError",
     "Window",
     "__version__",
+    "decode_flags",
     "evaluate_run",
     "load_config",
     "make_surface",
     "match_arrays",
     "match_pair",
+    "open",
     "open_image",
     "triangulate",
 ]
@@ -43,11 +46,13 @@ _HOMES = {
     "RunError": "errors",
     "SatIntervalsError": "errors",
     "Window": "tiling",
+    "decode_flags": "interop.dataset",
     "evaluate_run": "evaluate.disparity",
     "load_config": "config",
     "make_surface": "heights.dsm",
     "match_arrays": "match.in_memory",
     "match_pair": "run.pair",
+    "open": "interop.dataset",
     "open_image": "raster",
     "triangulate": "heights.triangulate",
 }

@@ -71,6 +71,15 @@ FLAGS = (
 )
 
 
+def flag_attributes() -> dict[str, object]:
+    """Return attributes that describe the validity flags by the CF conventions."""
+    return {
+        "long_name": "validity flags",
+        "flag_masks": np.array([flag.value for flag in FLAGS], np.uint16),
+        "flag_meanings": " ".join(flag.name for flag in FLAGS),
+    }
+
+
 def cause(validity: np.ndarray) -> np.ndarray:
     """Return the flag that makes each pixel invalid, 0 if valid; of several, the first in the order of FLAGS."""
     reasons = validity.astype(np.int64) & INVALID

@@ -6,7 +6,7 @@ import numpy as np
 
 from sat_intervals.config import load_config
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION, Bands
-from sat_intervals.raster import RUN_FILES, OutputWriter, north_up, write_layer
+from sat_intervals.raster import RUN_FILES, OutputWriter, north_up, surface_file, write_layer
 from sat_intervals.run.statistics import Tally
 from sat_intervals.show.legend import PIXEL_CLASSES
 
@@ -99,3 +99,12 @@ def without_intervals(folder):
 def no_bands(height, width):
     """Bands and validity of a run in which cross-checking rejected every pixel."""
     return np.full((4, height, width), np.nan, np.float32), np.full((height, width), OCCLUSION, np.uint16)
+
+
+def write_surface(out, height, agreement=np.nan, runs=FINISHED):
+    """A surface of intervals 3 m wide beside a run, whose confidence is one half."""
+    ones = np.ones_like(height)
+    bands = np.stack([height, height - 1, height + 2, ones, 0.5 * ones, agreement * ones]).astype(np.float32)
+    with OutputWriter(out, [surface_file("dsm.tif")], *height.shape, PLACE, {"RUNS": runs}) as writer:
+        writer.write(0, bands)
+        writer.publish()

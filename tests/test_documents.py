@@ -1,10 +1,21 @@
-"""The documents: README stays short, links lead somewhere, and code cites sections that exist."""
+"""The documents: README stays short, links lead somewhere, code cites sections that exist, commands and code run."""
 
 import re
+import shlex
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers import COMMAND, invoke
+
+from sat_intervals.cli import main
+from sat_intervals.config import Config
+from sat_intervals.raster import read_layers
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "METHOD.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -66,3 +77,138 @@ def test_code__cites_sections_that_exist() -> None:
     assert {one for one in cited if one[1] not in numbers} == set()
     old = [file.name for file in files if file != Path(__file__) and re.search(r"method: section", file.read_text())]
     assert old == []
+
+
+# What three dots at the end of a command stand for.
+SENSORS = " --left-model left.geom --right-model right.geom --left-grid left_grid.tif --right-grid right_grid.tif"
+
+
+def blocks(document: Path, language: str) -> Iterator[str]:
+    """Yield the code blocks of a document in a language."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```$", document.read_text(), re.MULTILINE | re.DOTALL)
+    yield from (code for of, code in found if of == language)
+
+
+def commands() -> list[tuple[str, str]]:
+    """Return the name of the document and the line of each command, without comments, redirections and prompts."""
+    found = []
+    for document in DOCUMENTS:
+        for line in "".join(blocks(document, "")).splitlines():
+            if line.removeprefix("$ ").startswith("sat-intervals "):
+                line = re.sub(r"\s+(#|>).*", "", line.removeprefix("$ "))
+                found.append((document.name, re.sub(r" \.\.\.$", SENSORS, line)))
+    return found
+
+
+def test_commands__have_arguments_and_options_that_exist() -> None:
+    found = commands()
+    assert len(found) > 40
+    for document, line in found:
+        name, *words = shlex.split(line)[1:]
+        assert name in main.commands, (document, line)
+        main.commands[name].make_context(name, words)  # raises for what it does not know
+
+
+# What a machine of tests lacks, or what takes long, and where it is tried instead.
+NOT_RUN = {
+    "s3://": "tests/store/test_remote.py",
+    "--tune": "tests/run/test_calibrate.py",
+    "--cost mccnn": "tests/match/test_mccnn.py",
+    "lidar.tif": "tests/evaluate/test_dsm.py: there are no heights of others for the demo scene",
+    "sat-intervals reference": "tests/heights/test_reference.py, likewise",
+    "--truth out/truth.tif": "tests/heights/test_reference.py, with the truth of reference",
+    "peer_dsm": "tests/heights/test_reference.py, on a real pair",
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all files that the documents name, made of a small scene and its sensor models."""
+    folder = tmp_path_factory.mktemp("documents")
+    assert invoke("demo", folder, "--size", "160", "200", "--quiet").exit_code == 0
+    subprocess.run([sys.executable, ROOT / "docs" / "pictures" / "demo_cameras.py", folder], check=True)
+    for name in ("intervals.tif", "validity.tif", "run.json"):
+        (folder / name).unlink()
+    copies = {
+        "left": ["left.vrt", "stereo/run-L.tif", "TILE/pair_1/rectified_ref.tif"],
+        "right": ["right.vrt", "stereo/run-R.tif", "TILE/pair_1/rectified_sec.tif"],
+    }
+    for pair in ("pair1", "pair2", "pair3", "PAIRS..."):
+        (folder / pair).mkdir()
+        (folder / pair / "meta.json").write_text('{"disparity": [-12, 40]}')
+        for side in ("left", "right", "truth"):
+            copies.setdefault(side, []).append(f"{pair}/{side}.tif")
+    for side, names in copies.items():
+        for name in names:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(folder / f"{side}.tif", folder / name)
+    (folder / "pairs.csv").write_text("name,left,right,minimum,maximum\na,left.tif,right.tif,-12,40\n")
+    (folder / "cluster.yaml").write_text("disparity: {minimum: -12, maximum: 40}\ncluster: {workers: 2}\n")
+    (folder / "tuned.yaml").write_text("disparity: {minimum: -12, maximum: 40}\n")
+    return folder
+
+
+def in_documents(line: str) -> str:
+    """Return a command of a document for the files of `place`; a run replaces that of the command before."""
+    line = re.sub(r"(left|right)\.geom", r"\1_model.tif", line)
+    line = line.replace("--row 640", "--row 64").replace("--disparity -60 0", "--disparity -12 40")
+    return f"{line} --overwrite" if re.match(r"sat-intervals (match .*(?<!--dry-run)$|batch)", line) else line
+
+
+@pytest.mark.process
+@pytest.mark.peer("shareloc", "matplotlib")
+def test_commands__of_all_documents_run(place: Path) -> None:
+    subprocess.run([COMMAND, "range", "left.tif", "right.tif", "--output", "range.tif"], cwd=place, check=True)
+    settings = subprocess.run([COMMAND, "config", "--preset", "satellite"], capture_output=True, text=True, check=True)
+    (place / "settings.yaml").write_text(settings.stdout)
+    for document, line in commands():
+        if any(words in line for words in NOT_RUN):
+            continue
+        words = shlex.split(in_documents(line))
+        if "--dry-run" in words:
+            (place / "slurm.yaml").write_text(
+                "disparity: {minimum: 0, maximum: 9}\ncluster: {kind: slurm, memory: 1GB}\n"
+            )
+            words[words.index("cluster.yaml")] = "slurm.yaml"
+        done = subprocess.run([COMMAND, *words[1:]], cwd=place, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, (document, line, done.stderr)
+
+
+@pytest.mark.process
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_code__of_all_documents_runs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    names = {side: read_layers(place / f"{side}.tif")[0] for side in ("left", "right")}
+    count = 0
+    for document in DOCUMENTS:
+        for code in blocks(document, "python"):
+            shutil.rmtree(place / "out", ignore_errors=True)
+            assert invoke("match", "left.tif", "right.tif", "out", "--disparity", -12, 40).exit_code == 0
+            if "match_pair" in code:
+                shutil.rmtree(place / "out")
+            exec(code.replace("profile(640)", "profile(64)"), names | {"np": np})
+            count += 1
+    assert count >= 3
+
+
+def test_site__has_a_page_for_every_document_and_every_setting() -> None:
+    spec = spec_from_file_location("documentation_site", ROOT / "docs" / "site.py")
+    assert spec
+    assert spec.loader
+    site = module_from_spec(spec)
+    spec.loader.exec_module(site)
+    listed = set(re.findall(r"([\w-]+\.md)", (ROOT / "mkdocs.yml").read_text()))
+    made = {"index.md", "gallery.md", "commands.md", "settings-reference.md", "python.md", "CHANGELOG.md"}
+    assert listed == made | {document.name for document in DOCUMENTS} - {"README.md"}
+    settings = site.settings_reference()
+    for name, field in Config.model_fields.items():
+        assert f"## `{name}`" in settings
+        for model in site.models_of(field.annotation):
+            assert all(f"| `{key}` |" in settings for key in model.model_fields)
+    assert "| `size` | whole number, >= 64, <= 16384, multiple of 64 | `1024` |" in settings
+    text = site.command_reference()
+    assert all(f"### {name}\n" in text and f"Usage: sat-intervals {name} " in text for name in main.commands)
+    assert (
+        site.adapted("[a](../METHOD.md#1) [b](docs/x.md) [c](../README.md)")
+        == "[a](METHOD.md#1) [b](x.md) [c](index.md)"
+    )

@@ -13,7 +13,7 @@ from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import match_whole
-from sat_intervals.products import BANDS, FLAGS
+from sat_intervals.products import BANDS, flag_attributes
 
 _LOG = logging.getLogger(__name__)
 
@@ -69,15 +69,6 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         dataset[band.name] = xr.DataArray(layer, dims=labels.dims, attrs=attributes)
     dataset["validity"] = xr.DataArray(final.validity, dims=labels.dims, attrs=flag_attributes())
     return dataset
-
-
-def flag_attributes() -> dict[str, object]:
-    """Attributes that describe the validity flags by the CF conventions."""
-    return {
-        "long_name": "validity flags",
-        "flag_masks": np.array([flag.value for flag in FLAGS], np.uint16),
-        "flag_meanings": " ".join(flag.name for flag in FLAGS),
-    }
 
 
 def _pixels(array: Array, side: str) -> np.ma.MaskedArray:

@@ -2,6 +2,7 @@
 
 from sat_intervals.raster.cog import BLOCK, Copy, Part, codec_versions, compressed, factors
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
+from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.heightfield import HeightRaster
@@ -21,7 +22,7 @@ from sat_intervals.raster.layers import (
     write_rows,
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
-from sat_intervals.raster.projection import Projection, utm_of
+from sat_intervals.raster.projection import Projection, grid_mapping, utm_of
 from sat_intervals.raster.publishing import OutputError, stamps
 from sat_intervals.raster.surfaces import check_reference, is_surface, read_heights, read_place, resolution_of
 from sat_intervals.raster.windows import read_views, read_window
@@ -52,6 +53,8 @@ __all__ = [
     "codec_versions",
     "compressed",
     "factors",
+    "footprint",
+    "grid_mapping",
     "is_marked",
     "is_surface",
     "north_up",

@@ -150,11 +150,14 @@ def write_once(
     write_layer(path, pixels, nodata, georeferencing, MARK)
 
 
-def read_layers(path: str | os.PathLike[str], window: Window | None = None) -> np.ndarray:
-    """Read all bands of a file or of a window inside it, ``(bands, rows, columns)`` in the file's type."""
+def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:
+    """Read all bands of a file or of a window inside it, ``(bands, rows, columns)`` in the file's type.
+
+    Of one ``band``, counted from 1: ``(rows, columns)``.
+    """
     area = window and RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
-        return np.asarray(dataset.read(window=area))
+        return np.asarray(dataset.read(band, window=area))
 
 
 def read_shape(path: str | os.PathLike[str]) -> tuple[int, int, int]:

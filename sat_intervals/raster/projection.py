@@ -1,6 +1,7 @@
 """Convert longitude and latitude to map coordinates, and ellipsoidal heights to heights above a geoid."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pyproj import CRS, Proj, Transformer
@@ -9,6 +10,7 @@ from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster.georeferencing import Georeferencing
 
 _GEOGRAPHIC = "EPSG:4326"
 # Degrees outside the area of a CRS that are accepted: the next UTM zone.
@@ -26,6 +28,17 @@ def utm_of(longitude: float, latitude: float) -> str:
     if not zones:
         raise SatIntervalsError(f"no UTM zone at longitude {longitude:.2f}, latitude {latitude:.2f}: give --crs")
     return f"EPSG:{zones[0].code}"
+
+
+def grid_mapping(place: Georeferencing) -> dict[str, Any]:
+    """Return CRS and transform as attributes of a CF grid mapping, with those of GDAL; empty without both."""
+    attributes: dict[str, Any] = {}
+    if place.crs is not None:
+        wkt = place.crs.to_wkt()
+        attributes |= CRS.from_wkt(wkt).to_cf() | {"crs_wkt": wkt, "spatial_ref": wkt}
+    if place.transform is not None:
+        attributes["GeoTransform"] = " ".join(map(repr, place.transform.to_gdal()))
+    return attributes
 
 
 class Projection:

@@ -1,12 +1,19 @@
-"""Keep files in the place of a picture or page that this tool did not make."""
+"""Keep files in the place of a picture, page, style or project that this tool did not make."""
 
 from collections.abc import Iterable
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
 
-# Text near the beginning of the tool's pictures and pages.
-_MARKS = b"tEXtSoftware\0sat-intervals", b'<meta name="generator" content="sat-intervals">'
+XML_MARK = "made by sat-intervals"
+"""Text of the comment in styles and projects; QGIS removes it when it writes the file again."""
+
+# Text near the beginning of the tool's pictures, pages, styles and projects.
+_MARKS = (
+    b"tEXtSoftware\0sat-intervals",
+    b'<meta name="generator" content="sat-intervals">',
+    f"<!--{XML_MARK}-->".encode(),
+)
 _BEGINNING = 1024  # bytes
 
 
@@ -19,14 +26,26 @@ def check_made_here(paths: Iterable[Path]) -> None:
         Names the first such file.
     """
     for path in paths:
-        if path.is_file() and not path.is_symlink():
-            try:
-                with path.open("rb") as stream:
-                    beginning = stream.read(_BEGINNING)
-            except OSError as error:
-                raise SatIntervalsError(f"{path} exists and cannot be read: {error.strerror}: move it away") from error
-            if not any(mark in beginning for mark in _MARKS):
-                raise SatIntervalsError(
-                    f"{path} exists and was not made by sat-intervals, or by a version that left no mark in it: move "
-                    "it away"
-                )
+        if not is_replaceable(path):
+            raise SatIntervalsError(
+                f"{path} exists and was not made by sat-intervals, or by a version that left no mark in it: move "
+                "it away"
+            )
+
+
+def is_replaceable(path: Path) -> bool:
+    """Return whether a file is missing, a link, or has the mark of this tool.
+
+    Raises
+    ------
+    SatIntervalsError
+        The file cannot be read.
+    """
+    if not path.is_file() or path.is_symlink():
+        return True
+    try:
+        with path.open("rb") as stream:
+            beginning = stream.read(_BEGINNING)
+    except OSError as error:
+        raise SatIntervalsError(f"{path} exists and cannot be read: {error.strerror}: move it away") from error
+    return any(mark in beginning for mark in _MARKS)

@@ -95,7 +95,7 @@ class TileArrays:
                 self.folder.make(name.rpartition("/")[0])
                 self.folder.write(name, text)
 
-    def _array(self, name: str, store: Store) -> zarr.Array[Any]:
+    def _array(self, name: str, store: Store) -> "zarr.Array[Any]":
         """Open an array of a store without reading its metadata there, which are for other tools."""
         _, metadata = _descriptions(self.grid, self.count, self.ambiguities, self.levels, self.has_seams)
         return zarr.Array(zarr.AsyncArray(metadata[name], StorePath(store, name)))

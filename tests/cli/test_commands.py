@@ -543,7 +543,8 @@ def test_match__prints_plain_lines_and_a_table(done):
     assert "matching tiles: 20/20" in lines
     assert "postprocessing rows: 200/200" in lines
     assert "writing files" in lines
-    assert lines[-3:] == [str(out / name) for name in ("intervals.tif", "validity.tif", "run.json")]
+    assert lines[-4:-1] == [str(out / name) for name in ("intervals.tif", "validity.tif", "run.json")]
+    assert lines[-1] == f"next: sat-intervals report {out}"
     report = json.loads((out / "run.json").read_text())
     assert set(report["counts_meaning"]) <= set(report["counts"])
     assert report["counts"]["flags"]["regularized"] >= report["counts"]["low_confidence"] > 0
@@ -577,7 +578,7 @@ def test_match__draws_a_bar_on_a_terminal(folder, tmp_path):
     assert re.search(r"matching tiles[^\n]*━[^\n]*\d+/20", shown)
     after = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)[-2000:]
     assert "valid pixels" in after
-    assert after.rstrip().endswith("run.json")
+    assert after.rstrip().splitlines()[-1].startswith("next: sat-intervals report")
 
 
 def read_terminal(terminal):
@@ -597,7 +598,7 @@ def test_match__takes_names_as_they_are(folder, tmp_path):
     pair = {f"{name}": place / f":smile: {name} [1].tif" for name in ("left", "right")}
     result = invoke(*matching(folder, out, **pair))
     assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines()[-1] == str(out / "run.json")
+    assert result.stdout.splitlines()[-2:] == [str(out / "run.json"), f"next: sat-intervals report '{out}'"]
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
     missing = place / "[/none].tif"
     assert_refused(invoke(*matching(folder, out, "--overwrite", left=missing)), f"{missing} cannot be read")

@@ -11,7 +11,7 @@ from operator import getitem
 
 import numpy as np
 import pytest
-from finished import FINISHED, PLACE, no_bands, random_bands, without_intervals, write_run
+from finished import PLACE, no_bands, random_bands, without_intervals, write_run, write_surface
 from helpers import invoke, write_pair
 from matplotlib import colormaps
 from matplotlib.artist import Artist
@@ -287,15 +287,6 @@ def test_plot__without_intervals_claims_none(tmp_path, words):
     assert "Row 20, columns 0 to 49; gaps: invalid pixels" in words
     with pytest.raises(SatIntervalsError, match="has no intervals, its setting interval is null: errors need them"):
         draw_errors(open_results(out), tmp_path / "errors.png")
-
-
-def write_surface(out, height, agreement=np.nan, runs=FINISHED):
-    """A surface of intervals 3 m wide beside a run, whose confidence is one half."""
-    ones = np.ones_like(height)
-    bands = np.stack([height, height - 1, height + 2, ones, 0.5 * ones, agreement * ones]).astype(np.float32)
-    with OutputWriter(out, [surface_file("dsm.tif")], *height.shape, PLACE, {"RUNS": runs}) as writer:
-        writer.write(0, bands)
-        writer.publish()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,31 @@
+"""``sat-intervals project``: write a QGIS project of a finished run."""
+
+from pathlib import Path
+
+import click
+
+from sat_intervals.cli.options import log_options, path
+
+
+@click.command(short_help="Write a QGIS project and styles of a finished run.")
+@click.argument("out", callback=path)
+@log_options
+def project(out: Path) -> None:
+    """Write OUT/project.qgz, a QGIS project of the finished run in the folder OUT.
+
+    \b
+    OUT/project.qgz           images, disparity, width, confidence, validity, and
+                              heights with hillshade after triangulate and dsm
+    OUT/width.vrt             interval width, computed when it is read
+    OUT/dsm_half_width.vrt    half the width of the intervals of heights
+    OUT/*.qml                 style of the raster of the same name
+
+    QGIS 3.22 or newer opens it. Styles saved by QGIS are kept; a project saved by QGIS is not replaced.
+    """  # noqa: D301 (\b keeps the line breaks in click)
+    from sat_intervals.show.project import write_project
+
+    written = write_project(out)
+    for note in written.notes:
+        click.echo(note, err=True)
+    for file in written.files:
+        click.echo(file)

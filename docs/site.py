@@ -1,0 +1,171 @@
+"""Build the documentation site in site/; run it by ``make docs``. A warning of MkDocs is an error.
+
+Pages are README.md, METHOD.md, CHANGELOG.md and docs/*.md with their links adapted; the references of commands,
+settings and Python are generated from click, pydantic and docstrings; pictures of the gallery are made by commands.
+"""
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
+
+import click
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+import sat_intervals
+from sat_intervals.cli.app import STEPS
+from sat_intervals.config import Config
+
+ROOT = Path(__file__).parents[1]
+PAGES = ROOT / "build" / "docs"
+# Commands of the gallery, run in the folder of its pictures: title, command, what it shows.
+GALLERY = (
+    ("A scene with exact truth", "sat-intervals demo demo --size 700 700", None),
+    ("Maps", "sat-intervals plot demo --dpi 90", "demo/overview.png"),
+    ("Where intervals miss the truth", "sat-intervals plot demo --dpi 90", "demo/errors.png"),
+    ("Coverage and width", "sat-intervals plot demo --dpi 90", "demo/coverage.png"),
+    ("A row", "sat-intervals plot demo --dpi 90 --row 350 --columns 100 500", "demo/profile.png"),
+    ("The page of a run", "sat-intervals report demo", "demo/report.html"),
+    ("A relief, with local search ranges", "sat-intervals demo relief --size 500 500 --relief 60 --local-range", None),
+    ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
+)  # fmt: skip
+
+
+def adapted(text: str) -> str:
+    """Adapt the links of a document, which are those of the repository, to the pages of the site."""
+    text = re.sub(r"\]\((?:\.\./)?README\.md", "](index.md", text)
+    text = re.sub(r"\]\((?:\.\./)?docs/", "](", text)
+    text = re.sub(r"\]\((?:\.\./)?\.github/pictures/", "](pictures/", text)
+    return text.replace("](../", "](")
+
+
+def settings_reference() -> str:
+    """Return the page of all settings, from the models."""
+    lines = [
+        "# Settings",
+        "",
+        "All keys with their types, ranges and defaults. [settings.md](settings.md) explains them.",
+        "",
+    ]
+    for name, field in Config.model_fields.items():
+        models = list(models_of(field.annotation))
+        lines += [f"## `{name}`", ""]
+        if not models:
+            lines += [f"{described(field)}: {kind_of(field)}. Default `{field.default}`.", ""]
+        elif NoneType in get_args(field.annotation):
+            lines += ["`null` switches the step off.", ""]
+        for model in models:
+            lines += [f"### {title_of(model)}", ""] if len(models) > 1 else []
+            lines += ["| key | values | default | meaning |", "|---|---|---|---|"]
+            for key, one in model.model_fields.items():
+                default = "required" if one.is_required() else f"`{one.get_default(call_default_factory=True)}`"
+                lines.append(f"| `{key}` | {kind_of(one)} | {default} | {described(one)} |")
+            lines.append("")
+    return "\n".join(lines)
+
+
+def models_of(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models in an annotation, at any depth."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    else:
+        for part in get_args(annotation):
+            yield from models_of(part)
+
+
+def title_of(model: type[BaseModel]) -> str:
+    """Return the value by which a kind of section is chosen."""
+    for key in ("method", "penalty"):
+        if key in model.model_fields and (values := get_args(model.model_fields[key].annotation)):
+            return f"`{key}: {values[0]}`" + (" with MC-CNN" if model.__name__ in ("MccnnSgm", "CosineSgm") else "")
+    return model.__name__
+
+
+def kind_of(field: FieldInfo) -> str:
+    """Return type and range of a key."""
+    limits = []
+    for name, sign in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"), ("multiple_of", "multiple of")):
+        limits += [f"{sign} {getattr(one, name)}" for one in field.metadata if getattr(one, name, None) is not None]
+    return ", ".join([words(field.annotation), *limits]).replace("|", "\\|")
+
+
+def words(annotation: Any) -> str:
+    """Return a type in words."""
+    if annotation is NoneType:
+        return "null"
+    if get_origin(annotation) is Literal:
+        return " or ".join(f"`{value}`" for value in get_args(annotation))
+    if parts := [
+        part for part in get_args(annotation) if part is NoneType or get_origin(part) or isinstance(part, type)
+    ]:
+        return " or ".join(dict.fromkeys(map(words, parts)))
+    names = {int: "whole number", float: "number", bool: "true or false", str: "text"}
+    return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
+
+
+def described(field: FieldInfo) -> str:
+    """Return the meaning of a key for a cell of a table."""
+    return " ".join((field.description or "").split()).replace("|", "\\|")
+
+
+def command_reference() -> str:
+    """Return the page of all commands, their own help."""
+    lines = ["# Commands", "", "Each section is what `sat-intervals COMMAND --help` prints.", ""]
+    for step, commands in STEPS.items():
+        lines += [f"## {step}", ""]
+        for command in commands:
+            context = click.Context(command, info_name=f"sat-intervals {command.name}", terminal_width=100)
+            lines += [f"### {command.name}", "", "```text", command.get_help(context), "```", ""]
+    return "\n".join(lines)
+
+
+def python_reference() -> str:
+    """Return the page of public names; mkdocstrings puts their docstrings there."""
+    names = [f"sat_intervals.{home}.{name}" for name, home in sorted(sat_intervals._HOMES.items())]
+    return "\n\n".join(["# Python", "All names are imported from `sat_intervals`.", *(f"::: {name}" for name in names)])
+
+
+def gallery() -> str:
+    """Run the commands of the gallery and return its page."""
+    lines = ["# Gallery", "", "Each picture was made by the command above it.", ""]
+    folder = PAGES / "gallery-files"
+    folder.mkdir()
+    for title, command, file in GALLERY:
+        subprocess.run(
+            [sys.executable, "-c", RUN, *command.split()[1:]], cwd=folder, check=True, stdout=subprocess.DEVNULL
+        )
+        lines += [f"## {title}", "", "```", command, "```", ""]
+        if file:
+            link = f"gallery-files/{file}"
+            lines += [f"![{title}]({link})" if file.endswith(".png") else f"[Open the page]({link})", ""]
+    for raster in (*folder.rglob("*.tif"), *folder.rglob("run.json")):
+        raster.unlink()
+    return "\n".join(lines)
+
+
+RUN = "import sys; from sat_intervals.cli import main; sys.argv[0] = 'sat-intervals'; main()"
+
+
+def write_pages() -> None:
+    """Write all pages to build/docs."""
+    shutil.rmtree(PAGES, ignore_errors=True)
+    PAGES.mkdir(parents=True)
+    shutil.copytree(ROOT / ".github" / "pictures", PAGES / "pictures")
+    for file in (ROOT / "README.md", ROOT / "METHOD.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")):
+        name = "index.md" if file.name == "README.md" else file.name
+        (PAGES / name).write_text(adapted(file.read_text()))
+    (PAGES / "settings-reference.md").write_text(settings_reference())
+    (PAGES / "commands.md").write_text(command_reference())
+    (PAGES / "python.md").write_text(python_reference())
+
+
+if __name__ == "__main__":
+    write_pages()
+    (PAGES / "gallery.md").write_text(gallery())
+    subprocess.run([sys.executable, "-m", "mkdocs", "build", "--clean", "--strict", "--quiet"], cwd=ROOT, check=True)
+    print("Open site/index.html")

@@ -1,0 +1,183 @@
+"""Styles of rasters for QGIS: renderers, default styles (``.qml``), and virtual rasters of widths (``.vrt``).
+
+QGIS reads ``name.qml`` when it loads ``name.tif``. All XML is written by the standard library; QGIS is not needed.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from sat_intervals.products import FLAGS, INVALID
+from sat_intervals.raster import Georeferencing, whole_file
+from sat_intervals.show.legend import PIXEL_CLASSES, classify
+from sat_intervals.show.marks import XML_MARK
+
+# Colours at equal steps of matplotlib's maps.
+VIRIDIS = "#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"
+MAGMA = "#000004", "#51127c", "#b73779", "#fc8961", "#fcfdbf"
+CIVIDIS = "#00224e", "#434e6c", "#7d7c78", "#bcaf6f", "#fee838"
+# QGIS 3.22 is the oldest version the styles are tried with.
+VERSION = "3.22.0"
+# Sun of the hillshade: north-west, 45 degrees high. Heights are flattened: noise of 0.1 m is steep between small cells.
+_SUN = {"azimuth": "315", "angle": "45", "zfactor": "0.3", "multidirection": "0"}
+# Share of values below the first and above the last colour, in percent.
+_CUT = 2.0
+
+
+def colours(band: int, values: np.ndarray, ramp: Sequence[str], *, unit: str = "") -> Element:
+    """Return a renderer that spreads colours from the 2nd to the 98th percentile of values; NaN are left out."""
+    known = values[np.isfinite(values)]
+    first, last = np.percentile(known, (_CUT, 100 - _CUT)) if known.size else (0.0, 1.0)
+    return ramped(band, np.linspace(first, last if last > first else first + 1, len(ramp)), ramp, unit=unit)
+
+
+def widths(band: int, values: np.ndarray, *, unit: str) -> Element:
+    """Return a renderer of widths from 0 to their 98th percentile; small ones get more colours, by square roots."""
+    known = values[np.isfinite(values)]
+    last = float(np.percentile(known, 100 - _CUT)) if known.size else 0.0
+    return ramped(band, (last or 1.0) * np.linspace(0, 1, len(MAGMA)) ** 2, MAGMA, unit=unit)
+
+
+def ramped(band: int, places: Sequence[float] | np.ndarray, ramp: Sequence[str], *, unit: str = "") -> Element:
+    """Return a renderer that interpolates colours between values."""
+    first, last = f"{places[0]:.6g}", f"{places[-1]:.6g}"
+    renderer = _renderer("singlebandpseudocolor", band=band, classificationMin=first, classificationMax=last)
+    kind = {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
+    shader = SubElement(
+        SubElement(renderer, "rastershader"), "colorrampshader", kind | {"minimumValue": first, "maximumValue": last}
+    )
+    for place, colour in zip(places, ramp, strict=True):
+        label = f"{place:.4g} {unit}".strip()
+        SubElement(shader, "item", value=f"{place:.6g}", label=label, color=colour, alpha="255")
+    return renderer
+
+
+def grey(band: int, values: np.ndarray) -> Element:
+    """Return a renderer of an image, from the 2nd to the 98th percentile of its values."""
+    known = values[np.isfinite(values)]
+    first, last = np.percentile(known, (_CUT, 100 - _CUT)) if known.size else (0.0, 1.0)
+    renderer = _renderer("singlebandgray", grayBand=band, gradient="BlackToWhite")
+    stretch = SubElement(renderer, "contrastEnhancement")
+    for name, text in (("minValue", f"{first:.6g}"), ("maxValue", f"{last:.6g}")):
+        SubElement(stretch, name).text = text
+    SubElement(stretch, "algorithm").text = "StretchToMinimumMaximum"
+    return renderer
+
+
+def hillshade(band: int) -> Element:
+    """Return a renderer of the shading of heights."""
+    return _renderer("hillshade", band=band, **_SUN)
+
+
+def validity_classes(counts: np.ndarray) -> Element:
+    """Return a renderer of validity flags: a colour and a label for each value that occurs.
+
+    Parameters
+    ----------
+    counts
+        Number of pixels of each value of the band, 65536 integers.
+    """
+    renderer = _renderer("paletted", band=1)
+    palette = SubElement(renderer, "colorPalette")
+    present = np.flatnonzero(counts)
+    classes = classify(present.astype(np.uint16))
+    for place in np.lexsort((-counts[present], classes)):
+        value, kind = int(present[place]), PIXEL_CLASSES[classes[place]]
+        share = 100 * counts[value] / counts.sum()
+        label = f"{value}: {_meaning(value)} ({share:.2g} %)"
+        SubElement(palette, "paletteEntry", value=str(value), color=kind.colour, label=label, alpha="255")
+    return renderer
+
+
+def _meaning(value: int) -> str:
+    """Return the names of the flags of a value; what makes a pixel invalid comes first."""
+    names = [flag.name.replace("_", " ") for flag in FLAGS if flag.value & value & INVALID] or ["valid"]
+    names += [flag.name.replace("_", " ") for flag in FLAGS if flag.value & value & ~INVALID]
+    return ", ".join(names)
+
+
+def _renderer(kind: str, **attributes: object) -> Element:
+    given = {name: str(value) for name, value in attributes.items()}
+    renderer = Element("rasterrenderer", {"type": kind, "opacity": "1", "alphaBand": "-1", "nodataColor": ""} | given)
+    SubElement(renderer, "rasterTransparency")
+    return renderer
+
+
+def add_style(parent: Element, renderer: Element, blend: int) -> None:
+    """Add a renderer to a style or a layer, drawn over what is below with one of QGIS' blend modes; 0 = normal."""
+    pipe = SubElement(parent, "pipe")
+    pipe.append(renderer)
+    SubElement(pipe, "brightnesscontrast", brightness="0", contrast="0", gamma="1")
+    SubElement(pipe, "rasterresampler", maxOversampling="2")
+    SubElement(parent, "blendMode").text = str(blend)
+
+
+def write_style(path: Path, renderer: Element) -> None:
+    """Write the default style of the raster beside it."""
+    root = Element("qgis", version=VERSION, styleCategories="Symbology")
+    add_style(root, renderer, 0)
+    write_xml(path, root, "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n")
+
+
+def write_difference(
+    path: Path, source: tuple[str, int, int], place: Georeferencing, shape: tuple[int, int], factor: float = 1.0
+) -> None:
+    """Write a virtual raster of the difference of two bands, which GDAL computes when it is read.
+
+    Parameters
+    ----------
+    path
+        The file, beside its source.
+    source
+        Name of a raster, the band to subtract from, and the band to subtract, counted from 1.
+    place, shape
+        Georeferencing, rows and columns of the source.
+    factor
+        Factor of the difference.
+    """
+    name, upper, lower = source
+    root = Element("VRTDataset", rasterXSize=str(shape[1]), rasterYSize=str(shape[0]))
+    _add_place(root, place)
+    band = SubElement(root, "VRTRasterBand", dataType="Float32", band="1", subClass="VRTDerivedRasterBand")
+    for tag, text in (("NoDataValue", "nan"), ("PixelFunctionType", "diff"), ("SourceTransferType", "Float32")):
+        SubElement(band, tag).text = text
+    for number in (upper, lower):
+        of_band = SubElement(band, "ComplexSource")
+        SubElement(of_band, "SourceFilename", relativeToVRT="1").text = name
+        SubElement(of_band, "SourceBand").text = str(number)
+        SubElement(of_band, "ScaleOffset").text = "0"
+        SubElement(of_band, "ScaleRatio").text = f"{factor:g}"
+    write_xml(path, root)
+
+
+def _add_place(root: Element, place: Georeferencing) -> None:
+    options = place.creation_options()
+    if place.gcps and place.transform is None:
+        points = SubElement(root, "GCPList", Projection=place.gcps_crs.to_wkt() if place.gcps_crs else "")
+        for row, column, x, y, z in place.gcps:
+            at = {"Pixel": column, "Line": row, "X": x, "Y": y, "Z": z}
+            SubElement(points, "GCP", {key: repr(float(value)) for key, value in at.items()})
+    if place.crs:
+        SubElement(root, "SRS", dataAxisToSRSAxisMapping="1,2").text = place.crs.to_wkt()
+    if place.transform is not None:
+        SubElement(root, "GeoTransform").text = ", ".join(map(repr, place.transform.to_gdal()))
+    if "rpcs" in options:
+        rpcs = SubElement(root, "Metadata", domain="RPC")
+        for key, value in options["rpcs"].items():
+            SubElement(rpcs, "MDI", key=key).text = str(value)
+
+
+def text_of(root: Element, head: str = "") -> bytes:
+    """Return XML with the mark of this tool in its first lines."""
+    root.insert(0, ElementTree.Comment(XML_MARK))
+    ElementTree.indent(root, " ")
+    return (head + ElementTree.tostring(root, encoding="unicode") + "\n").encode()
+
+
+def write_xml(path: Path, root: Element, head: str = "") -> None:
+    """Write XML with the mark of this tool; replaces the file."""
+    with whole_file(path) as new:
+        new.write_bytes(text_of(root, head))

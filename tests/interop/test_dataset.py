@@ -1,0 +1,120 @@
+"""Finished runs as lazy datasets."""
+
+import json
+import subprocess
+import sys
+
+import dask.array
+import numpy as np
+import pytest
+import xarray as xr
+from finished import PLACE, random_bands, write_run
+from numpy.testing import assert_allclose, assert_array_equal
+
+import sat_intervals
+from sat_intervals import RunError, SatIntervalsError, decode_flags, evaluate_run
+from sat_intervals.interop.dataset import Intervals
+from sat_intervals.products import FLAGS, INVALID
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A dataset of a run, opened with small chunks, its folder, bands, validity and truth."""
+    bands, validity, truth = random_bands(70, 90)
+    out = write_run(tmp_path_factory.mktemp("run"), bands, validity, truth)
+    return sat_intervals.open(out, chunks=32), out, bands, validity, truth
+
+
+def test_open__is_lazy_and_has_the_pixels_of_the_files(made):
+    dataset, _, bands, validity, _ = made
+    assert all(isinstance(variable.data, dask.array.Array) for variable in dataset.data_vars.values())
+    assert dataset["lower"].chunksizes == {"y": (32, 32, 6), "x": (32, 32, 26)}
+    for name, band in zip(("disparity", "lower", "upper", "confidence"), bands, strict=True):
+        assert_array_equal(dataset[name], band)
+    assert_array_equal(dataset["validity"], validity)
+    assert_array_equal(dataset["width"], bands[2] - bands[1])
+    part = dataset["disparity"][5:60:7, ::-3]
+    assert_array_equal(part, bands[0][5:60:7, ::-3])
+    assert_allclose(dataset["confidence"][3, 4], bands[3, 3, 4])
+
+
+def test_open__without_chunks_reads_when_indexed(made):
+    _, out, bands, _, _ = made
+    dataset = sat_intervals.open(out, chunks=None)
+    assert dataset.chunks == {}
+    assert_array_equal(dataset["upper"][10:2:-2, 7:7], bands[2][10:2:-2, 7:7])
+    assert_array_equal(dataset["upper"][10:2:-2, 7], bands[2][10:2:-2, 7])
+    assert_array_equal(dataset["upper"].isel(x=[5, 2, 80]), bands[2][:, [5, 2, 80]])
+
+
+@pytest.mark.peer("rioxarray", "odc.geo")
+def test_open__has_a_place_that_rioxarray_and_odc_geo_recognise(made, tmp_path):
+    import odc.geo.xr  # noqa: F401
+    import rioxarray  # noqa: F401
+
+    dataset = made[0]
+    assert dataset.rio.crs == dataset["lower"].rio.crs == PLACE.crs
+    assert tuple(dataset["lower"].rio.transform())[:6] == tuple(PLACE.transform)[:6]
+    box = dataset["lower"].odc.geobox
+    assert (box.shape, box.crs.epsg, tuple(box.transform)[:6]) == ((70, 90), 32631, tuple(PLACE.transform)[:6])
+    assert tuple(dataset.isel(y=slice(10, 20))["lower"].rio.transform())[5] == PLACE.transform.f - 5
+
+
+def test_decode_flags__has_each_flag_and_what_is_valid(made):
+    dataset, _, _, validity, _ = made
+    flags = decode_flags(dataset["validity"])
+    assert [*flags] == ["valid", *(flag.name for flag in FLAGS)]
+    assert isinstance(flags["occlusion"].data, dask.array.Array)
+    for flag in FLAGS:
+        assert_array_equal(flags[flag.name], validity & flag.value != 0)
+        assert flags[flag.name].attrs["long_name"] == flag.meaning
+    assert_array_equal(flags["valid"], validity & INVALID == 0)
+    xr.testing.assert_identical(flags.compute(), dataset.intervals.flags().compute())
+
+
+def test_accessor__coverage_is_the_accuracy_of_evaluate(made):
+    dataset, out, _, _, truth = made
+    assert isinstance(dataset.intervals, Intervals)
+    expected = evaluate_run(out, out.parent / "truth.tif")["all"]["accuracy"]
+    assert 0.2 < expected < 0.98
+    labels = {"y": np.arange(70), "x": np.arange(90)}  # other labels than those of the dataset
+    for true in (truth, xr.DataArray(truth, dims=("y", "x"), coords=labels)):
+        assert_allclose(dataset.intervals.coverage(true), expected, atol=1e-9)
+    assert np.isnan(dataset.intervals.coverage(np.full((70, 90), np.nan)))
+    with pytest.raises(SatIntervalsError, match=r"truth has the shape \(3, 90\), the intervals \(70, 90\)"):
+        dataset.intervals.coverage(truth[:3])
+
+
+def test_accessor__width_and_profile(made):
+    dataset, _, bands, _, _ = made
+    assert_array_equal(dataset.intervals.width(), bands[2] - bands[1])
+    profile = dataset.intervals.profile(69, (3, 8))
+    assert isinstance(profile["upper"].data, np.ndarray)
+    assert_array_equal(profile["upper"], bands[2, 69, 3:9])
+    assert profile.sizes == {"x": 6}
+    for row, columns in ((70, None), (-1, None), (0, (5, 90)), (0, (8, 3))):
+        with pytest.raises(SatIntervalsError, match="are outside the dataset: rows are 0 to 69, columns 0 to 89"):
+            dataset.intervals.profile(row, columns)
+
+
+def test_open__of_a_run_that_was_replaced_does_not_mix_two_runs(tmp_path):
+    bands, validity, _ = random_bands(20, 30)
+    out = write_run(tmp_path, bands, validity)
+    dataset = sat_intervals.open(out)
+    report = json.loads((out / "run.json").read_text())
+    (out / "run.json").unlink()
+    (out / "run.json").write_text(json.dumps(report))
+    with pytest.raises(RunError, match="was replaced while it was read"):
+        dataset["lower"].compute()
+
+
+def test_open__refuses_what_is_no_run(tmp_path):
+    with pytest.raises(SatIntervalsError, match="give the folder of a finished run"):
+        sat_intervals.open(tmp_path)
+
+
+def test_accessor__is_registered_on_first_use_only() -> None:
+    code = "import sat_intervals, xarray as xr; a = hasattr(xr.Dataset, 'intervals'); sat_intervals.open; "
+    code += "print(a, hasattr(xr.Dataset, 'intervals'))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False True\n"
