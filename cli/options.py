@@ -61,6 +61,23 @@ disparity_option = click.option(
 )
 
 
+_SENSOR_OPTIONS = tuple(
+    click.option(f"--{side}-{kind}", required=True, callback=path, metavar="FILE", help=text.format(side))
+    for kind, text in (("model", "RPC model of the {} sensor image."), ("grid", "Epipolar grid of the {} image."))
+    for side in ("left", "right")
+)
+
+
+def sensor_options(command: Command) -> Command:
+    """Add options for models and grids; the command gets ``sensor_files``, in this order."""
+
+    @wraps(command)
+    def with_sensors(*, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path, **others: Any) -> Any:
+        return command(sensor_files=(left_model, right_model, left_grid, right_grid), **others)
+
+    return _with(with_sensors, *_SENSOR_OPTIONS)
+
+
 _IMAGE_OPTIONS = (
     click.option("--left-mask", callback=named, metavar="FILE", help="Mask of the left image: non-zero = masked."),
     click.option("--right-mask", callback=named, metavar="FILE", help="Mask of the right image."),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import log_options, path, quiet_option
+from sat_intervals.cli.options import log_options, path, quiet_option, sensor_options
 
 # Metres between lines of sight above which models are suspect.
 _SUSPECT = 0.1
@@ -12,15 +12,10 @@ _SUSPECT = 0.1
 
 @click.command(short_help="Compute points and height bounds of a run with sensor models.")
 @click.argument("out", callback=path)
-@click.option("--left-model", required=True, callback=path, metavar="FILE", help="RPC model of the left sensor image.")
-@click.option(
-    "--right-model", required=True, callback=path, metavar="FILE", help="RPC model of the right sensor image."
-)
-@click.option("--left-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the left image.")
-@click.option("--right-grid", required=True, callback=path, metavar="FILE", help="Epipolar grid of the right image.")
+@sensor_options
 @quiet_option
 @log_options
-def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path, quiet: bool) -> None:
+def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], quiet: bool) -> None:
     """Triangulate the disparity and both bounds of the finished run in the folder OUT.
 
     \b
@@ -37,12 +32,12 @@ def triangulate(out: Path, left_model: Path, right_model: Path, left_grid: Path,
     from sat_intervals.heights.triangulate import triangulate
 
     with Console(quiet) as console:
-        report = triangulate(out, left_model, right_model, left_grid, right_grid, progress=console.progress)
+        report = triangulate(out, *sensor_files, progress=console.progress)
     if report["points"]:
         (lowest, highest), residual = report["height"], report["residual"][1]
         console.say(
             f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid, "
-            f"lines of sight at most {residual:.2g} m apart"
+            f"lines of sight at most {residual:.2g} m apart (this tests models and grids, not the matches)"
         )
     else:
         console.say("no valid pixels, so no points")
