@@ -22,6 +22,7 @@ from sat_intervals.cli.evaluate import evaluate
 from sat_intervals.cli.export import export
 from sat_intervals.cli.logs import printable
 from sat_intervals.cli.match import match
+from sat_intervals.cli.pair_surface import surface
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
@@ -37,7 +38,7 @@ _ITEM = "\n  "
 # Exit status of a process ended by SIGPIPE.
 READER_GONE = 141
 _NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
-RESUMED = ("match", "demo", "batch")
+RESUMED = ("match", "demo", "batch", "surface")
 
 
 class _Commands(click.Group):
@@ -157,4 +158,5 @@ main.add_command(ablate)
 main.add_command(calibrate)
 main.add_command(triangulate)
 main.add_command(dsm)
+main.add_command(surface)
 main.add_command(export)

@@ -80,8 +80,8 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
     )
     if report["median_half_width"] is not None:
         console.say(
-            f"half width of the intervals ({report['bounds']} of the points' bounds): median "
-            f"{report['median_half_width']:.2f} m, {100 * report['wide']:.1f} % above {WIDE:g} m"
+            f"median half width +-{report['median_half_width']:.2f} m, {100 * report['wide']:.1f} % wider than "
+            f"+-{WIDE:g} m, by --bounds {report['bounds']}"
         )
     for name, what in (
         ("outliers", "points left out as outliers"),

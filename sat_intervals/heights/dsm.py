@@ -102,13 +102,7 @@ def make_surface(
         A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
-    _check_target(path)
-    grid = None
-    if isinstance(resolution, Path):
-        grid, crs = _grid_of(resolution, crs)
-        resolution = grid.resolution
-    radius = resolution if radius is None else radius
-    _check_lengths(resolution, radius)
+    grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius)
     runs = _triangulated([Path(out) for out in outs])
     for run in runs:
         run.check_kept([path], [run.out / "points.tif", geoid])
@@ -137,6 +131,27 @@ def make_surface(
     }
 
 
+def checked_cells(
+    path: Path, resolution: float | Path, crs: str | None, radius: float | None
+) -> tuple[Cells | None, float, str | None, float]:
+    """Check the arguments of `make_surface` that need no run; return the grid of a raster, resolution, CRS and radius.
+
+    Raises
+    ------
+    SatIntervalsError
+        The file to write is something else, or an argument cannot be used.
+    """
+    if path.exists() and not is_surface(path):
+        raise SatIntervalsError(f"{path} exists and is not a surface model: choose another --output")
+    grid = None
+    if isinstance(resolution, Path):
+        grid, crs = _grid_of(resolution, crs)
+        resolution = grid.resolution
+    radius = resolution if radius is None else radius
+    _check_lengths(resolution, radius)
+    return grid, resolution, crs, radius
+
+
 def runs_tag(runs: Sequence[Run]) -> str:
     """Return the tag RUNS of a surface, which identifies its runs."""
     return " ".join(run.report["finished"] for run in runs)
@@ -151,12 +166,6 @@ def _check_lengths(resolution: float, radius: float) -> None:
             f"radius is {radius:g} m, {radius / resolution:.0f} cells of {resolution:g} m: choose at most "
             f"{_REACH * resolution:g} m, or a coarser --resolution"
         )
-
-
-def _check_target(path: Path) -> None:
-    """Raise if the file exists and is not a surface model."""
-    if path.exists() and not is_surface(path):
-        raise SatIntervalsError(f"{path} exists and is not a surface model: choose another --output")
 
 
 def _triangulated(outs: Sequence[Path]) -> list[Run]:
