@@ -66,21 +66,12 @@ def surface(
 
     config = load_config(config_file, with_range(given, disparity, local_range, range_grid))
     with Console(quiet) as console:
-        from sat_intervals.heights.dsm import checked_cells, make_surface
-        from sat_intervals.heights.sensors import Sensors
+        from sat_intervals.heights.dsm import make_surface
         from sat_intervals.heights.triangulate import triangulate
-        from sat_intervals.raster.identity import check_not_replaced
         from sat_intervals.run.before import report_before
-        from sat_intervals.run.output import OUTPUTS
         from sat_intervals.run.pair import match_pair
 
-        results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
-        like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
-        read = [config_file, *sensor_files, cells["geoid"], *like]
-        check_not_replaced(read, results, [out / "tiles"])
-        # What can be wrong is found before hours of matching.
-        checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
-        Sensors.load(*sensor_files)
+        _check(out, cells, sensor_files, config_file)
         images = open_images(left, right)
         report = None if overwrite else report_before(*images, out, config, window)
         if report is None:
@@ -92,3 +83,17 @@ def surface(
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))
     check_strict(strict, report["warnings"])
+
+
+def _check(out: Path, cells: dict[str, Any], sensor_files: tuple[Path, Path, Path, Path], config: Path | None) -> None:
+    """Raise for what the later steps cannot use, before hours of matching."""
+    from sat_intervals.heights.dsm import checked_cells
+    from sat_intervals.heights.sensors import Sensors
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.run.output import OUTPUTS
+
+    results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
+    like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
+    check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
+    checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
+    Sensors.load(*sensor_files)
