@@ -35,7 +35,7 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(PYTEST) --quiet tests/test_architecture.py
 
-# The tables of docs/speed.md: this project beside its peers; about thirteen minutes.
+# The tables of docs/speed.md: this project beside its peers; about fifteen minutes.
 bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
 
@@ -55,7 +55,7 @@ calibration: $(VENV)/.has-mccnn
 surface-bounds: $(VENV)/.has-dsm
 	$(BIN)/python -W ignore tests/benchmarks/surface_bounds.py
 
-# The tables of docs/coverage.md, on the same pairs; about half an hour.
+# The tables of docs/coverage.md, on the same pairs; about five minutes after `make calibration`, else half an hour more.
 coverage: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/coverage_tables.py
 

@@ -27,6 +27,7 @@ from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
 from sat_intervals.cli.range import search_range
+from sat_intervals.cli.reference import reference
 from sat_intervals.cli.report import report
 from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
@@ -159,4 +160,5 @@ main.add_command(calibrate)
 main.add_command(triangulate)
 main.add_command(dsm)
 main.add_command(surface)
+main.add_command(reference)
 main.add_command(export)

@@ -12,8 +12,9 @@ from sat_intervals.cli.pairs import finite
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
+    from sat_intervals.config import Calibration
     from sat_intervals.config.pairs import Pair
-    from sat_intervals.run.calibrate import Subject
+    from sat_intervals.run.measure import Subject
 
 _FILE = click.Path(path_type=Path)
 _CALIBRATION = """\
@@ -77,7 +78,8 @@ def calibrate(
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.calibrate import calibration_from, check_subjects, measure_subjects
+    from sat_intervals.run.calibrate import calibration_from, check_subjects
+    from sat_intervals.run.measure import measure_subjects
 
     settings = _Settings(config_file, given, tolerance, remove_bias, by_group)
     subjects = _subjects(pairs, truth, settings)
@@ -87,11 +89,11 @@ def calibrate(
     check_subjects(subjects)
     with Console(quiet) as console:
         if tune:
-            _tune(subjects, output, folder, console)
+            _tune(subjects, output, folder, name, console)
             return
         parts = measure_subjects(subjects, folder, console.progress)
     calibration, expected = calibration_from(parts, subjects, name or output.stem)
-    _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
+    write_calibration(output, calibration)
     if not quiet:
         show_calibration(calibration, expected)
         click.echo(str(output))
@@ -113,7 +115,12 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Sett
     from sat_intervals.config.pairs import check_names, find_pairs, is_pair
     from sat_intervals.errors import SatIntervalsError
 
-    is_run = [(path / "run.json").exists() or not is_pair(path) for path in paths]
+    is_run = [(path / "run.json").exists() for path in paths]
+    if unknown := [path for path, run in zip(paths, is_run, strict=True) if not run and not is_pair(path)]:
+        raise SatIntervalsError(
+            f"{unknown[0]} is no pair and no finished run: give a folder with left.tif, right.tif, truth.tif and "
+            "meta.json, a CSV file, or the folder of a run"
+        )
     find_pairs(source for source, run in zip(paths, is_run, strict=True) if not run)  # raises if a pair is given twice
     found: list[tuple[Path, Pair | None]] = []
     for source, run in zip(paths, is_run, strict=True):
@@ -131,7 +138,7 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Sett
 def _of_pair(pair: "Pair", truth: Path | None, settings: _Settings) -> "Subject":
     from sat_intervals.config import load_config
     from sat_intervals.raster import open_image
-    from sat_intervals.run.calibrate import Subject, truth_of
+    from sat_intervals.run.measure import Subject, truth_of
 
     search = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
     config = load_config(settings.config_file, settings.given | search)
@@ -150,11 +157,11 @@ def _of_pair(pair: "Pair", truth: Path | None, settings: _Settings) -> "Subject"
 
 def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
     """Open a finished run, with its own settings unless the options choose others."""
-    from sat_intervals.config import load_config
+    from sat_intervals.config import Cluster, load_config
     from sat_intervals.config.pairs import group_beside
     from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
-    from sat_intervals.run.calibrate import Subject
+    from sat_intervals.run.measure import Subject
 
     run = open_results(out, truth)
     if run.truth is None:
@@ -163,7 +170,8 @@ def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
         search = {"disparity": run.config.disparity.model_dump()}
         config = load_config(settings.config_file, settings.given | search)
     else:
-        config = load_config(run.config, settings.given)
+        here = run.config.model_copy(update={"cluster": Cluster()})  # the run's may be jobs of a batch system
+        config = load_config(here, settings.given)
     group = group_beside(run.left.path) if settings.by_group else str(out)
     return Subject(
         str(out), group, run.left, run.right, run.truth, config, run.region, settings.tolerance, settings.remove_bias
@@ -180,6 +188,11 @@ def _checked_folder(output: Path) -> Path:
     return folder
 
 
+def write_calibration(output: Path, calibration: "Calibration") -> None:
+    """Write a calibration with an explanation."""
+    _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
+
+
 def _write(output: Path, head: str, content: dict[str, Any]) -> None:
     import yaml
 
@@ -189,18 +202,25 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
 
 
-def _tune(subjects: "list[Subject]", output: Path, folder: Path, console: "Console") -> None:
+def _tune(subjects: "list[Subject]", output: Path, folder: Path, name: str | None, console: "Console") -> None:
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
+    from sat_intervals.errors import RunError, SatIntervalsError
     from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
         console.say("MC-CNN is left out: pip install sat-intervals[mccnn]")
     found = []
-    for name, changes in candidates(with_network=has_network()):
-        console.say(f"calibrating {name}")
-        found.append(tuned(name, changes, subjects, folder, console.progress))
+    for label, changes in candidates(subjects[0].config, with_network=has_network()):
+        console.say(f"calibrating {label}")
+        try:
+            found.append(tuned(label, changes, subjects, folder, console.progress))
+        except RunError:
+            raise
+        except SatIntervalsError as error:
+            console.say(f"{label} is left out: {error}")
     best = best_of(found)
-    show_tuned(found, best)
-    _write(output, _SETTINGS, settings_of(best))
+    if not console.quiet:
+        show_tuned(found, best)
+    _write(output, _SETTINGS, settings_of(best, name or best.name))
     console.say(str(output))

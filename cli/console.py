@@ -24,7 +24,11 @@ STAGES = {
     "points": "triangulating rows",
     "extent": "reading points",
     "cells": "filling rows of cells",
+    "registration": "registering the reference",
+    "reference": "reading points",
+    "truth": "finding disparities of rows",
     "files": "writing files",
+    "compared": "matching again, to compare",
 }
 
 
@@ -41,6 +45,7 @@ class Console:
     """Shows progress: a bar on a terminal, plain lines elsewhere, nothing with ``--quiet``."""
 
     def __init__(self, quiet: bool) -> None:
+        self.quiet = quiet
         # Paths may have square brackets and colons, which are not markup.
         self._terminal = _Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
         self._bar = Progress(

@@ -86,7 +86,7 @@ def demo(
 
 def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Console") -> None:
     """Match again with a coverage, or with alpha if the run has a coverage, and print widths and scores of both."""
-    from sat_intervals.config import ConfigError, load_config, resolved
+    from sat_intervals.config import Cluster, ConfigError, load_config, resolved
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.run.pair import match_pair
 
@@ -97,10 +97,13 @@ def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Con
     nominal = getattr(own, one)
     names, interval = [f"{one} {nominal}", f"{other_one} {nominal}"], {other_one: nominal}
     try:
-        other = resolved(load_config(config, {"interval": interval, "cluster": {"store": None}}))
+        # other machines do not see the folder
+        here = config.model_copy(update={"cluster": Cluster(workers=config.cluster.workers)})
+        other = resolved(load_config(here, {"interval": interval}))
     except ConfigError:  # no built-in calibration, or a coverage that none has
         return
     with TemporaryDirectory(prefix="sat-intervals-") as folder:
+        console.progress("compared", 0, 1)
         match_pair(out / "left.tif", out / "right.tif", folder, other)
         beside = evaluate_run(folder, out / "truth.tif")["all"]
     for name, of in zip(names, (figures, beside), strict=True):

@@ -1,6 +1,5 @@
 """``sat-intervals evaluate``: how often intervals contain the truth, and how wide they are."""
 
-import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import click
 
 from sat_intervals.cli.options import COSTS
 from sat_intervals.cli.pairs import judging_options, overrides, say_json
+from sat_intervals.cli.surface import Surface, surface_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -39,8 +39,7 @@ class _Source:
 @click.option("--mask", type=_FILE, multiple=True, help="Pixels to evaluate (not 0); one for each OUT, in that order.")
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
 @click.option("--group", metavar="LABEL", help="Put all scenes in this group; ignore meta.json.")
-@click.option("--dsm", type=_FILE, help="Evaluate this surface model against --reference, instead of runs.")
-@click.option("--reference", type=_FILE, help="Reference heights above the same datum, in any CRS.")
+@surface_options
 @click.option(
     "--cost", type=click.Choice(COSTS), multiple=True, help="Matching cost of pairs; give it twice to compare both."
 )
@@ -51,8 +50,7 @@ def evaluate(
     mask: tuple[Path, ...],
     remove_bias: bool,
     group: str | None,
-    dsm: Path | None,
-    reference: Path | None,
+    surface: Surface | None,
     cost: tuple[str, ...],
     config_file: Path | None,
     preset: str | None,
@@ -66,30 +64,30 @@ def evaluate(
     Prints figures over valid pixels: accuracy (share of intervals that contain the truth), relative size (median width
     / width of the search range) and, for low confidence, relative overestimation (median of 1 - largest error of the
     area / width). If a run kept rejected pixels, also prints figures over all pixels with an interval. For several OUT,
-    prints means over the scenes of each group (the paper's table 1); `group` is read from meta.json beside the left
-    image.
+    prints means over the scenes of each group (the paper's table 1), and the coverage of each scene; `group` is read
+    from meta.json beside the left image.
 
     Without --truth, the truth is truth.tif beside the left image. OUT may also be a pair, which is matched first: a
     folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum], `group`), or a CSV file
     with the columns left, right, truth, minimum, maximum and optionally name and group. Its paths are relative to the
     file.
 
-    For a surface model (--dsm), prints the share of reference heights inside the cells' intervals, the median width,
-    the median of height - reference and its NMAD (1.4826 times the median distance from the median), by slope of the
-    reference and by width of the interval.
+    For a surface model (--dsm), prints bias, median, NMAD (1.4826 times the median distance from the median), RMSE and
+    LE90 of height - reference, the share of reference heights inside the cells' intervals and the half widths, by slope
+    of the reference, by width of the interval and by --classes. The reference is first moved by its constant shift from
+    the surface; figures of all cells are printed before and after that.
     """
-    if dsm or reference:
-        for name, value in (
-            ("--truth", truth), ("--mask", mask), ("--remove-bias", remove_bias), ("--group", group), ("--cost", cost),
-            ("--config", config_file), ("--preset", preset), ("--accurate", accurate), ("--tolerance", tolerance),
-        ):  # fmt: skip
-            if value:
-                raise click.UsageError(f"{name} applies to runs and pairs, not to --dsm: leave it out.")
-        _evaluate_surface(folders, dsm, reference, as_json)
+    if surface:
+        others = {
+            "--truth": truth, "--mask": mask, "--remove-bias": remove_bias, "--group": group, "--cost": cost,
+            "--config": config_file, "--preset": preset, "--accurate": accurate, "--tolerance": tolerance,
+        }  # fmt: skip
+        surface.check_alone(folders, others)
+        surface.evaluate(as_json)
         return
-    from sat_intervals.cli.tables import show_groups, show_missed, show_scene
+    from sat_intervals.cli.tables import show_scene, show_scenes
     from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.evaluate.paper import SceneMetrics, table_1
+    from sat_intervals.evaluate.paper import SceneMetrics
 
     sources = _sources(folders, truth, mask, cost)
     configs = _configs(sources, config_file, preset, accurate, cost)
@@ -105,8 +103,7 @@ def evaluate(
     elif len(scenes) == 1:
         show_scene(scenes[0])
     else:
-        show_groups(table_1(scenes), "means over scenes, valid pixels")
-        show_missed(scenes)
+        show_scenes(scenes)
 
 
 def _warn_of_whole_truth(scenes: "list[SceneMetrics]", tolerance: float) -> None:
@@ -114,21 +111,6 @@ def _warn_of_whole_truth(scenes: "list[SceneMetrics]", tolerance: float) -> None
     names = [scene.name for scene in scenes if scene.report["truth_is_whole"]]
     if names and not tolerance:
         click.echo(f"warning: the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5", err=True)
-
-
-def _evaluate_surface(folders: tuple[Path, ...], dsm: Path | None, reference: Path | None, as_json: bool) -> None:
-    if not (dsm and reference):
-        raise click.UsageError("--dsm and --reference go together: give both.")
-    if folders:
-        raise click.UsageError(f"{folders[0]} is a run and --dsm a surface model: evaluate one of them at a time.")
-    from sat_intervals.cli.tables import show_surface
-    from sat_intervals.evaluate.dsm import evaluate_surface
-
-    report = evaluate_surface(dsm, reference)
-    if as_json:
-        click.echo(json.dumps(report, indent=1))
-    else:
-        show_surface(str(dsm), report)
 
 
 def _sources(

@@ -54,8 +54,8 @@ def plan(
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.config import load_config
-    from sat_intervals.run.cluster import parse_memory
     from sat_intervals.run.plan import plan as make_plan
+    from sat_intervals.run.workers import parse_memory
 
     config = load_config(config_file, with_range(given, disparity, local_range, range_grid))
     limit = parse_memory(memory) if memory else None

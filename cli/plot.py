@@ -2,10 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sat_intervals.cli.options import log_options
+from sat_intervals.cli.pairs import finite
+
+if TYPE_CHECKING:
+    from sat_intervals.results import Results
 
 _FILE = click.Path(path_type=Path)
 _PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
@@ -20,6 +25,12 @@ _PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm
 @click.option(
     "--beside", type=_FILE, multiple=True, metavar="OUT", help="Run of the same pair at another coverage, to draw too."
 )
+@click.option("--mask", type=_FILE, help="Pixels that coverage.png counts (not 0).")
+@click.option(
+    "--tolerance", type=click.FloatRange(min=0), default=0.0, callback=finite, metavar="PX",
+    help="In coverage.png, truth up to PX outside an interval counts as inside.",
+)  # fmt: skip
+@click.option("--remove-bias", is_flag=True, help="In coverage.png, add the median of disparity - truth to the truth.")
 @click.option("--dpi", type=click.IntRange(30, 600), default=110, show_default=True, help="Dots per inch.")
 @log_options
 def plot(
@@ -30,6 +41,7 @@ def plot(
     pixel: tuple[int, int] | None,
     beside: tuple[Path, ...],
     dpi: int,
+    **judging: Any,
 ) -> None:
     """Draw pictures of the finished run in the folder OUT and write them there.
 
@@ -55,20 +67,15 @@ def plot(
     from sat_intervals.show.search_range import draw_range, has_range
 
     results = open_results(out, truth)
-    if columns is not None and row is None:
-        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
+    _check(results, row, columns, pixel)
     is_judged = None not in (results.truth, results.config.interval)
     if beside and not is_judged:
         raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
-    if row is not None:
-        results.check_part(row, columns)
-    if pixel:
-        results.check_pixel(*pixel)
     results.check_kept([out / f"{name}.png" for name in _PICTURES], [truth, out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
     if is_judged:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)
-        drawings["coverage"] = lambda path: draw_coverage([out, *beside], truth, path, dpi)
+        drawings["coverage"] = lambda path: draw_coverage([out, *beside], path, dpi, truth=truth, **judging)
     if has_range(results):
         drawings["range"] = lambda path: draw_range(results, path, dpi)
     if row is not None:
@@ -81,6 +88,18 @@ def plot(
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
+
+
+def _check(results: "Results", row: int | None, columns: tuple[int, int] | None, pixel: tuple[int, int] | None) -> None:
+    """Raise if a profile or a pixel is outside the results."""
+    from sat_intervals.errors import SatIntervalsError
+
+    if columns is not None and row is None:
+        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
+    if row is not None:
+        results.check_part(row, columns)
+    if pixel:
+        results.check_pixel(*pixel)
 
 
 def _is_current(surface: Path, finished: str) -> bool:

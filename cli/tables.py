@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up
+from sat_intervals.evaluate.paper import ACCURACY, OBJECTIVE, Row, SceneMetrics, look_up, table_1
 
 if TYPE_CHECKING:
     from sat_intervals.config import Calibration
@@ -56,7 +56,23 @@ def show_groups(rows: Sequence[Row], title: str) -> None:
         )
 
 
-def show_missed(scenes: Sequence[SceneMetrics]) -> None:
+def show_scenes(scenes: Sequence[SceneMetrics]) -> None:
+    """Print the paper's table 1, and each scene's coverage beside the nominal one, with widths and interval scores."""
+    show_groups(table_1(scenes), "means over scenes, valid pixels")
+    _show_missed(scenes)
+    paths = [
+        ("nominal",), ("all", "accuracy"), ("high", "accuracy"), ("low", "accuracy"), ("all", "mean_width"),
+        ("all", "median_width"), ("all", "interval_score"),
+    ]  # fmt: skip
+    figures = {scene.name: [look_up(scene.report, path) for path in paths] for scene in scenes}
+    known = [[value for value in column if value is not None] for column in zip(*figures.values(), strict=True)]
+    figures["mean"] = [sum(column) / len(column) if column else None for column in known]
+    header = ["", "nominal", "coverage", "high", "low", "mean width", "median width", "score"]
+    rows = [[name, *map(_figure, values)] for name, values in figures.items()]
+    show(header, rows, "coverage asked for (or alpha) and measured, widths and interval score (px), valid pixels")
+
+
+def _show_missed(scenes: Sequence[SceneMetrics]) -> None:
     """List the scenes below the paper's objective."""
     accuracies = {scene.name: look_up(scene.report, ACCURACY) for scene in scenes}
     missed = [f"{name} ({_figure(value)})" for name, value in accuracies.items() if (value or 0.0) < OBJECTIVE]
@@ -104,15 +120,74 @@ def show_scene(scene: SceneMetrics) -> None:
         show(["confidence", "pixels", "accuracy", "mean width (px)"], deciles, "by decile of confidence")
 
 
+# Columns of the figures of a surface model: key, and heading.
+_ACCURACY = {
+    "count": "cells", "bias": "bias (m)", "median": "median (m)", "nmad": "NMAD (m)", "rmse": "RMSE (m)",
+    "le90": "LE90 (m)", "p95_p5": "P95-P5 (m)", "coverage": "coverage", "mean_half_width": "mean half width (m)",
+    "median_half_width": "median half width (m)", "interval_score": "interval score (m)",
+}  # fmt: skip
+
+
 def show_surface(name: str, report: dict[str, Any]) -> None:
-    """Print the figures of a surface model, by slope and by width of the interval."""
-    columns = ("accuracy", "median_width", "bias", "nmad")
-    rows = [["all cells", *_measures(report["all"], *columns)]]
+    """Print the figures of a surface model: registration, then all cells and classes."""
+    for line in registration_lines(report["registration"]):
+        click.echo(line)
+    show(*_surface_table(report), name)
+    for line in _notes(report):
+        click.echo(line)
+
+
+def surface_markdown(name: str, report: dict[str, Any]) -> str:
+    """Return the figures of a surface model as a Markdown document."""
+    header, rows = _surface_table(report)
+    table = [header, ["---"] * len(header), *rows]
+    lines = [f"# {name}", "", *(f"- {line}" for line in registration_lines(report["registration"])), ""]
+    lines += [f"| {' | '.join(row)} |" for row in table]
+    return "\n".join([*lines, "", *(f"- {line}" for line in _notes(report)), ""])
+
+
+def _surface_table(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return the header and the rows of the figures of a surface model."""
+    named = [("all cells", report["all"])]
+    if report["registration"]:
+        named = [("all cells, before registration", report["before"]), ("all cells, after", report["all"])]
     for key, label in (("slope", "slope {} degrees"), ("width", "width {} m")):
         for kind in report[key]:
             ends = f"{kind['from']:g} to {kind['to']:g}" if kind["to"] is not None else f"from {kind['from']:g}"
-            rows.append([label.format(ends), *_measures(kind, *columns)])
-    show(["", "cells", "accuracy", "median width (m)", "bias (m)", "NMAD (m)"], rows, name)
+            named.append((label.format(ends), kind))
+    named += [(f"class {kind['class']}", kind) for kind in report["classes"]]
+    keys = list(_ACCURACY)[1:]
+    return ["", *_ACCURACY.values()], [[label, *_measures(kind, *keys)] for label, kind in named]
+
+
+def _notes(report: dict[str, Any]) -> list[str]:
+    nominal = report["nominal"]
+    return [
+        "errors are height - reference; bias is their mean; LE90: 90 % of the absolute errors are not larger",
+        "nominal coverage, or alpha: unknown, so no interval scores"
+        if nominal is None
+        else f"nominal coverage, or alpha: {nominal:g}; the interval score judges for it, less is better",
+    ]
+
+
+def registration_lines(found: dict[str, Any] | None) -> list[str]:
+    """Return lines for people about a registration: the shift, and figures before and after it."""
+    if found is None:
+        return []
+    east, north, up = (
+        f"{value:+.2f} m" + ("" if deviation is None else f" (standard deviation {deviation:.2g})")
+        for value, deviation in zip(found["shift"], found["deviation"], strict=True)
+    )
+    lines = [f"reference moved: easting {east}, northing {north}, height {up}"]
+    if not found["is_horizontal"]:
+        lines = [f"reference moved: height {up}; easting and northing cannot be told here, as on flat ground"]
+    for when in ("before", "after"):
+        figures = found[when]
+        lines.append(
+            f"height - reference {when}: median {figures['median']:.2f} m, NMAD {figures['nmad']:.2f} m, "
+            f"LE90 {figures['le90']:.2f} m, {figures['count']} points"
+        )
+    return lines
 
 
 def show_calibration(calibration: "Calibration", expected: Sequence[dict[str, float]]) -> None:

@@ -64,7 +64,7 @@ FLAGS = (
     Flag(7, "right_masked", "all candidates impossible, at least one through the right mask", True),
     Flag(8, "occlusion", "rejected by cross-checking: occlusion", True),
     Flag(9, "mismatch", "rejected by cross-checking: mismatch", True),
-    Flag(11, "regularized", "interval regularised in a low-confidence area", False),
+    Flag(11, "regularized", "low confidence; interval regularised, unless the calibration has no quantile", False),
     Flag(13, "range_end", "best candidate at an end of the search range, or next to it", False),
     Flag(14, "open_below", "interval open below: the disparity may lie before the search range", False),
     Flag(15, "open_above", "interval open above: the disparity may lie behind the search range", False),
@@ -143,6 +143,9 @@ POINTS = (
     Band("longitude_upper", "degree", "of the point at height_upper"),
     Band("latitude_upper", "degree", "of the point at height_upper"),
 )
+
+# The band of true disparities made from reference heights.
+TRUTH = (Band("disparity", "px", "of the reference height that the left sensor sees at the pixel's centre"),)
 
 # Bands of a surface model.
 SURFACE = (

@@ -504,7 +504,7 @@ def cuts_of(volume, cost_span, config):
         return
     levels = [Fraction((1 - Decimal(str(config.interval.alpha or 1))) * cost_span)]
     if config.interval.coverage is not None:
-        levels = [Fraction(config.cuts.high), Fraction(config.cuts.low)][: 2 if config.regularization else 1]
+        levels = [Fraction(config.cuts.high), Fraction(config.cuts.low)]
     for level in levels:
         yield tuple(bound / 64 for bound in subpixel_cut(volume, level, 64, refine))
 
@@ -576,6 +576,7 @@ def match_arrays(left, right, left_state, right_state, config):
         quantile = settings.quantile
         if is_subpixel:
             quantile = config.cuts.quantile
+        if quantile is not None and is_subpixel:
             lower, upper = (
                 np.where(low, rounded(8 * bound) / 8, bound) for rounded, bound in ((np.floor, lower), (np.ceil, upper))
             )

@@ -1,6 +1,6 @@
 """Settings: defaults, ranges, one-line descriptions and derived thresholds."""
 
-from sat_intervals.config.calibration import Calibration, calibration_of, key_of, load_calibration, resolved
+from sat_intervals.config.calibration import Calibration, calibration_of, key_of, load_calibration, resolved, unreached
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
@@ -41,4 +41,5 @@ __all__ = [
     "load_config",
     "preset_text",
     "resolved",
+    "unreached",
 ]

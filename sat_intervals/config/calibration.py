@@ -3,11 +3,13 @@
 import hashlib
 import json
 import os
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -29,26 +31,27 @@ class _Model(BaseModel):
 
 
 class Levels(_Model):
-    """The three numbers of one coverage.
+    """Levels that intervals are cut at, and the quantile of their regularisation.
 
-    ``high`` and ``low`` are the levels of pixels of high and low confidence: excess ``S(d) - min S`` of the aggregated
-    cost, real numbers in the unit of the kernels' integer costs. That is the sum over the 8 paths of SGM (one cost
-    without SGM), times the `steps` of the matching cost: 1 for Census, 125 for MC-CNN. ``quantile`` is that of the
-    regularisation of low-confidence segments; None leaves them as they are.
+    Attributes
+    ----------
+    coverage
+        Share of true disparities to be inside; None for levels that come from alpha.
+    high, low
+        Levels of pixels of high and low confidence: excess ``S(d) - min S`` of the aggregated cost, real numbers in the
+        unit of the kernels' integer costs. That is the sum over the 8 paths of SGM (one cost without SGM), times the
+        `steps` of the matching cost: 1 for Census, 125 for MC-CNN.
+    quantile
+        Of the regularisation of low-confidence segments; None leaves them as they are.
+    reached
+        False if the pairs of the calibration did not reach the coverage in a class, at any level.
     """
 
-    coverage: float
+    coverage: float | None
     high: float = Field(ge=0, le=IMPOSSIBLE_COST)
     low: float = Field(ge=0, le=IMPOSSIBLE_COST)
     quantile: float | None = Field(ge=0.5, le=1)
-
-
-class Cuts(NamedTuple):
-    """What a run takes from a calibration, in the units of `Levels`."""
-
-    high: float
-    low: float
-    quantile: float | None
+    reached: bool = True
 
 
 class Calibration(_Model):
@@ -77,7 +80,7 @@ class Calibration(_Model):
     def _check_order(cls, rows: tuple[Levels, ...]) -> tuple[Levels, ...]:
         found = tuple(row.coverage for row in rows)
         if found != COVERAGES:
-            words = [", ".join(f"{coverage:g}" for coverage in order) for order in (found, COVERAGES)]
+            words = [", ".join(map(str, order)) for order in (found, COVERAGES)]
             raise ValueError(f"coverages are {words[0]}, needed in this order: {words[1]}")
         for one, next_one in pairwise(rows):
             # low-confidence pixels may need a lower level with a higher quantile
@@ -117,6 +120,8 @@ def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calib
     except OSError as error:
         known = ", ".join(name for name, _ in _built_in_files()) or "none"
         raise ConfigError(f"calibration {file}: {error.strerror} (built in: {known}): {_MAKE_ONE}") from error
+    if "levels" not in values and values.keys() & {"preset", "disparity", "cost", "sgm", "interval"}:
+        raise ConfigError(f"{file} has settings, not a calibration: give it by --config")
     return _checked(values, str(file))
 
 
@@ -170,33 +175,41 @@ def calibration_of(config: "Config") -> Calibration:
     Raises
     ------
     ConfigError
-        The one given belongs to other settings, or no built-in one to these.
+        The one given belongs to other settings, or no built-in one to these; names the first difference.
     """
     assert config.interval is not None
     given, key = config.interval.calibration, key_of(config)
     if isinstance(given, Calibration):
-        if given.key != key:
-            raise ConfigError(
-                f"calibration {given.name} belongs to other settings, {_difference(given.key, key)}: {_MAKE_ONE}"
-            )
+        if different := _differences(given.key, key):
+            raise ConfigError(f"calibration {given.name} belongs to other settings, {different[0]}: {_MAKE_ONE}")
         return given
-    built_in = [load_calibration(file) for _, file in _built_in_files()]
-    for calibration in built_in:
-        if calibration.key == key:
+    names = [name for name, _ in _built_in_files()]
+    for name in sorted(names, key=lambda name: name != config.preset):  # that of the preset first: reading takes 20 ms
+        if (calibration := _built_in(name)).key == key:
             return calibration
-    known = ", ".join(calibration.name for calibration in built_in) or "none"
-    raise ConfigError(f"no built-in calibration (known: {known}) belongs to these settings: {_MAKE_ONE}")
+    differences = {name: _differences(_built_in(name).key, key) for name in names}
+    nearest = min(names, key=lambda name: len(differences[name]))
+    raise ConfigError(
+        f"no built-in calibration belongs to these settings (that of {nearest} is the nearest: "
+        f"{', '.join(differences[nearest][:3])}): {_MAKE_ONE}"
+    )
 
 
-def _difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return the first difference of two keys in words."""
+@cache
+def _built_in(name: str) -> Calibration:
+    return load_calibration(name)
+
+
+def _differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+    """Return the differences of two keys in words."""
     one, other = _flat(there), _flat(here)
+    found = []
     for name in {**other, **one}:
         if one.get(name) != other.get(name):
             words = ["null" if key.get(name) is None else key[name] for key in (one, other)]
-            return f"{name} is {words[0]} there and {words[1]} here"
-    name = min(one.keys() ^ other.keys())  # a null that the other lacks
-    return f"{name} is only {'there' if name in one else 'here'}"
+            found.append(f"{name} is {words[0]} there and {words[1]} here")
+    # a null or an empty section that the other lacks counts only if nothing else differs
+    return found or [f"{name} is only {'there' if name in one else 'here'}" for name in one.keys() ^ other.keys()]
 
 
 def _flat(key: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -221,23 +234,30 @@ def resolved(config: "Config") -> "Config":
     return config.model_copy(update={"interval": interval})
 
 
-def at(calibration: Calibration, coverage: float) -> Cuts:
-    """Return the levels and the quantile of a coverage, linear between those of COVERAGES.
+def unreached(config: "Config") -> str:
+    """Return a line that names a coverage which the calibration does not reach; empty if it does, or with alpha."""
+    levels = config.cuts
+    if levels is None or levels.reached:
+        return ""
+    return (
+        f"the pairs of calibration {calibration_of(config).name} do not reach coverage {levels.coverage:g} at any "
+        "level: expect less, or ask for less"
+    )
 
-    Where only one neighbour has a quantile, low-confidence pixels take level and quantile of the larger coverage.
+
+def at(calibration: Calibration, coverage: float) -> Levels:
+    """Return the levels of a coverage, linear between those of COVERAGES.
+
+    Where the quantiles of both neighbours differ, low-confidence pixels take level and quantile of the larger one.
     """
     if not COVERAGES[0] <= coverage <= COVERAGES[-1]:
         raise ConfigError(f"coverage is {coverage:g}, allowed: {COVERAGES[0]} to {COVERAGES[-1]}")
-    one, other = next(rows for rows in pairwise(calibration.levels) if coverage <= rows[1].coverage)
-    share = (coverage - one.coverage) / (other.coverage - one.coverage)
-
-    def between(below: float, above: float) -> float:
-        return below + share * (above - below) if share < 1 else above
-
-    if share == 0:
-        return Cuts(one.high, one.low, one.quantile)
-    high = between(one.high, other.high)
-    if one.quantile is None or other.quantile is None:
-        low = between(one.low, other.low) if one.quantile == other.quantile else other.low
-        return Cuts(high, low, other.quantile)
-    return Cuts(high, between(one.low, other.low), between(one.quantile, other.quantile))
+    above = bisect_left(COVERAGES, coverage)
+    other = calibration.levels[above]
+    if coverage == COVERAGES[above]:
+        return other
+    one = calibration.levels[above - 1]
+    share = (coverage - COVERAGES[above - 1]) / (COVERAGES[above] - COVERAGES[above - 1])
+    high, low = one.high + share * (other.high - one.high), one.low + share * (other.low - one.low)
+    low = low if one.quantile == other.quantile else other.low
+    return other.model_copy(update={"coverage": coverage, "high": high, "low": low})

@@ -93,8 +93,11 @@ def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
 
 def _read_yaml(file: Path) -> Mapping[str, Any]:
     try:
-        return read_mapping(file, f"sections {', '.join(Config.model_fields)}")
+        values = read_mapping(file, f"sections {', '.join(Config.model_fields)}")
     except OSError as error:
         preset = isinstance(error, FileNotFoundError) and file.suffix == ".yaml" and file.stem in PRESETS
         hint = f" (give --preset {file.stem} for the preset of the package)" if preset else ""
         raise ConfigError(f"{file}: {error.strerror}{hint}") from error
+    if {"key", "levels"} <= values.keys():
+        raise ConfigError(f"{file} is a calibration: give it by --calibration, with --coverage")
+    return values

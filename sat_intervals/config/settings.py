@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from sat_intervals.config.calibration import Calibration, Cuts, at, calibration_of
+from sat_intervals.config.calibration import Calibration, Levels, at, calibration_of
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import AnySgm, CosineSgm, MccnnSgm, Sgm
 from sat_intervals.config.presets import PRESETS, with_preset
@@ -84,6 +84,11 @@ class Config(Section):
             raise ValueError(
                 f"regularization needs {' and '.join(off)}, set to null: give {' and '.join(off)} or set "
                 "regularization to null too"
+            )
+        if self.interval is not None and self.interval.coverage is not None and self.regularization is None:
+            raise ValueError(
+                f"interval.coverage is {self.interval.coverage} and regularization null, but calibrations are for two "
+                "classes of confidence, which it makes: give regularization, or alpha instead of the coverage"
             )
         if self.disparity.is_local and self.cross_check and self.cross_check.method == "accurate":
             raise ValueError(
@@ -176,7 +181,7 @@ class Config(Section):
         return floor((1 - Fraction(self.interval.alpha)) * self.cost_span)
 
     @property
-    def cuts(self) -> Cuts | None:
+    def cuts(self) -> Levels | None:
         """Return the levels of sub-pixel cuts in integer costs, and the quantile of the regularisation.
 
         With alpha both levels are the same. None without intervals, and with bounds in whole pixels. Whether a
@@ -194,17 +199,15 @@ class Config(Section):
             calibration = given if isinstance(given, Calibration) else calibration_of(self)
             return at(calibration, float(self.interval.coverage))
         level = float((1 - Fraction(self.interval.alpha or 1)) * self.cost_span)
-        return Cuts(level, level, self.regularization.quantile if self.regularization else None)
+        quantile = self.regularization.quantile if self.regularization else None
+        return Levels(coverage=None, high=level, low=level, quantile=quantile)
 
     @property
     def subpixel_levels(self) -> int:
-        """Return the number of levels of sub-pixel bounds: 2 with a coverage, 1 with alpha, 0 for whole pixels.
-
-        With a coverage and no regularisation there are no classes of confidence, and so 1 level.
-        """
+        """Return the number of levels of sub-pixel bounds: 2 with a coverage, 1 with alpha, 0 for whole pixels."""
         if self.interval is None or self.interval.bounds == "whole":
             return 0
-        return 2 if self.interval.coverage is not None and self.regularization is not None else 1
+        return 1 if self.interval.coverage is None else 2
 
     @property
     def bound_steps(self) -> int:

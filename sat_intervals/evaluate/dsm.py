@@ -1,13 +1,16 @@
-"""Evaluate the intervals of a surface model against reference heights, strip by strip."""
+"""Evaluate a surface model and its intervals against reference heights, tile by tile."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.match.histogram import Histogram
+from sat_intervals.evaluate.accuracy import LARGEST, Accuracy, Errors
+from sat_intervals.kernels.registration import REACH, Blocks, Registration, register
 from sat_intervals.raster import (
     Georeferencing,
     check_reference,
@@ -15,67 +18,70 @@ from sat_intervals.raster import (
     read_heights,
     read_layers,
     read_place,
+    read_small_layers,
+    read_tags,
     resolution_of,
 )
-from sat_intervals.tiling import Window, strips
+from sat_intervals.tiling import Grid, Window
 
 # Heights evaluated at a time, some hundred bytes each.
-_STRIP = 1 << 20
+_TILE = 1 << 20
 # Limits of classes: slope of the reference in degrees, width of the interval in metres.
 SLOPES = (0.0, 5.0, 15.0, 30.0, 45.0, 90.0)
 WIDTHS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, np.inf)
-# Errors and widths are counted in centimetres, up to this many metres.
-_LARGEST = 500
-# Factor of the NMAD, a robust standard deviation: sigma of a normal distribution (Hoehle and Hoehle 2009).
-_NORMAL = 1.4826
+# Largest number of values of a raster of classes.
+_MOST_CLASSES = 64
+# Samples of a profile, and of those read at a time.
+_SAMPLES, _AT_ONCE = 4000, 256
+# Blocks of each side that register, their sides in cells, and points of a block.
+_BLOCKS, _SMALLEST, _LARGEST_BLOCK, _POINTS = 8, 16, 256, 1000
 
 
-class _Class:
-    """Figures of a class of cells."""
+@dataclass(frozen=True)
+class Comparison:
+    """A surface model and its reference.
 
-    def __init__(self) -> None:
-        self._count = self._inside = 0
-        self._errors, self._widths = Histogram(-_LARGEST, _LARGEST, 100), Histogram(0, _LARGEST, 100)
-
-    def add(self, error: np.ndarray, width: np.ndarray, inside: np.ndarray) -> None:
-        self._count += error.size
-        self._inside += int(inside.sum())
-        self._errors.add(error)
-        self._widths.add(width)
-
-    def report(self) -> dict[str, Any]:
-        deviation = self._errors.deviation()
-        return {
-            "count": self._count,
-            "accuracy": self._inside / self._count if self._count else None,
-            "median_width": self._widths.median(),
-            "bias": self._errors.median(),
-            "nmad": None if deviation is None else _NORMAL * deviation,
-        }
-
-
-def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, Any]:
-    """Evaluate the intervals of a surface model.
-
-    Parameters
+    Attributes
     ----------
-    surface
-        A file that `make_surface` wrote.
-    reference
-        Heights above the same datum in any CRS. If it is n times finer than the cells, each cell is compared with n x n
-        heights; else with the one nearest to its centre.
+    surface, reference
+        The files.
+    shape, place
+        Size and georeferencing of the surface.
+    finer
+        Heights of the reference along a cell.
+    shift
+        Metres by which the reference is moved: easting, northing, height.
+    """
 
-    Returns
-    -------
-    For ``all`` heights with an interval, by ``slope`` of the reference (degrees) and by ``width`` of the
-    interval (metres): ``count``, ``accuracy`` (the share of reference heights inside the interval), ``median_width``,
-    ``bias`` (median of height - reference) and ``nmad`` of height - reference, in metres; None without cells. ``from``
-    and ``to`` are the limits of a class.
+    surface: Path
+    reference: Path
+    shape: tuple[int, int]
+    place: Georeferencing
+    finer: int
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def cell(self) -> float:
+        """Return the side of a cell in metres."""
+        assert self.place.pixel_size is not None
+        return self.place.pixel_size[0]
+
+    def heights(self, window: Window, finer: int = 1, *, smooth: bool = False) -> np.ndarray:
+        """Read the moved reference in a window of cells, which may reach beyond the surface, ``finer`` per side."""
+        east, north, up = self.shift
+        part = self.place.shifted(window).moved(-east, -north).refined(finer)
+        shape = finer * window.height, finer * window.width
+        smooth = smooth or (east, north) != (0.0, 0.0)
+        return np.asarray(read_heights(self.reference, part, shape, Window(0, 0, *shape), smooth=smooth) + up)
+
+
+def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
+    """Open a surface model and its reference.
 
     Raises
     ------
     SatIntervalsError
-        A file cannot be read, or both do not overlap, or their heights differ by too much.
+        A file cannot be read or used.
     """
     surface, reference = Path(surface), Path(reference)
     shape, place = read_place(surface)
@@ -85,60 +91,240 @@ def evaluate_surface(surface: str | Path, reference: str | Path) -> dict[str, An
     check_reference(reference, surface)
     assert place.pixel_size is not None
     finer = max(1, round(place.pixel_size[0] / resolution_of(reference, place)))
-    whole = _Class()
-    slopes, widths = ([_Class() for _ in ends[1:]] for ends in (SLOPES, WIDTHS))
-    for window in strips(*shape, _STRIP // finer**2):
-        height, lower, upper = (_refined(band, finer) for band in read_layers(surface, window)[:3].astype(np.float64))
-        truth, slope = _truth(reference, place, shape, window, finer)
-        known = np.isfinite(truth) & np.isfinite(lower) & np.isfinite(height)
-        error, width = (height - truth)[known], (upper - lower)[known]
-        inside = ((lower <= truth) & (truth <= upper))[known]
-        whole.add(error, width, inside)
-        for classes, ends, values in ((slopes, SLOPES, slope[known]), (widths, WIDTHS, width)):
-            for kind, (first, last) in zip(classes, pairwise(ends), strict=True):
-                chosen = (first <= values) & (values < last)
-                kind.add(error[chosen], width[chosen], inside[chosen])
+    return Comparison(surface, reference, shape, place, finer)
+
+
+def nominal_of(surface: Path) -> float | None:
+    """Return the coverage, or alpha, that the intervals of a surface were made for; None if its runs differ."""
+    tags = read_tags(surface)
+    level = tags.get("COVERAGE", tags.get("ALPHA"))
+    return None if level is None else float(level)
+
+
+def evaluate_surface(
+    surface: str | Path, reference: str | Path, classes: str | Path | None = None, *, registers: bool = True
+) -> dict[str, Any]:
+    """Evaluate the heights and intervals of a surface model.
+
+    Parameters
+    ----------
+    surface
+        A file that `make_surface` wrote.
+    reference
+        Heights above the same datum in any CRS. If it is n times finer than the cells, each cell is compared with n x n
+        heights; else with the one nearest to its centre, or interpolated there if the reference was moved.
+    classes
+        A raster of whole numbers, such as land cover, in any CRS.
+    registers
+        Whether to move the reference by its constant shift from the surface.
+
+    Returns
+    -------
+    For ``all`` heights, by ``slope`` of the reference (degrees), by ``width`` of the interval (metres) and by
+    ``classes``: the figures of `Accuracy.report`. ``before``: those of all heights with the reference in its place.
+    ``from`` and ``to`` are the limits of a class, ``class`` its number. ``registration``, see `Registration.report`;
+    None without, or with too few heights. ``nominal``: coverage or alpha of the surface; None if unknown.
+
+    Raises
+    ------
+    SatIntervalsError
+        A file cannot be read, or both do not overlap, or their heights differ by too much.
+    """
+    given = open_comparison(surface, reference)
+    nominal = nominal_of(given.surface)
+    if classes is not None:
+        read_place(Path(classes))
+    found = _registered(given) if registers else None
+    moved = moved_by(given, found and found.report())
+    before, whole = Accuracy(nominal), Accuracy(nominal)
+    slopes, widths = ([Accuracy(nominal) for _ in ends[1:]] for ends in (SLOPES, WIDTHS))
+    kinds: dict[int, Accuracy] = {}
+    for window in _tiles(given):
+        errors, slope, known = _compared(moved, window)
+        whole.add(errors)
+        for group, ends, values in ((slopes, SLOPES, slope), (widths, WIDTHS, errors.width)):
+            for kind, (first, last) in zip(group, pairwise(ends), strict=True):
+                kind.add(errors.of((first <= values) & (values < last)))
+        if classes is not None:
+            _add_classes(kinds, errors, _classes(given, Path(classes), window)[known], Path(classes), nominal)
+        if moved is not given:
+            before.add(_compared(given, window)[0])
     report = whole.report()
+    _check_common(given, before.report() if moved is not given else report)
+    return {
+        "nominal": nominal,
+        "registration": found and found.report(),
+        "before": before.report() if moved is not given else report,
+        "all": report,
+        "slope": _by(slopes, SLOPES),
+        "width": _by(widths, WIDTHS),
+        "classes": [{"class": number, **kinds[number].report()} for number in sorted(kinds)],
+    }
+
+
+def moved_by(given: Comparison, registration: dict[str, Any] | None) -> Comparison:
+    """Return a comparison with the reference moved by the registration of a report."""
+    return given if registration is None else replace(given, shift=tuple(registration["shift"]))
+
+
+def _check_common(given: Comparison, report: dict[str, Any]) -> None:
     if not report["count"]:
         raise SatIntervalsError(
-            f"no cell of {surface} has an interval and a height in {reference}: give a reference of the same place, "
-            "and a surface of runs with intervals"
+            f"no cell of {given.surface} has a height in {given.reference}: give a reference of the same place"
         )
-    if abs(report["bias"]) >= _LARGEST:
+    if abs(report["median"]) >= LARGEST:
         raise SatIntervalsError(
-            f"the heights of {surface} and {reference} differ by {_LARGEST} m or more in the median: check that both "
-            "are metres above the same datum"
+            f"the heights of {given.surface} and {given.reference} differ by {LARGEST} m or more in the median: check "
+            "that both are metres above the same datum"
         )
-    return {"all": report, "slope": _by(slopes, SLOPES), "width": _by(widths, WIDTHS)}
 
 
-def _by(classes: list[_Class], ends: tuple[float, ...]) -> list[dict[str, Any]]:
+def _tiles(given: Comparison) -> Iterator[Window]:
+    """Yield square tiles: windows of whole rows would read the blocks of a fine reference many times."""
+    side = max(1, int(_TILE**0.5) // given.finer)
+    return (tile.core for tile in Grid(Window(0, 0, *given.shape), side))
+
+
+def _compared(given: Comparison, window: Window) -> tuple[Errors, np.ndarray, np.ndarray]:
+    """Return the errors of a tile, the slopes of the reference there, and which heights of the tile they are."""
+    finer = given.finer
+    height, lower, upper = (
+        np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
+        for band in read_layers(given.surface, window)[:3].astype(np.float64)
+    )
+    truth, slope = given.heights(window, finer), _slope(given, window)
+    known = np.isfinite(truth) & np.isfinite(height)
+    missed = np.maximum(np.maximum(lower - truth, truth - upper), 0)
+    return Errors((height - truth)[known], (upper - lower)[known], missed[known]), slope[known], known
+
+
+def _slope(given: Comparison, window: Window) -> np.ndarray:
+    """Return the slope of the reference in degrees, from interpolated heights: those of pixels would form steps."""
+    around = window.grown(1, 1).clipped(Window(0, 0, *given.shape))
+    finer = given.finer
+    heights = given.heights(around, finer, smooth=True)
+    place = window.relative_to(around)
+    first, left = place.row * finer, place.column * finer
+    rows, columns = window.height * finer, window.width * finer
+    padded = np.pad(heights, 1, mode="edge")[first : first + rows + 2, left : left + columns + 2]
+    across = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * given.cell / finer)
+    down = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * given.cell / finer)
+    return np.asarray(np.degrees(np.arctan(np.hypot(across, down))))
+
+
+def _classes(given: Comparison, path: Path, window: Window) -> np.ndarray:
+    shape = given.finer * window.height, given.finer * window.width
+    place = given.place.shifted(window).refined(given.finer)
+    return read_heights(path, place, shape, Window(0, 0, *shape))
+
+
+def _add_classes(
+    kinds: dict[int, Accuracy], errors: Errors, values: np.ndarray, path: Path, nominal: float | None
+) -> None:
+    for value in np.unique(values[np.isfinite(values)]):
+        if value % 1 or len(kinds) > _MOST_CLASSES:
+            raise SatIntervalsError(
+                f"{path} has values such as {value:g}, or more than {_MOST_CLASSES} of them: give a raster of classes"
+            )
+        kinds.setdefault(int(value), Accuracy(nominal)).add(errors.of(values == value))
+
+
+def _by(classes: list[Accuracy], ends: tuple[float, ...]) -> list[dict[str, Any]]:
     return [
         {"from": first, "to": None if np.isinf(last) else last, **kind.report()}
         for kind, (first, last) in zip(classes, pairwise(ends), strict=True)
     ]
 
 
-def _refined(band: np.ndarray, finer: int) -> np.ndarray:
-    """Repeat each cell ``finer`` times along both axes."""
-    return np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
+def _registered(given: Comparison) -> Registration | None:
+    """Return the shift from the reference to the surface; None with too few heights."""
+    side = min(_LARGEST_BLOCK, max(_SMALLEST, min(given.shape) // _BLOCKS))
+    grid = Grid(Window(0, 0, *given.shape), side)
+    size = side + 2 * (REACH + 1)
+    surfaces: list[np.ndarray] = []
+    parts: list[tuple[np.ndarray, ...]] = []
+    rows, columns = (range(0, count, -(-count // _BLOCKS)) for count in (grid.rows, grid.columns))
+    for core in (grid.tile(row, column).core for row in rows for column in columns):
+        height = read_layers(given.surface, core)[0].astype(np.float64)
+        row, column = np.nonzero(np.isfinite(height))
+        if not row.size:
+            continue
+        chosen = slice(None, None, -(-row.size // _POINTS))
+        row, column = row[chosen], column[chosen]
+        around = Window(core.row - REACH - 1, core.column - REACH - 1, size, size)
+        surface = given.heights(around, smooth=True)
+        if np.isfinite(surface).any():
+            places = (column + REACH + 1.0, row + REACH + 1.0, height[row, column])
+            parts.append((np.full(row.size, len(surfaces)), *places))
+            surfaces.append(surface.astype(np.float32))
+    if not parts:
+        return None
+    block, x, y, heights = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return register(Blocks(np.stack(surfaces), given.cell, block, x, y, heights, 1))
 
 
-def _truth(
-    path: Path, place: Georeferencing, shape: tuple[int, int], window: Window, finer: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return reference heights of a window of cells, ``finer`` per side, and their slope in degrees; NaN if missing.
+class Profile(NamedTuple):
+    """Heights along a line: ``(n,)`` metres from its first end, NaN where unknown; and the ends."""
 
-    The slope comes from interpolated heights: those of the nearest pixels would form steps.
+    distance: np.ndarray
+    height: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    reference: np.ndarray
+    ends: tuple[tuple[float, float], tuple[float, float]]
+
+
+def read_profile(given: Comparison, line: tuple[float, float, float, float] | None = None) -> Profile:
+    """Read a surface and its reference along a line, by default the middle row.
+
+    ``line`` is easting and northing of both ends, in the surface's CRS.
+
+    Raises
+    ------
+    SatIntervalsError
+        The line does not cross the surface.
     """
-    place = place.refined(finer)
-    shape = shape[0] * finer, shape[1] * finer
-    window = Window(*(finer * side for side in (window.row, window.column, window.height, window.width)))
-    around = window.grown(1, 1).clipped(Window(0, 0, *shape))
-    padded = np.pad(read_heights(path, place, shape, around, smooth=True), [(1, 1), (1, 1)], mode="edge")
-    assert place.pixel_size is not None
-    across, down = place.pixel_size
-    rise_across = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * across)
-    rise_down = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * down)
-    slope = np.degrees(np.arctan(np.hypot(rise_across, rise_down)))
-    return read_heights(path, place, shape, window), slope[window.relative_to(around).slices]
+    place = given.place.transform
+    assert place is not None
+    rows, columns = given.shape
+    if line is None:
+        y = place.f + (rows // 2 + 0.5) * place.e
+        line = (place.c, y, place.c + columns * place.a, y)
+    length = float(np.hypot(line[2] - line[0], line[3] - line[1]))
+    part = np.linspace(0, 1, int(min(_SAMPLES, max(2, length / given.cell))), endpoint=False)
+    row = np.floor((line[1] + part * (line[3] - line[1]) - place.f) / place.e).astype(int)
+    column = np.floor((line[0] + part * (line[2] - line[0]) - place.c) / place.a).astype(int)
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    if not inside.any():
+        raise SatIntervalsError(
+            f"the line from {line[0]:g}, {line[1]:g} to {line[2]:g}, {line[3]:g} does not cross {given.surface}: give "
+            "eastings and northings in its CRS"
+        )
+    bands = np.full((4, part.size), np.nan)
+    for chosen in np.array_split(np.flatnonzero(inside), -(-int(inside.sum()) // _AT_ONCE)):
+        first, left = int(row[chosen].min()), int(column[chosen].min())
+        window = Window(first, left, int(row[chosen].max()) + 1 - first, int(column[chosen].max()) + 1 - left)
+        here = row[chosen] - first, column[chosen] - left
+        bands[:3, chosen] = read_layers(given.surface, window)[:3][:, *here]
+        bands[3, chosen] = given.heights(window)[here]
+    ends = (line[0], line[1]), (line[2], line[3])
+    return Profile(part * length, bands[0], bands[1], bands[2], bands[3], ends)
+
+
+def error_map(given: Comparison, longest: int) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """Return height - reference, sampled to ``longest`` cells at most along each side, and its map extent.
+
+    The extent is left, right, bottom and top.
+    """
+    rows, columns = given.shape
+    coarser = -(-max(given.shape) // longest)
+    small = -(-rows // coarser), -(-columns // coarser)
+    heights = read_small_layers(given.surface, small)[0].astype(np.float64)
+    place = given.place.transform
+    assert place is not None
+    across, down = columns / small[1], rows / small[0]
+    east, north, up = given.shift
+    coarse = given.place.moved(-east, -north).coarser(across, down)
+    truth = read_heights(given.reference, coarse, small, Window(0, 0, *small)) + up
+    extent = place.c, place.c + columns * place.a, place.f + rows * place.e, place.f
+    return heights - truth, extent

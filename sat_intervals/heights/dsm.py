@@ -103,7 +103,7 @@ def make_surface(
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
     grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius)
-    runs = _triangulated([Path(out) for out in outs])
+    runs = triangulated([Path(out) for out in outs])
     for run in runs:
         run.check_kept([path], [run.out / "points.tif", geoid])
     choices = choices.for_runs(runs)
@@ -114,6 +114,7 @@ def make_surface(
         **choices.tags(),
         "RADIUS": f"{radius:g} m",
         "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}",
+        **_nominal_tag(runs),
     }
     place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
     writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
@@ -157,6 +158,13 @@ def runs_tag(runs: Sequence[Run]) -> str:
     return " ".join(run.report["finished"] for run in runs)
 
 
+def _nominal_tag(runs: Sequence[Run]) -> dict[str, str]:
+    """Return the tag COVERAGE or ALPHA of a surface, none if its runs differ or have no intervals."""
+    levels = {("COVERAGE", run.config.interval.coverage) if run.config.interval.coverage else
+              ("ALPHA", run.config.interval.alpha) for run in runs if run.config.interval}  # fmt: skip
+    return {name: str(level) for name, level in levels} if len(levels) == 1 else {}
+
+
 def _check_lengths(resolution: float, radius: float) -> None:
     for name, value in (("resolution", resolution), ("radius", radius)):
         if not 0 < value <= _LARGEST:
@@ -168,7 +176,14 @@ def _check_lengths(resolution: float, radius: float) -> None:
         )
 
 
-def _triangulated(outs: Sequence[Path]) -> list[Run]:
+def triangulated(outs: Sequence[Path]) -> list[Run]:
+    """Open runs with points of their own.
+
+    Raises
+    ------
+    SatIntervalsError
+        A folder is no run, is given twice, or has no points, those of an earlier run, or damaged ones.
+    """
     for out, count in Counter(out.resolve() for out in outs).items():
         if count > 1:
             raise SatIntervalsError(f"{out} is given {count} times: give each run once")
@@ -186,13 +201,13 @@ def _triangulated(outs: Sequence[Path]) -> list[Run]:
 
 
 def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Projection:
-    middle = _point_near_the_middle(runs)
+    middle = point_near_the_middle(runs)
     projection = Projection(utm_of(*middle) if crs is None else crs, geoid)
     projection.check(*middle)
     return projection
 
 
-def _point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
+def point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
     """Return longitude and latitude of the middle of a window with points, of the first run that has any."""
     for run in runs:
         tiles = Grid(Window(0, 0, *run.shape), WINDOW)

@@ -137,23 +137,30 @@ class Lattice:
         (self._rows, row_step) = _axis(region.row, region.row_stop - 1)
         self._columns, column_step = _axis(region.column, region.column_stop - 1)
         self._disparities, disparity_step = _axis(minimum, maximum)
-        self._spacing = row_step, column_step, disparity_step
+        self.spacing = row_step, column_step, disparity_step
+        """Pixels between nodes along rows, columns and disparities."""
         self._nodes: dict[int, np.ndarray] = {}
 
     def points(self, window: Window, *disparities: np.ndarray) -> list[Points]:
         """Return the points of disparity maps ``(rows, columns)`` of a window, relative to the region."""
-        step = self._spacing[0]
+        nodes, origin = self.nodes(window)
+        return [
+            Points(*interpolate(nodes, self.spacing, origin, disparity.astype(np.float64))) for disparity in disparities
+        ]
+
+    def nodes(self, window: Window) -> tuple[np.ndarray, tuple[float, float, float]]:
+        """Return the rows of nodes around a window, all columns, and the place of their first from its first pixel.
+
+        Nodes are ``(rows, columns, disparities, 4)``, see `Sensors.triangulate`, ``spacing`` apart. The place is row,
+        column and disparity.
+        """
+        step = self.spacing[0]
         first = min(int(window.row / step), len(self._rows) - 2)
         last = min(int((window.row_stop - 1) / step) + 1, len(self._rows) - 1)
         self._nodes = {
             row: self._nodes[row] if row in self._nodes else self._row(row) for row in range(first, last + 1)
         }
-        nodes = np.stack(list(self._nodes.values()))
-        origin = first * step - window.row, -float(window.column), self._minimum
-        return [
-            Points(*interpolate(nodes, self._spacing, origin, disparity.astype(np.float64)))
-            for disparity in disparities
-        ]
+        return np.stack(list(self._nodes.values())), (first * step - window.row, -float(window.column), self._minimum)
 
     def _row(self, row: int) -> np.ndarray:
         """Triangulate a row of nodes: ``(columns, disparities, 4)``."""

@@ -16,7 +16,10 @@ class Histogram:
         """Count values; none may be NaN."""
         places = np.rint((values - self._first) * self._steps)
         places = np.clip(places, 0, self._counts.size - 1).astype(np.int64)
-        self._counts += np.bincount(places, minlength=self._counts.size)
+        if places.size:
+            least = int(places.min())
+            counts = np.bincount(places - least)
+            self._counts[least : least + counts.size] += counts
 
     def median(self) -> float | None:
         """Return the median (the mean of both middle values of an even number); None without values."""
@@ -26,15 +29,38 @@ class Histogram:
         middle = np.searchsorted(upto, [(upto[-1] - 1) // 2, upto[-1] // 2], side="right")
         return float(self._first + middle.sum() / (2 * self._steps))
 
+    def quantile(self, share: float) -> float | None:
+        """Return a quantile, linear between values; None without values."""
+        present = np.flatnonzero(self._counts)
+        return _quantile(self._first + present / self._steps, self._counts[present], share)
+
+    def quantile_of_absolutes(self, share: float) -> float | None:
+        """Return a quantile of the absolute values, linear between values; None without values."""
+        present = np.flatnonzero(self._counts)
+        values = np.abs(self._first + present / self._steps)
+        order = np.argsort(values, kind="stable")
+        return _quantile(values[order], self._counts[present][order], share)
+
     def deviation(self) -> float | None:
         """Return the median absolute deviation from the median; None without values."""
         median = self.median()
         if median is None:
             return None
-        distance = np.abs(self._first + np.arange(self._counts.size) / self._steps - median)
+        present = np.flatnonzero(self._counts)
+        distance = np.abs(self._first + present / self._steps - median)
         nearest_first = np.argsort(distance, kind="stable")
-        upto = np.cumsum(self._counts[nearest_first])
+        upto = np.cumsum(self._counts[present][nearest_first])
         return float(distance[nearest_first[np.searchsorted(upto, (upto[-1] - 1) // 2, side="right")]])
+
+
+def _quantile(values: np.ndarray, counts: np.ndarray, share: float) -> float | None:
+    """Return a quantile of sorted values that occur several times, as `numpy.quantile`."""
+    upto = np.cumsum(counts)
+    if not upto.size:
+        return None
+    place = share * (upto[-1] - 1)
+    low, high = values[np.searchsorted(upto, [np.floor(place), np.ceil(place)], side="right")]
+    return float(low + (place - np.floor(place)) * (high - low))
 
 
 def bias_histogram() -> Histogram:

@@ -1,18 +1,21 @@
 """Matching of two arrays in memory as one tile, without files, store or scheduler."""
 
+import logging
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from sat_intervals.config import Config, load_config, resolved
+from sat_intervals.config import Config, load_config, resolved, unreached
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.memory import check_memory, volume_bytes
 from sat_intervals.match.normalization import Moments, PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.search_range import Found, NoRangeError, find_range, finest_step, reduced, with_range
 from sat_intervals.match.whole import match_whole
 from sat_intervals.products import BANDS, FLAGS
+
+_LOG = logging.getLogger(__name__)
 
 Array = np.ndarray | xr.DataArray
 
@@ -41,6 +44,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
         If the arrays do not fit each other or the search range, or the volume does not fit in memory.
     """
     config = resolved(load_config(config))
+    if missed := unreached(config):
+        _LOG.warning("%s", missed)
     pixels = _pixels(left, "left"), _pixels(right, "right")
     _check_rows(*pixels)
     ranges = None

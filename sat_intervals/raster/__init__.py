@@ -1,7 +1,10 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, surface_file
+from sat_intervals.raster.cog import BLOCK, Copy, Part, codec_versions, compressed, factors
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
+from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
+from sat_intervals.raster.heightfield import HeightRaster
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files
 from sat_intervals.raster.layers import (
     MARK,
@@ -25,21 +28,30 @@ from sat_intervals.raster.windows import read_views, read_window
 from sat_intervals.raster.writer import OutputWriter, check_space, remove_scratch, restore
 
 __all__ = [
+    "BLOCK",
     "MARK",
     "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
+    "Copy",
     "File",
+    "Frame",
     "Georeferencing",
+    "HeightRaster",
     "Image",
     "InputError",
     "OutputError",
     "OutputWriter",
+    "Part",
     "Projection",
+    "Vertical",
     "check_marked",
     "check_pair",
     "check_reference",
     "check_space",
+    "codec_versions",
+    "compressed",
+    "factors",
     "is_marked",
     "is_surface",
     "north_up",
@@ -58,8 +70,10 @@ __all__ = [
     "remove_scratch",
     "resolution_of",
     "restore",
+    "run_files",
     "stamps",
     "surface_file",
+    "truth_file",
     "utm_of",
     "whole_file",
     "write_layer",

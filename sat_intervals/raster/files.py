@@ -1,16 +1,16 @@
 """Metadata of the files of a run, from the tables of `sat_intervals.products`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, Band
+from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, TRUTH, Band
 
 
 @dataclass(frozen=True)
 class File:
-    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver."""
+    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression."""
 
     name: str
     dtype: str
@@ -19,6 +19,7 @@ class File:
     tags: Mapping[str, str] = field(default_factory=dict)
     predictor: str = "NO"
     driver: str = "COG"
+    compression: str = "deflate"
 
     def describe(self, dataset: DatasetWriter) -> None:
         """Write names, units and meanings of the bands."""
@@ -42,6 +43,17 @@ RUN_FILES = (INTERVALS, VALIDITY)
 POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT"),)
 
 
+def run_files(compression: str) -> tuple[File, File]:
+    """Return the files of a run with a compression of the settings; flags stay as they are with LERC."""
+    flags = "deflate" if compression == "lerc" else compression
+    return replace(INTERVALS, compression=compression), replace(VALIDITY, compression=flags)
+
+
 def surface_file(name: str) -> File:
     """Return the properties of a surface model's file."""
     return File(name, "float32", float("nan"), SURFACE)
+
+
+def truth_file(name: str) -> File:
+    """Return the properties of a file of true disparities."""
+    return File(name, "float32", float("nan"), TRUTH)

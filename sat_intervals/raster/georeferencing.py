@@ -68,11 +68,21 @@ class Georeferencing:
         gcps = tuple(point._replace(row=point.row - row, column=point.column - column) for point in self.gcps)
         return replace(self, transform=transform, gcps=gcps, rpcs=rpcs)
 
-    def refined(self, finer: int) -> "Georeferencing":
-        """Return the georeferencing with each pixel split into ``finer`` x ``finer``; needs a transform."""
+    def moved(self, x: float, y: float) -> "Georeferencing":
+        """Return the georeferencing with all pixels moved by x, y in units of the CRS; needs a transform."""
         assert self.transform is not None
         a, b, c, d, e, f = self.transform[:6]
-        return replace(self, transform=Affine(a / finer, b / finer, c, d / finer, e / finer, f))
+        return replace(self, transform=Affine(a, b, c + x, d, e, f + y))
+
+    def coarser(self, across: float, down: float) -> "Georeferencing":
+        """Return the georeferencing with pixels ``across`` x ``down`` times as large; needs a transform."""
+        assert self.transform is not None
+        a, b, c, d, e, f = self.transform[:6]
+        return replace(self, transform=Affine(a * across, b * down, c, d * across, e * down, f))
+
+    def refined(self, finer: int) -> "Georeferencing":
+        """Return the georeferencing with each pixel split into ``finer`` x ``finer``; needs a transform."""
+        return self.coarser(1 / finer, 1 / finer)
 
     def creation_options(self) -> dict[str, Any]:
         """Return rasterio's creation options for a new GeoTIFF, which stores a transform or control points."""

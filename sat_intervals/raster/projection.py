@@ -62,7 +62,7 @@ class Projection:
         self._area = target.area_of_use
         self._proj = Proj(target)
         self._map = Transformer.from_crs(_GEOGRAPHIC, target, always_xy=True)
-        self._geoid = None if geoid is None else _geoid(geoid)
+        self._geoid = None if geoid is None else geoid_grid(geoid)
 
     def check(self, longitude: float, latitude: float) -> None:
         """Raise if the CRS or the geoid does not fit at a place (degrees)."""
@@ -94,6 +94,10 @@ class Projection:
         """Return easting and northing in metres."""
         return self._map.transform(longitude, latitude)
 
+    def degrees(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return longitude and latitude of map coordinates."""
+        return self._map.transform(x, y, direction="INVERSE")
+
     def undulation(self, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
         """Return metres from the ellipsoid up to the geoid; 0 without a geoid, NaN outside its grid."""
         if self._geoid is None:
@@ -102,7 +106,8 @@ class Projection:
         return np.where(np.isfinite(height), -height, np.nan)
 
 
-def _geoid(path: Path) -> Transformer:
+def geoid_grid(path: Path) -> Transformer:
+    """Return a transformer from heights above the ellipsoid to heights above a geoid (degrees, metres)."""
     if not path.is_file():
         raise SatIntervalsError(f"{path}: no such file: give a grid of geoid heights")
     radians = "+proj=unitconvert +xy_in=deg +xy_out=rad"

@@ -4,8 +4,8 @@ import errno
 import os
 import re
 import shutil
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -13,45 +13,34 @@ from typing import Self
 
 import numpy as np
 from rasterio import Env
-from rasterio.enums import Resampling
-from rasterio.io import DatasetReader, DatasetWriter
+from rasterio.io import DatasetWriter
 from rasterio.shutil import copy
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.raster import gdal
+from sat_intervals.raster.cog import Copy, Part, put_together, template
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, publish, put_back, stamps
+from sat_intervals.raster.streaming import Stream
 from sat_intervals.store.folder import LocalFolder
 
 # Locked folder of unfinished files, named after the first of them. Files of these names from a killed process are
 # replaced, others stay.
 _SCRATCH = ".unpublished-{}"
-# Names there: a final one, that of its strips, and those of GDAL beside both.
-_UNFINISHED = r"(?:strips-)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
-# Layout of the temporary strips. Blocks are low, so that a strip fills most of those it touches; interleaving by band
-# saves a fifth of the time of the final files.
-_STRIPS = {"tiled": True, "blockxsize": 256, "blockysize": 64, "interleave": "band", "bigtiff": "IF_SAFER"}
-# Every GeoTIFF reader supports DEFLATE. On the bands of a Pleiades pair level 1 writes 5.4 Mpx per second and core, 49
-# bits per pixel; level 6: 3.2 and 46; no compression: 9.1 and 186. Predictors are slower and larger (4.3 and 63), since
-# bounds are integers and V-fits are fractions of small ones, whose bytes repeat.
-_COG = {"COMPRESS": "DEFLATE", "LEVEL": "1", "OVERVIEW_RESAMPLING": "NEAREST", "BIGTIFF": "IF_SAFER"}
+# Names there: a final one, those of its strips and their levels, and those of GDAL beside both.
+_UNFINISHED = r"(?:(?:strips|rows)-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
 # Tags in the file itself, not in another beside it.
 _PNG = {"WRITE_METADATA_AS_TEXT": "YES"}
-# Side in pixels of the smallest overview.
-_OVERVIEW_SIZE = 512
-# GDAL's block cache in bytes; the default is a twentieth of the memory. A larger cache is not faster, even for strips
-# of 60 000 columns, and keeps small images in memory.
+# GDAL's block cache in bytes; the default is a twentieth of the memory.
 _CACHE = 16 << 20
-# Rows and columns of a window that is read back: enough blocks for every thread.
-_READ_BACK = 512, 4096
 _SUM_WRAPS = 1 << 64  # sums of bits are modulo 2^64
 _WAY_OUT = "free disk space or choose another folder"
 
 
 class OutputWriter:
-    """Write files from full-width strips of rows in increasing order.
+    """Write files from full-width strips of rows in increasing order, or from parts that were made elsewhere.
 
     ::
 
@@ -59,9 +48,9 @@ class OutputWriter:
             writer.write(row, intervals, validity)  # strip by strip
             writer.publish()
 
-    Memory depends on the strip. Until `publish` the files are in a hidden folder inside ``folder``, as plain GeoTIFFs
-    and then as Cloud-Optimized GeoTIFFs; leaving the context removes it in any case. The folder is locked: a second
-    process that writes the same files is refused.
+    Memory depends on the strip. Until `publish` the files are in a hidden folder inside ``folder``, first in parts;
+    leaving the context removes it in any case. The folder is locked: a second process that writes the same files is
+    refused.
 
     Parameters
     ----------
@@ -104,9 +93,10 @@ class OutputWriter:
         self._shape = height, width
         self._georeferencing = georeferencing
         self._tags = dict(tags)
-        self._threads = "ALL_CPUS" if threads is None else str(threads)
-        self._strips: dict[str, DatasetWriter] = {}
-        self._sums = {file.name: 0 for file in files}
+        self._threads = threads
+        self._streams: dict[str, Stream] = {}
+        self._pictures: dict[str, tuple[DatasetWriter, int]] = {}  # with the sum of the pixels
+        self._made: dict[str, dict[str, int]] = {}
         self._there: dict[str, str] = {}
         self._is_published = False
 
@@ -128,8 +118,6 @@ class OutputWriter:
                 self._replaced.mkdir(parents=True, exist_ok=True)
                 self._there = stamps(self._folder, self._names)
             check_space(self._folder, self._files, *self._shape)
-            for file in self._files:
-                self._strips[file.name] = self._create(file)
         except BaseException:
             self._clean()
             raise
@@ -144,31 +132,60 @@ class OutputWriter:
         """Write the strip that begins at ``row``; one array per file, ``(bands, rows, width)`` or ``(rows, width)``."""
         for file, raster in zip(self._files, rasters, strict=True):
             bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
-            area = RasterioWindow(0, row, self._shape[1], bands.shape[1])
-            with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
-                self._strips[file.name].write(bands, window=area)
-            self._sums[file.name] += _sum(bands)
+            with self._failing(self._folder / file.name):
+                if file.driver == "COG":
+                    if file.name not in self._streams:
+                        place = self._scratch / file.name
+                        self._streams[file.name] = Stream(file, place, self._shape, self._threads)
+                    self._streams[file.name].write(row, bands)
+                else:
+                    self._draw(file, row, bands)
+
+    def _draw(self, file: File, row: int, bands: np.ndarray) -> None:
+        """Write a strip of a picture, which GDAL makes of a plain GeoTIFF."""
+        with Env(GDAL_CACHEMAX=_CACHE):
+            if file.name not in self._pictures:
+                height, width = self._shape
+                kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
+                path = str(self._scratch / f"strips-{file.name}")
+                self._pictures[file.name] = gdal.create(path, height=height, width=width, **kind), 0
+                self._pictures[file.name][0].update_tags(**self._tags)
+                file.describe(self._pictures[file.name][0])
+            strips, before = self._pictures[file.name]
+            strips.write(bands, window=RasterioWindow(0, row, self._shape[1], bands.shape[1]))
+            self._pictures[file.name] = strips, before + _sum(bands)
+
+    def put_together(self, name: str, levels: Sequence[Sequence[Part]], copy_all: Copy | None = None) -> dict[str, int]:
+        """Make a file of rows of blocks, see `cog.put_together`, under a temporary name; return size and CRC-32."""
+        (file,) = (file for file in self._files if file.name == name)
+        with self._failing(self._folder / name):
+            made = template(file, self._georeferencing, self._tags, self._scratch / name)
+            # a name of its own: a worker that was lost must not write into the file of a later run
+            path = self._scratch / f"strips-{uuid.uuid4().hex}-{name}"
+            self._made[name] = put_together(path, made, self._shape, levels, copy_all)
+            os.replace(path, self._scratch / name)
+        return self._made[name]
 
     def build(self) -> dict[str, dict[str, int]]:
-        """Build the final files under temporary names and read them back; return size and CRC-32 by name."""
-        files = [file for file in self._files if file.name in self._strips]
-        with ThreadPoolExecutor() as threads:  # GDAL compresses in threads, but reads and writes in one
-            return {file.name: made for file, made in zip(files, threads.map(self._build, files), strict=True)}
-
-    def _build(self, file: File) -> dict[str, int]:
-        name, strips, whole = file.name, self._strips[file.name], self._scratch / file.name
-        options = _COG | {"NUM_THREADS": self._threads, "PREDICTOR": file.predictor} if file.driver == "COG" else _PNG
-        with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
-            if file.driver == "COG":
-                self._add_overviews(strips)
-            strips.close()
-            del self._strips[name]
-            copy(strips.name, str(whole), driver=file.driver, **options)
-            _flush(whole)
-            self._verify(whole, self._sums[name])
-            made = checksum_of(whole)
-        os.unlink(strips.name)
-        return made
+        """Build the final files under temporary names; return size and CRC-32 by name."""
+        for name, stream in self._streams.items():
+            with self._failing(self._folder / name):
+                stream.check_complete()
+            self.put_together(name, stream.parts)
+            stream.remove()
+        self._streams.clear()
+        for name, (strips, expected) in self._pictures.items():
+            with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
+                strips.close()
+                copy(strips.name, str(self._scratch / name), driver="PNG", **_PNG)
+                _flush(self._scratch / name)
+                with gdal.reading(str(self._scratch / name)) as dataset:
+                    if (_sum(dataset.read()) - expected) % _SUM_WRAPS:
+                        raise OSError(errno.EIO, "the content read back differs from that written")
+                self._made[name] = checksum_of(self._scratch / name)
+            os.unlink(strips.name)
+        self._pictures.clear()
+        return dict(self._made)
 
     def publish(self, report: tuple[str, str] | None = None, *, replaceable: Mapping[str, str] | None = None) -> None:
         """Rename the files to their final names, all of them or none; `publishing.publish` has the rules.
@@ -193,38 +210,6 @@ class OutputWriter:
         publish(self._scratch, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
         self._is_published = True
 
-    def _create(self, file: File) -> DatasetWriter:
-        """Create a plain GeoTIFF for the strips, with all metadata of the final file."""
-        height, width = self._shape
-        kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
-        options = _STRIPS | kind | self._georeferencing.creation_options()
-        with self._failing(self._folder / file.name), Env(GDAL_CACHEMAX=_CACHE):
-            strips = gdal.create(str(self._scratch / f"strips-{file.name}"), height=height, width=width, **options)
-            strips.update_tags(**self._tags)
-            file.describe(strips)
-        return strips
-
-    def _add_overviews(self, strips: DatasetWriter) -> None:
-        """Add overviews to the strips; the COG driver's own take longer than all its other work."""
-        size = max(self._shape)
-        factors = [2**level for level in range(1, 32) if size > _OVERVIEW_SIZE << (level - 1)]
-        if factors:
-            strips.build_overviews(factors, Resampling.nearest)
-
-    def _verify(self, whole: Path, expected: int) -> None:
-        """Read a file back, with its overviews: GDAL may not report a full disk."""
-        found = 0
-        with gdal.reading(str(whole), num_threads=self._threads) as dataset:
-            levels = range(len(dataset.overviews(1)))
-            for area in _areas(dataset):
-                found += _sum(dataset.read(window=area))
-        for level in levels:
-            with gdal.reading(str(whole), overview_level=level, num_threads=self._threads) as dataset:
-                for area in _areas(dataset):
-                    dataset.read(window=area)
-        if (found - expected) % _SUM_WRAPS:
-            raise OSError(errno.EIO, "the content read back differs from that written")
-
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:
         """Turn errors into an OutputError with the final name of the file and the system's reason."""
@@ -248,10 +233,11 @@ class OutputWriter:
         return full + gdal.reason(error)
 
     def _clean(self) -> None:
-        for strips in self._strips.values():
+        for strips, _ in self._pictures.values():
             with suppress(*gdal.GDAL_ERRORS):
                 strips.close()
-        self._strips.clear()
+        self._pictures.clear()
+        self._streams.clear()
         self._remove_scratch()
         self._locked.close()
 
@@ -306,14 +292,6 @@ def check_space(folder: Path, files: Sequence[File], height: int, width: int) ->
 def _bytes(files: Sequence[File], height: int, width: int) -> int:
     """Return the size of all bands without compression."""
     return height * width * sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in files)
-
-
-def _areas(dataset: DatasetReader) -> Iterator[RasterioWindow]:
-    """Yield windows that cover a file."""
-    height, width = _READ_BACK
-    for row in range(0, dataset.height, height):
-        for column in range(0, dataset.width, width):
-            yield RasterioWindow(column, row, min(width, dataset.width - column), min(height, dataset.height - row))
 
 
 def _sum(bands: np.ndarray) -> int:

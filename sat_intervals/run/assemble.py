@@ -3,35 +3,32 @@
 import json
 import logging
 import platform
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Config, calibration_of
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_strips
+from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import RUN_FILES, OutputError, OutputWriter, stamps
+from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
 from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
-from sat_intervals.store.tiles import DamagedTilesError, Records, mark_finished, mark_replaced, replaceable_files
+from sat_intervals.run.strips import check_done, check_matched, finish_strips, levels_of, parts_of
+from sat_intervals.run.workers import Workers
+from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, replaceable_files
 
-Item = TypeVar("Item")
-
-# Pixels of a strip, in whole rows. A strip in memory takes about 100 bytes per pixel, and there are several.
-STRIP_PIXELS = 1 << 20
 # Meanings of some of the counts, for readers of run.json.
 _COUNTS_MEANING = {
     "ambiguous": "valid pixels whose interval is the whole search range",
@@ -44,13 +41,22 @@ _COUNTS_MEANING = {
 _LOG = logging.getLogger(__name__)
 
 
-def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_tiles: bool = False) -> dict[str, Any]:
+def assemble(
+    job: Job,
+    client: Callable[[], Workers],
+    seconds: dict[str, float],
+    progress: Progress,
+    *,
+    keep_tiles: bool = False,
+) -> dict[str, Any]:
     """Write the files of a run whose tiles are done; return the content of run.json.
 
     Parameters
     ----------
     job
         The pair.
+    client
+        Returns the client of the cluster that finishes strips.
     seconds
         Times of earlier stages; those of this one are added.
     progress
@@ -61,9 +67,9 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     Raises
     ------
     DamagedTilesError
-        Tiles must be matched again.
+        Tiles must be matched, or strips finished again.
     RunError
-        A file cannot be written.
+        A strip failed, or a file cannot be written.
     SatIntervalsError
         No pixel could be matched.
     """
@@ -75,24 +81,20 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
     scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
     tally = Tally(config.disparity.count, config.disparity.minimum)
     where = job.left.georeferencing.shifted(region)
-    with _resumable(), OutputWriter(job.out, RUN_FILES, region.height, region.width, where, _tags(config)) as writer:
+    files = run_files(config.products.compression)
+    with _resumable(), OutputWriter(job.out, files, region.height, region.width, where, _tags(config)) as writer:
         with logged_stage(seconds, "bands"):
-            strips = (RawRows(**strip) for strip in store.strips(STRIP_PIXELS // region.width, records))
-            row = 0
-            for final in _prefetched(postprocess_strips(_prefetched(strips), scale, config)):
-                writer.write(row, np.stack(final[:4]), final.validity)
-                tally.add(final)
-                row += final.validity.shape[0]
-                progress("bands", row, region.height)
+            parts, copy_all = finish_strips(job, client, scale, records, progress)
+            for place in parts:
+                tally.merge(parts[place].get("counts", {}))
         with logged_stage(seconds, "files"):
             progress("files", 0, 1)
-            files = writer.build()
+            for file in files:
+                writer.put_together(file.name, levels_of(job, file.name, parts), copy_all)
             job.check_inputs()
             progress("files", 0, 1)  # a last chance to interrupt the run before it publishes
-        for stage in ("read", "match", "write"):
-            seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
-        seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
-        report = _report(job, statistics, scale, tally, seconds, seams) | {"files": files}
+        _add_seconds(seconds, records)
+        report = _report(job, statistics, scale, tally, seconds, seams) | {"files": writer.build()}
         report["quality"] = quality_of(job, records)
         report["warnings"] = warnings_of(job, report["counts"], report["quality"])
         for line in report["warnings"]:
@@ -104,8 +106,16 @@ def assemble(job: Job, seconds: dict[str, float], progress: Progress, *, keep_ti
         if not keep_tiles:
             mark_finished(store.home, job.name, list(stamps(job.out, OUTPUTS).values()))
         mark_replaced(store.home)
+        parts_of(job).drop()
         progress("files", 1, 1)
     return report
+
+
+def _add_seconds(seconds: dict[str, float], records: Records) -> None:
+    """Add the seconds of all tiles by stage, and the total."""
+    for stage in ("read", "match", "write"):
+        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
+    seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
 
 
 @contextmanager
@@ -115,43 +125,6 @@ def _resumable() -> Iterator[None]:
         yield
     except OutputError as error:
         raise RunError(f"{error}; rerun the same command: it resumes from the tiles, which are all done") from error
-
-
-def _prefetched(items: Iterable[Item]) -> Iterator[Item]:
-    """Yield the items; compute the next one in a thread while the current one is used."""
-    with ThreadPoolExecutor(1) as thread:
-        iterator = iter(items)
-        following = thread.submit(next, iterator, None)
-        while (item := following.result()) is not None:
-            following = thread.submit(next, iterator, None)
-            yield item
-
-
-def check_done(job: Job, records: Records) -> None:
-    """Raise if tiles are missing; a retry restores them."""
-    missing = [tile.name for tile in job.store.grid if tile.name not in records]
-    if missing:
-        raise DamagedTilesError(
-            f"tiles {', '.join(missing)} are missing in {job.store.folder}: rerun the same command: it resumes"
-        )
-
-
-def check_matched(job: Job, records: Records, searched: int) -> None:
-    """Raise if no pixel could be matched, with the likely reason."""
-    if searched:
-        return
-    usable = {side: sum(record["usable_pixels"][side] for record in records.values()) for side in ("left", "right")}
-    empty = [image.path for image, side in ((job.left, "left"), (job.right, "right")) if not usable[side]]
-    search, window = job.config.disparity, job.config.cost.window
-    reason = (
-        f"all pixels of {' and '.join(empty)} are no data or masked"
-        if empty
-        else f"nowhere do both images have {window} x {window} usable pixels"
-    )
-    raise SatIntervalsError(
-        f"no pixel of {job.left.path} can be matched in {job.right.path} over disparities {search.minimum} to "
-        f"{search.maximum}, {reason}: check no-data values, masks, window and search range"
-    )
 
 
 def _tags(config: Config) -> dict[str, str]:
@@ -179,10 +152,11 @@ def _versions() -> dict[str, str]:
 
 def _calibration(config: Config) -> dict[str, Any] | None:
     """Return what the run took from its calibration, whose content is in the settings."""
-    if config.interval is None or config.interval.coverage is None or config.cuts is None:
+    levels = config.cuts
+    if levels is None or levels.coverage is None:
         return None
     calibration = calibration_of(config)
-    return {"name": calibration.name, "sha256": calibration.sha256, **config.cuts._asdict()}
+    return {"name": calibration.name, "sha256": calibration.sha256, **levels.model_dump()}
 
 
 def _report(

@@ -12,8 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from distributed import Client
-
 from sat_intervals.config import Config, load_config
 from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError
@@ -22,11 +20,11 @@ from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.run.before import report_before
-from sat_intervals.run.cluster import Connection
 from sat_intervals.run.job import Job, Search, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
 from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, find_on, match_jobs, measure_images
 from sat_intervals.run.status import read_report
+from sat_intervals.run.workers import Connection, Workers
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.place import is_own, place_of
@@ -240,7 +238,7 @@ def _kernels(config: Config) -> str:
     return config.model_dump_json(include={"cost": True, "sgm": {"penalty"}, "cross_check": {"method"}})
 
 
-def _assembled(client: Client, matched: Matched, keep_tiles: bool, progress: Progress) -> dict[str, Any]:
+def _assembled(client: Workers, matched: Matched, keep_tiles: bool, progress: Progress) -> dict[str, Any]:
     job, failures, seconds = matched
 
     def match() -> None:
@@ -252,7 +250,7 @@ def _assembled(client: Client, matched: Matched, keep_tiles: bool, progress: Pro
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assemble_repaired(job, match, seconds, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others

@@ -1,4 +1,4 @@
-"""Where tiles are matched: threads or processes of this machine, a dask scheduler, or jobs of a batch system."""
+"""Clusters of dask: processes of this machine, a scheduler, or jobs of a batch system; see `workers` for threads."""
 
 import gc
 import logging
@@ -11,14 +11,12 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Self
 
-from dask.utils import parse_bytes
 from distributed import Client, LocalCluster, Worker, WorkerPlugin
 from distributed.comm.addressing import resolve_address
 from distributed.utils import silence_logging_cmgr
 
-from sat_intervals.config import Cluster, ConfigError
+from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import LOOPBACK, batch_system
@@ -47,36 +45,13 @@ def connected(settings: Cluster, out: Path) -> Iterator[Client]:
     with _asyncio_timeouts_hidden(), _client(settings, out) as client:
         _LOG.info("connected to %s", client)
         is_debug = logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG)
-        is_debug = is_debug and settings.kind not in ("threads", "address")  # this process; the user's own workers
+        is_debug = is_debug and settings.kind != "address"  # the user's own workers
         if is_debug or settings.kind == "processes":
             client.register_plugin(_WorkerLog(is_debug))
         for name in ("sat_intervals", "distributed") if is_debug else ():
             client.forward_logging(name)
         yield client
     _LOG.info("disconnected")
-
-
-class Connection:
-    """A cluster that is connected when it is first needed; see `connected`. A context manager."""
-
-    def __init__(self, settings: Cluster, out: Path) -> None:
-        self._settings, self._out = settings, out
-        self._stack = ExitStack()
-        self._client: Client | None = None
-
-    def client(self) -> Client:
-        """Return the client of the cluster."""
-        if self._client is None:
-            self._client = self._stack.enter_context(connected(self._settings, self._out))
-        return self._client
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        """Close the client and what it started; `client` connects again."""
-        self._client = None
-        self._stack.__exit__(*error)
 
 
 class _WorkerLog(WorkerPlugin):
@@ -117,7 +92,7 @@ def _client(settings: Cluster, out: Path) -> Iterator[Client]:
     if settings.kind == "address":
         with silence_logging_cmgr(logging.CRITICAL), _client_of(str(settings.address)) as client:
             yield client
-    elif settings.kind in ("threads", "processes"):
+    elif settings.kind == "processes":
         with ExitStack() as stack:
             with _signals_blocked():
                 client = stack.enter_context(Client(stack.enter_context(_local(settings))))
@@ -147,35 +122,29 @@ def _client_of(address: str) -> Client:
 
 def _local(settings: Cluster) -> LocalCluster:
     workers = settings.workers or usable_cores()
-    processes = settings.kind == "processes"
-    if processes:
-        _check_loopback()
+    _check_loopback()
     with warnings.catch_warnings():
         # no network is needed
         warnings.filterwarnings("ignore", "Couldn't detect a suitable IP address", RuntimeWarning)
         try:
             return LocalCluster(
-                n_workers=workers if processes else 1,
-                threads_per_worker=1 if processes else workers,
-                processes=processes,
-                host=LOOPBACK if processes else None,
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                host=LOOPBACK,
                 dashboard_address=f"{LOOPBACK}:0",
                 worker_dashboard_address=f"{LOOPBACK}:0",
                 silence_logs=logging.CRITICAL,
-                **({"death_timeout": STARTING} if processes else {}),
+                death_timeout=STARTING,
             )
         except Exception as error:  # any error at the start, such as a full /dev/shm
             cause: BaseException = error
             while cause.__cause__ is not None:
                 cause = cause.__cause__
             why = " ".join(str(cause).split()) or type(cause).__name__
-            if not processes:
-                raise RunError(
-                    f"dask cannot start here: {why}: check its settings, such as DASK_TEMPORARY_DIRECTORY"
-                ) from error
             raise RunError(
-                f"the {workers} worker processes did not start within {STARTING:.0f} s ({why}): give fewer --workers "
-                "or more room in /dev/shm, or use --cluster threads"
+                f"the {workers} worker processes did not start within {STARTING:.0f} s ({why}): give fewer --workers, "
+                "more room in /dev/shm or another DASK_TEMPORARY_DIRECTORY, or use --cluster threads"
             ) from error
 
 
@@ -216,27 +185,3 @@ def _signals_blocked() -> Iterator[None]:
             signal.signal(number, handler or signal.SIG_DFL)
         for late in pending:
             signal.raise_signal(late)
-
-
-def parse_memory(text: str) -> int:
-    """Parse a memory size such as ``4GB``, ``512 MiB`` or ``3e9`` with dask; return bytes.
-
-    Raises
-    ------
-    ConfigError
-        It is not a size, or not above zero.
-    """
-    try:
-        size = parse_bytes(text) if any(map(str.isdigit, text)) else 0  # dask reads "GB" as 1 GB
-    except (ValueError, OverflowError):
-        size = 0
-    if size <= 0:
-        raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
-    return size
-
-
-def tiles_at_once(settings: Cluster) -> int:
-    """Return the number of tiles at once; for an existing scheduler, that of this machine."""
-    if settings.kind in ("threads", "processes", "address"):
-        return settings.workers or usable_cores()
-    return (settings.maximum_jobs or settings.jobs) * settings.cores

@@ -19,11 +19,11 @@ from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, restore, stamps
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
-from sat_intervals.run.cluster import parse_memory
 from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
 from sat_intervals.run.schedule import blocks_of, handed_bytes
+from sat_intervals.run.workers import parse_memory
 from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
@@ -249,13 +249,16 @@ def _version() -> str:
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
-    """Return all that decides the bytes of a tile."""
+    """Return all that decides the bytes of a tile; of a calibration only its levels."""
+    settings, levels = config.model_dump(mode="json", exclude=_NOT_OF_TILES), config.cuts
+    if levels is not None:
+        settings["interval"] = {"high": levels.high, "low": levels.low, "steps": config.bound_steps}
     return {
         **({"local_ranges": grid} if grid else {}),
         "version": _version(),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,
-        "settings": config.model_dump(mode="json", exclude=_NOT_OF_TILES),
+        "settings": settings,
         "inputs": inputs,
         "region": asdict(region),
     }

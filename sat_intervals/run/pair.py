@@ -1,13 +1,10 @@
 """Match a pair, files to files, with steps shared with batches: measure images, match tiles, repair damaged ones."""
 
-import errno
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from distributed import Client
 
 from sat_intervals.config import Config, load_config
 from sat_intervals.errors import RunError
@@ -19,19 +16,16 @@ from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
-from sat_intervals.run.cluster import Connection
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.search_range import search_range
-from sat_intervals.run.submit import Submission, Task, reason
 from sat_intervals.run.tile import match_block, measure_block, trace_block
+from sat_intervals.run.workers import Connection, Task, Workers, check_not_full, reason
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.removal import BORDERS
 from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Tile, Window
-
-_FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
 # How often damaged tiles are matched again; more damage means a broken disk.
 _TRIES = 2
@@ -105,7 +99,7 @@ def _match_pair(
         job = prepare(*pair, out, config, window=window, overwrite=overwrite, find=find)
 
     def match() -> None:
-        with logged_stage(seconds, "tiles"), connection:
+        with logged_stage(seconds, "tiles"):
             if job.waiting() or not _is_measured(job):
                 client = connection.client()
                 with logged_stage(seconds, "tiles.images"):
@@ -129,7 +123,7 @@ def _match_pair(
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
             match()
-            report = assemble_repaired(job, match, seconds, progress, keep_tiles=keep_tiles)
+            report = assemble_repaired(job, connection.client, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
             job.store.remove()
     return report
@@ -149,17 +143,23 @@ def find_on(
 
 
 def assemble_repaired(
-    job: Job, match: Callable[[], None], seconds: dict[str, float], progress: Progress, *, keep_tiles: bool
+    job: Job,
+    client: Callable[[], Workers],
+    match: Callable[[], None],
+    seconds: dict[str, float],
+    progress: Progress,
+    *,
+    keep_tiles: bool,
 ) -> dict[str, Any]:
-    """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles."""
+    """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles or parts."""
     for _ in range(_TRIES):
         try:
-            return assemble(job, seconds, progress, keep_tiles=keep_tiles)
+            return assemble(job, client, seconds, progress, keep_tiles=keep_tiles)
         except DamagedTilesError as error:
             job.store.check(job.manifest)
             _LOG.warning("%s; trying this now", error)
             match()
-    return assemble(job, seconds, progress, keep_tiles=keep_tiles)
+    return assemble(job, client, seconds, progress, keep_tiles=keep_tiles)
 
 
 def _is_measured(job: Job) -> bool:
@@ -167,7 +167,7 @@ def _is_measured(job: Job) -> bool:
     return not job.config.cost.needs_statistics or job.store.normalization() is not None
 
 
-def measure_images(client: Client, job: Job, progress: Progress) -> None:
+def measure_images(client: Workers, job: Job, progress: Progress) -> None:
     """Measure mean and standard deviation of both images and store them, if the cost needs them and they are missing.
 
     Raises
@@ -182,12 +182,12 @@ def measure_images(client: Client, job: Job, progress: Progress) -> None:
     )
 
 
-def _measured(client: Client, image: Image, job: Job, progress: Progress) -> ImageStatistics:
+def _measured(client: Workers, image: Image, job: Job, progress: Progress) -> ImageStatistics:
     windows = blocks(image.height, image.width)
     retries = job.config.cluster.retries
     found: dict[int, Moments] = {}
-    for outcome in Submission(
-        client, (Task(i, measure_block, (image, block, job.files), retries) for i, block in enumerate(windows))
+    for outcome in client.outcomes(
+        (Task(i, measure_block, (image, block, job.files), retries) for i, block in enumerate(windows))
     ):
         if outcome is not None and outcome.error is not None:
             if isinstance(outcome.error, ChangedInputError):
@@ -221,7 +221,7 @@ class Matched(NamedTuple):
     seconds: dict[str, float]
 
 
-def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
+def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
     """Match the unfinished tiles of jobs; yield each job after its last tile.
 
     Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the
@@ -234,16 +234,13 @@ def match_jobs(client: Client, jobs: Sequence[Job], progress: Progress) -> Itera
     yield from (ended for ended, schedule in zip(matched, schedules, strict=True) if not schedule)
     done = total - sum(map(len, schedules))
     progress("tiles", done, total)
-    for outcome in Submission(client, _tasks(jobs, schedules)):
+    for outcome in client.outcomes(_tasks(jobs, schedules)):
         if outcome is None:
             progress("tiles", done, total)
             continue
         (i, step), seconds, error = outcome
-        if isinstance(error, OSError) and error.errno in _FULL_DISK:  # all other tiles would fail too
-            raise RunError(
-                f"{error.filename or jobs[i].store.folder}: {error.strerror}: free disk space and rerun the same "
-                "command: it resumes"
-            ) from error
+        if error is not None:
+            check_not_full(error, jobs[i].store.folder)
         if error is None:
             schedules[i].ended(step)
             add_seconds(matched[i].seconds, seconds or {})  # of tracing; a tile keeps its own in its record

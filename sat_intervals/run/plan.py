@@ -12,21 +12,21 @@ from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
 from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image
-from sat_intervals.run.cluster import tiles_at_once
+from sat_intervals.raster import BLOCK, Image
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
-from sat_intervals.run.submit import reason
+from sat_intervals.run.strips import strip_bytes
+from sat_intervals.run.workers import reason, tiles_at_once
 from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.
 SAMPLE = 512
 # Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each sub-pixel level),
-# strips of the final bands, files.
-_STORE_BYTES, _STRIP_BYTES, _FILE_BYTES = 12, 18, 10
+# parts of the files with what overviews are made of, files.
+_STORE_BYTES, _PART_BYTES, _FILE_BYTES = 12, 18, 10
 
 
 @dataclass(frozen=True)
@@ -107,15 +107,16 @@ def plan(
     seconds, extra = _expected(left, right, config, workers, grid)
     pixels = region.height * region.width
     together = {"threads": workers, "processes": 1, "address": 1}.get(config.cluster.kind, config.cluster.cores)
+    task = max(tile_bytes(config), strip_bytes(region.width))
     return Plan(
         tile_size=config.tiles.size,
         tiles=len(grid),
         workers=workers,
         extra_work=extra,
-        worker_bytes=PROCESS_BYTES + tile_bytes(config),
+        worker_bytes=PROCESS_BYTES + task,
         together=together,
-        together_bytes=PROCESS_BYTES + together * tile_bytes(config),
-        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels + _STRIP_BYTES + _FILE_BYTES)
+        together_bytes=PROCESS_BYTES + together * task,
+        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels + _PART_BYTES + _FILE_BYTES)
         + handed_bytes(grid, config),
         seconds=seconds,
     )
@@ -179,12 +180,13 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     # Of two tiles the first one's states of the last wavefront are traced, too: no tile is ready before.
     traced = max(1, 4 * _traced(sample, whole, one) // 3)
     paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
-    files = (seconds["bands"] + seconds["files"]) * pixels / sampled
+    strips = seconds["bands"] * pixels / sampled / min(workers, -(-grid.region.height // BLOCK))
+    files = seconds["files"] * pixels / sampled
     images = seconds["tiles.images"]  # the sample already measures whole images
     blocks = blocks_of(grid, config)
     parallel = time_of(blocks, min(workers, len(grid)), paths / max(1, 3 * len(blocks)), tiles / len(blocks))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
-    return float(seconds["start"] + seconds["kernels"] + images + parallel + files), extra
+    return float(seconds["start"] + seconds["kernels"] + images + parallel + strips + files), extra
 
 
 def _sampled(

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Disparity
+from sat_intervals.config import Disparity, unreached
 from sat_intervals.match.sampling import Look, summary
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
@@ -67,6 +67,8 @@ def warnings_of(job: Job, counts: dict[str, Any], quality: dict[str, Any]) -> li
             f"range {search.minimum} to {search.maximum}, the median width is {width:g} px: check the search range, "
             "and no-data values (--nodata), or the ground has no texture"
         )
+    if missed := unreached(job.config):
+        lines.append(f"{path}: {missed}")
     paths = {"left": job.left.path, "right": job.right.path}
     return lines + doubts(quality, paths, is_census=job.config.cost.method == "census" and job.config.preset == "paper")
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from distributed import Client
 
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -26,9 +25,8 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, read_window
 from sat_intervals.raster.identity import ChangedInputError, check_unchanged
-from sat_intervals.run.cluster import Connection
 from sat_intervals.run.quality import COLLAR, is_plain
-from sat_intervals.run.submit import Submission, Task, reason
+from sat_intervals.run.workers import Connection, Task, Workers, reason
 from sat_intervals.tiling import Window
 
 _Files = dict[str, dict[str, Any]]
@@ -76,7 +74,7 @@ def _checked(work: Callable[[], _Result], files: _Files) -> _Result:
         raise
 
 
-def search_range(client: Client, left: Image, right: Image, files: _Files, progress: Progress) -> Found:
+def search_range(client: Workers, left: Image, right: Image, files: _Files, progress: Progress) -> Found:
     """Find the search range of a pair from the whole images, with its evidence.
 
     Parameters
@@ -126,7 +124,7 @@ def find_here(left: Image, right: Image, progress: Progress) -> Found:
         return search_range(connection.client(), left, right, {}, progress)
 
 
-def _reduced(client: Client, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:
+def _reduced(client: Workers, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:
     """An image at the finest level, and its smallest usable value."""
     windows = [
         block
@@ -143,7 +141,7 @@ def _reduced(client: Client, image: Image, step: Step, files: _Files, progress: 
 
 
 def _outcomes(
-    client: Client, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], progress: Progress
+    client: Workers, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], progress: Progress
 ) -> Iterator[tuple[int, Any]]:
     """Results of a function on workers, by the number of the task.
 
@@ -153,7 +151,7 @@ def _outcomes(
         A task failed.
     """
     done = 0
-    for outcome in Submission(client, (Task(i, function, arguments, _RETRIES) for i, arguments in enumerate(tasks))):
+    for outcome in client.outcomes((Task(i, function, arguments, _RETRIES) for i, arguments in enumerate(tasks))):
         if outcome is not None and outcome.error is not None:
             if isinstance(outcome.error, ChangedInputError):
                 raise outcome.error

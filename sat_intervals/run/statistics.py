@@ -1,5 +1,6 @@
 """Count pixels of the final bands, strip by strip, for run.json."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,19 @@ class Tally:
         width = (bands.upper - bands.lower)[bands.valid]
         width = np.rint(width[np.isfinite(width)] / np.float32(_WIDTH_STEP)).astype(np.int32)
         self._widths += np.bincount(width, minlength=self._widths.size)
+
+    def counts(self) -> dict[str, list[list[int]]]:
+        """Return all counts, each with its place; `merge` adds them."""
+        return {
+            name: [[int(place), int(counts[place])] for place in np.flatnonzero(counts)]
+            for name, counts in (("ends", self._ends), ("sums", self._sums), ("widths", self._widths))
+        }
+
+    def merge(self, counts: Mapping[str, Sequence[Sequence[int]]]) -> None:
+        """Add what another tally of the same range has counted, see `counts`."""
+        for name, there in counts.items():
+            for place, count in there:
+                getattr(self, f"_{name}")[place] += count
 
     def _count(self, wanted: np.ndarray) -> int:
         """Pixels whose sum of flags is wanted."""

@@ -1,22 +1,21 @@
-"""Submit tasks to a cluster with a bounded number in flight, and handle lost workers."""
+"""Submit tasks to a dask cluster with a bounded number in flight, and handle lost workers."""
 
 import logging
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 from distributed import Client, Future, KilledWorker
 from distributed.client import ClosedClientError
 
 from sat_intervals.errors import RunError
 from sat_intervals.run.batch_system import current_workers
+from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task
 
-# Seconds between checks of the workers, whose number may change.
-_CHECK_EVERY = 2.0
 # Seconds without a heartbeat, normally sent every few seconds, after which a warning names a worker.
 SILENT = 30.0
 # Seconds without a heartbeat of any worker, after the first one, at which a run ends.
@@ -26,31 +25,15 @@ _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Task:
-    """A call that any worker may make, and may repeat.
+class DaskWorkers:
+    """Workers of a dask cluster, and the addresses of those that were logged; see `Workers`."""
 
-    Attributes
-    ----------
-    label
-        Identifies the task in its `Outcome`.
-    function, arguments
-        The call.
-    retries
-        How often it is tried again if it raises.
-    """
+    client: Client
+    known: set[str] = field(default_factory=set)
 
-    label: Any
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    retries: int
-
-
-class Outcome(NamedTuple):
-    """Result or error of a task."""
-
-    label: Any
-    result: Any
-    error: BaseException | None
+    def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
+        """See `Workers` and `Submission`."""
+        return iter(Submission(self.client, tasks, self.known))
 
 
 class Submission:
@@ -65,7 +48,8 @@ class Submission:
         The scheduler is gone, or all workers of a batch system.
     """
 
-    def __init__(self, client: Client, tasks: Iterator[Task | None]) -> None:
+    def __init__(self, client: Client, tasks: Iterator[Task | None], known: set[str] | None = None) -> None:
+        """``known``: workers that were logged before, kept up to date."""
         self._client, self._tasks = client, tasks
         self._name = uuid.uuid4().hex  # unique, since a scheduler may serve several runs
         self._submitted = 0
@@ -73,7 +57,7 @@ class Submission:
         self._in_flight: dict[str, tuple[Task, bool, Future[Any]]] = {}
         self._suspects: list[Task] = []
         self._limit, self._checked = 2, float("-inf")
-        self._workers: set[str] = set()
+        self._workers: set[str] = set() if known is None else known
         self._heartbeats = _Heartbeats()
 
     def __iter__(self) -> Iterator[Outcome | None]:
@@ -100,13 +84,13 @@ class Submission:
     def _next(self) -> Future[Any] | None:
         """Wait for the next finished future; return None after a few seconds."""
         try:
-            return self._ended.get(timeout=_CHECK_EVERY)
+            return self._ended.get(timeout=CHECK_EVERY)
         except Empty:
             return None
 
     def _fill(self) -> None:
         """Submit tasks until two per current core are in flight."""
-        if time.monotonic() - self._checked > _CHECK_EVERY:
+        if time.monotonic() - self._checked > CHECK_EVERY:
             with _scheduler_errors():
                 cores = current_workers(self._client)
                 self._heartbeats.check(self._client)
@@ -122,7 +106,8 @@ class Submission:
     def _log_workers(self, workers: set[str]) -> None:
         for worker in sorted(workers ^ self._workers):
             _LOG.info("worker %s %s", worker, "joined" if worker in workers else "left")
-        self._workers = workers
+        self._workers.clear()
+        self._workers.update(workers)
 
     def _submit(self, task: Task, *, is_alone: bool = False) -> None:
         self._submitted += 1
@@ -187,15 +172,3 @@ def _scheduler_errors() -> Iterator[None]:
         yield
     except (OSError, ClosedClientError) as error:
         raise RunError("the dask scheduler is gone; rerun the same command: it resumes") from error
-
-
-def reason(error: BaseException) -> str:
-    """Return why a task failed, in one line."""
-    if isinstance(error, KilledWorker):
-        return (
-            f"every worker that matched it died, the last at {error.last_worker.address}, probably out of memory: give "
-            "workers more memory, or choose smaller tiles"
-        )
-    if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename2 or error.filename}: {error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__

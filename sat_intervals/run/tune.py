@@ -1,5 +1,6 @@
 """Compare settings on pairs with truth: presets and a ladder of penalties, each with its own calibration."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -8,13 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import PRESETS, Calibration, Config, Interval, load_config
+from sat_intervals.config import PRESETS, Calibration, Config, Interval, key_of, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.match.calibration import ladder, left_out, means
+from sat_intervals.match.calibration import left_out, means
 from sat_intervals.match.mccnn import load_network
+from sat_intervals.match.measurement import ladder
 from sat_intervals.progress import Progress
-from sat_intervals.run.calibrate import Subject, calibration_from, measure_subjects
+from sat_intervals.run.calibrate import calibration_from
+from sat_intervals.run.measure import Subject, measure_subjects
 
 COVERAGE = 0.9  # that settings are compared at
 # Settings with fewer good pixels than this share of the most are not chosen, however narrow their intervals.
@@ -49,8 +52,18 @@ def has_network() -> bool:
     return True
 
 
-def candidates(*, with_network: bool) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield names and settings: the presets, then penalties with Census and, with the network, with MC-CNN."""
+def candidates(own: Config, *, with_network: bool) -> Iterator[tuple[str, dict[str, Any] | None]]:
+    """Yield names and settings: presets, penalties with Census and, with the network, with MC-CNN.
+
+    ``own`` settings, None, are the first if they are none of these.
+    """
+    changes = dict(_ladder(with_network=with_network))
+    if key_of(own) not in [key_of(_changed(own, one)) for one in changes.values()]:
+        yield "own settings", None
+    yield from changes.items()
+
+
+def _ladder(*, with_network: bool) -> Iterator[tuple[str, dict[str, Any]]]:
     for preset in PRESETS:
         if with_network or "mccnn" not in preset:
             yield preset, {"preset": preset}
@@ -63,7 +76,7 @@ def candidates(*, with_network: bool) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def tuned(
-    name: str, changes: Mapping[str, Any], subjects: Sequence[Subject], folder: Path, progress: Progress
+    name: str, changes: Mapping[str, Any] | None, subjects: Sequence[Subject], folder: Path, progress: Progress
 ) -> Tuned:
     """Calibrate pairs with changed settings, and judge these; parameters as in `measure_subjects`."""
     subjects = [replace(subject, config=_changed(subject.config, changes)) for subject in subjects]
@@ -79,20 +92,32 @@ def tuned(
     )
 
 
-def _changed(config: Config, changes: Mapping[str, Any]) -> Config:
-    """Return the settings that are compared, with search range, cross-checking and cluster of the others."""
-    kept = config.model_dump(include={"disparity", "cross_check", "cluster"})
+def _changed(config: Config, changes: Mapping[str, Any] | None) -> Config:
+    """Return the settings that are compared, with search range, cross-checking, tiles and cluster of the others."""
+    if changes is None:
+        return config
+    kept = config.model_dump(include={"disparity", "cross_check", "tiles", "cluster"})
     return load_config(changes, kept)
 
 
 def best_of(found: Sequence[Tuned]) -> Tuned:
-    """Return the settings with the smallest interval score, of those with nearly as many good pixels as any."""
-    most = max(one.good for one in found)
-    return min((one for one in found if one.good >= _GOOD_ENOUGH * most), key=lambda one: one.figures["score"])
+    """Return the settings with the smallest interval score, of those with nearly as many good pixels as any.
+
+    Raises
+    ------
+    SatIntervalsError
+        None has a score.
+    """
+    judged = [one for one in found if math.isfinite(one.figures.get("score", math.nan))]
+    if not judged:
+        raise SatIntervalsError("no settings leave enough pixels with truth to be compared: give more pairs")
+    most = max(one.good for one in judged)
+    return min((one for one in judged if one.good >= _GOOD_ENOUGH * most), key=lambda one: one.figures["score"])
 
 
-def settings_of(best: Tuned) -> dict[str, Any]:
+def settings_of(best: Tuned, name: str) -> dict[str, Any]:
     """Return settings with their calibration, without search range and cluster, as a file for `match --config`."""
-    interval = Interval(coverage=Decimal(str(COVERAGE)), calibration=best.calibration)
+    calibration = best.calibration.model_copy(update={"name": name})
+    interval = Interval(coverage=Decimal(str(COVERAGE)), calibration=calibration)
     config = best.subjects[0].config.model_copy(update={"interval": interval})
     return config.model_dump(mode="json", exclude={"disparity", "cluster", "products"})

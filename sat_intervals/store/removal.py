@@ -9,10 +9,14 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, is_seale
 from sat_intervals.store.zarr_arrays import MADE_BY
 
 ARRAYS, RECORDS, FAILURES, BORDERS, COSTS = "arrays.zarr", "records", "failures", "borders", "costs"
-FOLDERS = RECORDS, FAILURES, BORDERS, COSTS
+PARTS = "parts"
+FOLDERS = RECORDS, FAILURES, BORDERS, COSTS, PARTS
 NORMALIZATION, SEARCH = "normalization.json", "range.json"
 _GROUP = f"{ARRAYS}/zarr.json"
-_OF_RUN = re.compile(rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json")
+_OF_RUN = re.compile(
+    rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
+    rf"|{PARTS}/[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)"
+)
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
     rf"|{BORDERS}/(\d+)_(\d+)_[0-3]"
@@ -21,7 +25,7 @@ _OF_TILE = re.compile(
 )
 # Folders of a run. If one of them were a link, writing would replace the user's files behind it.
 _FOLDER = re.compile(
-    rf"{RECORDS}|{FAILURES}|{BORDERS}|{COSTS}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
+    rf"{RECORDS}|{FAILURES}|{BORDERS}|{COSTS}|{PARTS}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
 )
 # Temporary names of `LocalFolder` and of zarr, which a killed process leaves, with the final name as group.
 _UNFINISHED = re.compile(r"(?:(?<=/)|^)\.([^/]+)\.[0-9a-f]{32}$"), re.compile(r"()\.[0-9a-f]{32}\.partial$")

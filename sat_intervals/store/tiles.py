@@ -43,7 +43,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 9
+LAYOUT = 10
 
 # Marker files in the folder of a run: present while it replaces an earlier run; its name, from the publication of its
 # files to the removal of its tiles.
@@ -291,8 +291,12 @@ class Store:
         with self._damage_handled():
             return self._arrays.seams(_checksums(records))
 
-    def strips(self, rows: int, records: Records) -> Iterator[dict[str, np.ndarray]]:
-        """Yield raw products of the region in full-width strips of about ``rows`` rows, from the top.
+    def strips(
+        self, rows: int, records: Records, first: int = 0, last: int | None = None
+    ) -> Iterator[dict[str, np.ndarray]]:
+        """Yield raw products of full-width strips of about ``rows`` rows, from the top, see `TileArrays.strips`.
+
+        ``records`` are those of the tiles in the rows ``[first, last)``, by default of all.
 
         Raises
         ------
@@ -300,7 +304,7 @@ class Store:
             Names the tiles with damaged files.
         """
         with self._damage_handled():
-            yield from self._arrays.strips(rows, _checksums(records))
+            yield from self._arrays.strips(rows, _checksums(records), first, last)
 
     @contextmanager
     def _damage_handled(self) -> Iterator[None]:

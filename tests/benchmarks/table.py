@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import rasterio
@@ -24,7 +25,7 @@ RUNS = 5
 
 
 def run(command, cores, environment=None):
-    """Seconds, and peak memory of the largest process in MB, of a command; and what it printed."""
+    """Seconds, peak memory of the largest process in MB, and processor seconds of a command; and what it printed."""
     started = time.perf_counter()
     process = subprocess.Popen(
         command,
@@ -39,13 +40,13 @@ def run(command, cores, environment=None):
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"failed with status {process.returncode}: {' '.join(map(str, command))}")
-    return time.perf_counter() - started, usage.ru_maxrss / 1024, printed
+    return time.perf_counter() - started, usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime, printed
 
 
 def candidate(name, size, disparities, runs=RUNS):
     """Median seconds, peak memory and seconds outside the network of MC-CNN of one candidate on one core."""
     command = [sys.executable, HERE / "candidates.py", name, size, size, disparities, runs]
-    _, _, printed = run([str(part) for part in command], CORES[:1])
+    *_, printed = run([str(part) for part in command], CORES[:1])
     result = json.loads(printed.splitlines()[-1])
     outside = [whole - network for whole, network in zip(result["seconds"], result["network"], strict=True)]
     return statistics.median(result["seconds"]), result["megabytes"], statistics.median(outside)
@@ -63,18 +64,45 @@ def write_pair(folder, size):
     return paths
 
 
-def match(pair, out, workers, disparities=64, environment=None):
-    """Seconds, peak memory in MB and run.json of a whole `sat-intervals match`."""
+# Prints the processor time of the command itself, without its workers, from the first strip on, and the bytes it wrote.
+CLIENT = """
+import json, sys, time
+from sat_intervals import match_pair
+def progress(stage, done, total):
+    if stage in ("bands", "files"):
+        marks.setdefault(stage, time.process_time())
+        marks["end"] = time.process_time()
+if __name__ == "__main__":
+    left, right, out, minimum, maximum = sys.argv[1:]
+    marks, search = {}, {"minimum": int(minimum), "maximum": int(maximum)}
+    settings = {"disparity": search, "cluster": {"kind": "processes", "workers": 2}}
+    report = match_pair(left, right, out, settings, overwrite=True, progress=progress)
+    print(json.dumps([marks["end"] - marks["bands"], sum(file["bytes"] for file in report["files"].values())]))
+"""
+
+
+def client(pair, folder):
+    """Processor time of the command while workers finish strips and copy them, and gigabytes written."""
+    (folder / "client.py").write_text(CLIENT)
+    ends = map(str, search_range(64))
+    command = [sys.executable, folder / "client.py", *pair, folder / "client", *ends]
+    seconds, written = json.loads(run([str(part) for part in command], CORES)[-1].splitlines()[-1])
+    return seconds, written / 1e9
+
+
+def match(pair, out, workers, disparities=64, environment=None, more=()):
+    """Seconds, peak memory in MB, processor seconds and run.json of a whole `sat-intervals match`."""
     ends = map(str, search_range(disparities))
     command = [Path(sys.executable).with_name("sat-intervals"), "match", *pair, out, "--disparity", *ends, "--quiet"]
-    command += ["--overwrite", "--workers", workers]
-    seconds, memory, _ = run([str(part) for part in command], CORES[:workers], environment)
-    return seconds, memory, json.loads((out / "run.json").read_text())
+    command += ["--overwrite", "--workers", workers, *more]
+    *figures, _ = run([str(part) for part in command], CORES[:workers], environment)
+    return *figures, json.loads((out / "run.json").read_text())
 
 
-def median_run(pair, out, workers, runs):
+def median_run(pair, out, workers, runs, more=()):
     """Return the result of `match` of the run with the median time."""
-    return sorted((match(pair, out, workers) for _ in range(runs)), key=lambda run: run[0])[runs // 2]
+    results = (match(pair, out, workers, more=more) for _ in range(runs))
+    return sorted(results, key=lambda run: run[0])[runs // 2]
 
 
 def row(*cells):
@@ -135,7 +163,7 @@ def file_to_file(folder):
     row("`sat-intervals --help`", f"{statistics.median(helps):.2f} s")
     one = median_run(pairs[4000], folder / "out", 1, 3)
     row("4000 x 4000, one worker on one core", f"{one[0]:.1f} s, {one[1]:.0f} MB")
-    stages = one[2]["seconds"]
+    stages = one[3]["seconds"]
     kernels, starting = stages["tiles.match"], one[0] - stages["tiles"] - stages["bands"] - stages["files"]
     row(
         "its stages",
@@ -143,25 +171,54 @@ def file_to_file(folder):
         f"files {stages['files']:.1f} s, starting {starting:.1f} s",
     )
     row("what all but the kernels adds to them", f"{100 * (one[0] / kernels - 1):.0f} %")
-    row("rows, with reading and writing", f"{16 / stages['bands']:.0f} Mpx/s")
+    (folder / "none.yaml").write_text("products: {compression: none}\n")
+    plain = median_run(pairs[4000], folder / "out", 1, 3, ["--config", folder / "none.yaml"])
+    row("the same without compression", f"{100 * (plain[0] / plain[3]['seconds']['tiles.match'] - 1):.0f} %")
+    row("strips, with reading, compressing and writing", f"{16 / stages['bands']:.0f} Mpx/s")
     if len(CORES) > 1:
         two = median_run(pairs[4000], folder / "out", 2, 3)
-        tiles = stages["tiles"] / two[2]["seconds"]["tiles"]
+        tiles = stages["tiles"] / two[3]["seconds"]["tiles"]
         row("two workers on two cores against one", f"{one[0] / two[0]:.2f} x (tiles {tiles:.2f} x), {two[1]:.0f} MB")
     small, large = median_run(pairs[2000], folder / "out", 1, RUNS), median_run(pairs[8000], folder / "out", 1, 1)
     row("cost a pixel, 8000 x 8000 against 2000 x 2000", f"{large[0] / small[0] / 16:.2f}")
     row("peak memory, the same", f"{large[1] / small[1]:.2f} ({large[1]:.0f} and {small[1]:.0f} MB)")
+    if len(CORES) > 1:
+        seconds, written = client(pairs[8000], folder)
+        row("the command itself after its tiles, 8000 x 8000, two processes", f"{seconds:.2f} s for {written:.2f} GB")
+
+
+def with_coverage(folder):
+    """Processor time with a coverage over that with alpha, of runs in turn, since other work changes the speed."""
+    print()
+    row("with a coverage against alpha, processor time, median of pairs of runs", "ratio", "all")
+    row("---", "---", "---")
+    pair, out = write_pair(folder, 2000), folder / "out"
+    for preset in ("paper", "satellite"):
+        options = [("--preset", preset, *more) for more in ((), ("--coverage", 0.9))]
+        for more in options:
+            match(pair, out, 1, more=more)  # not counted
+        ratios = []
+        for _ in range(7):
+            alpha, coverage = (match(pair, out, 1, more=more)[2] for more in options)
+            ratios.append(coverage / alpha)
+        least, most = min(ratios), max(ratios)
+        row(f"2000 x 2000, {preset}", f"{statistics.median(ratios):.2f}", f"{least:.2f} to {most:.2f}")
 
 
 def main():
-    """Print the table."""
+    """Print the tables that are named, by default all."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
     print(f"{cpu}, {len(CORES)} cores, {datetime.now(UTC):%Y-%m-%d}, Python {platform.python_version()}\n")
-    in_memory()
-    mccnn()
     with tempfile.TemporaryDirectory() as folder:
-        file_to_file(Path(folder))
+        parts = {
+            "memory": in_memory,
+            "mccnn": mccnn,
+            "files": partial(file_to_file, Path(folder)),
+            "coverage": partial(with_coverage, Path(folder)),
+        }
+        for name in sys.argv[1:] or parts:
+            parts[name]()
 
 
 if __name__ == "__main__":

@@ -48,7 +48,13 @@ def test_evaluate_report_plot__show_the_coverage_asked_for(run, pair, tmp_path):
     assert "nominalSentence" in (run / "report.html").read_text()
     at_80 = tmp_path / "at_80"
     assert invoke("match", *given(pair, at_80), "--coverage", 0.8, "--calibration", pair / "own.yaml").exit_code == 0
-    drawn = invoke("plot", run, "--beside", at_80, "--pixel", 100, 100, "--dpi", 40)
+    both = invoke("evaluate", run, at_80)
+    rows = {line.split()[0]: line.split()[1:] for line in both.output.splitlines() if line}
+    assert rows[str(run)][:2] == ["0.900", f"{report['all']['accuracy']:.3f}"]
+    assert rows[str(at_80)][0] == "0.800"
+    assert rows["mean"][0] == "0.850"
+    judging = "--tolerance", 1, "--remove-bias", "--mask", pair / "truth.tif"
+    drawn = invoke("plot", run, "--beside", at_80, "--pixel", 100, 100, "--dpi", 40, *judging)
     assert drawn.exit_code == 0, drawn.output
     assert str(run / "coverage.png") in drawn.output.split()
 

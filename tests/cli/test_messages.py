@@ -69,9 +69,8 @@ def test_main__names_a_variable_that_numba_cannot_start_with(threads, monkeypatc
 def test_main__names_a_malformed_dask_configuration(tmp_path):
     (tmp_path / "distributed.yaml").write_text("a: [1\n b: }")
     image = write(tmp_path / "image.tif", np.ones((9, 9), np.uint8))
-    result = ended(
-        "match", image, image, tmp_path / "out", "--disparity", 0, 4, env=os.environ | {"DASK_CONFIG": str(tmp_path)}
-    )
+    arguments = "match", image, image, tmp_path / "out", "--disparity", 0, 4, "--cluster", "processes"
+    result = ended(*arguments, env=os.environ | {"DASK_CONFIG": str(tmp_path)})
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert str(tmp_path / "distributed.yaml") in line
@@ -140,7 +139,8 @@ def test_output_writer__tells_a_lack_of_memory_from_a_full_disk(tmp_path, monkey
         raise error
 
     with OutputWriter(tmp_path, RUN_FILES, 9, 9, Georeferencing(), {}) as files:
-        monkeypatch.setattr(writer, "copy", fail)
+        files.write(0, np.zeros((4, 9, 9)), np.zeros((9, 9)))
+        monkeypatch.setattr(writer, "template", fail)
         monkeypatch.setattr(writer.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
         with pytest.raises(SatIntervalsError, match=r"tif cannot be written: not enough memory \(") as caught:
             files.build()

@@ -1,10 +1,12 @@
 """Calibrations: files, keys, levels between coverages, and messages."""
 
+import numpy as np
 import pytest
 import yaml
 from helpers import calibration
 
-from sat_intervals.config import ConfigError, calibration_of, key_of, load_calibration, load_config, resolved
+from sat_intervals import match_arrays
+from sat_intervals.config import ConfigError, calibration_of, key_of, load_calibration, load_config, resolved, unreached
 from sat_intervals.config.calibration import COVERAGES, at
 
 RANGE = {"disparity": {"minimum": -3, "maximum": 5}}
@@ -18,19 +20,38 @@ def rising(**changes):
     return values
 
 
+def numbers(levels):
+    return levels.high, levels.low, levels.quantile
+
+
 def test_at__gives_the_rows_and_is_linear_between() -> None:
     loaded = load_calibration(rising(row_1={"quantile": 0.5}))
     for i, coverage in enumerate(COVERAGES):
-        assert at(loaded, coverage) == (10 * i, i, 0.5 if i == 1 else 0.9)
-    assert at(loaded, 0.925) == pytest.approx((55, 5.5, 0.9))
-    assert at(loaded, 0.65) == pytest.approx((15, 1.5, 0.7))
+        assert at(loaded, coverage) == loaded.levels[i]
+    assert numbers(at(loaded, 0.925)) == pytest.approx((55, 5.5, 0.9))
+    assert at(loaded, 0.925).coverage == 0.925
 
 
-def test_at__without_a_quantile_at_one_side_takes_the_larger_coverage() -> None:
-    loaded = load_calibration(rising(row_2={"quantile": None}))
-    assert at(loaded, 0.65) == pytest.approx((15, 2, None))
-    assert at(loaded, 0.75) == pytest.approx((25, 3, 0.9))
-    assert at(loaded, 0.7) == (20, 2, None)
+def test_at__between_two_quantiles_takes_level_and_quantile_of_the_larger_coverage() -> None:
+    loaded = load_calibration(rising(row_1={"quantile": 0.5}, row_2={"quantile": None}))
+    assert numbers(at(loaded, 0.55)) == pytest.approx((5, 1, 0.5))
+    assert numbers(at(loaded, 0.65)) == pytest.approx((15, 2, None))
+    assert numbers(at(loaded, 0.75)) == pytest.approx((25, 3, 0.9))
+
+
+def test_unreached__names_a_coverage_that_the_calibration_does_not_reach(caplog) -> None:
+    """Between two rows, that of the larger coverage counts. A run says so, see tests of the commands."""
+    content = rising(row_8={"reached": False})
+
+    def line(**interval):
+        return unreached(load_config(RANGE, {"interval": interval}))
+
+    assert line(alpha=0.9) == line(coverage=0.975, calibration=content) == ""
+    for coverage in (0.98, 0.99):
+        assert f"calibration flat do not reach coverage {coverage}" in line(coverage=coverage, calibration=content)
+    settings = RANGE | {"interval": {"coverage": 0.99, "calibration": content}}
+    match_arrays(np.eye(20), np.eye(20), settings)
+    assert "do not reach coverage 0.99" in caplog.text
 
 
 def test_load_calibration__reads_a_file_and_a_run_keeps_its_content(tmp_path) -> None:
@@ -41,7 +62,7 @@ def test_load_calibration__reads_a_file_and_a_run_keeps_its_content(tmp_path) ->
     assert load_config(config.model_dump(mode="json")) == config
     assert calibration_of(config).provenance == {"scenes": ["one"]}
     assert calibration_of(config).sha256 == load_calibration(rising()).sha256
-    assert config.cuts == (50, 5, 0.9)
+    assert numbers(config.cuts) == (50, 5, 0.9)
 
 
 @pytest.mark.parametrize(
@@ -52,6 +73,7 @@ def test_load_calibration__reads_a_file_and_a_run_keeps_its_content(tmp_path) ->
             "levels: high falls from 30 at coverage 0.8 to 20 at 0.85: a level may not fall",
         ),
         (rising(row_4={"low": 0.5}), "levels: low falls from 3 at coverage 0.8 to 0.5 at 0.85"),
+        (rising(row_4={"coverage": None}), "levels: coverages are 0.5, 0.6, 0.7, 0.8, None, 0.9"),
         (rising(row_4={"coverage": 0.84}), "levels: coverages are 0.5, 0.6, 0.7, 0.8, 0.84, 0.9"),
         (rising(row_4={"high": -1.0}), "levels.4.high: input should be greater than or equal to 0"),
         (rising(row_4={"quantile": 0.4}), "levels.4.quantile: input should be greater than or equal to 0.5"),
@@ -59,6 +81,7 @@ def test_load_calibration__reads_a_file_and_a_run_keeps_its_content(tmp_path) ->
         ({"name": "x"}, "key: field required"),
         ([1], "holds [1], allowed: keys name, key, levels, provenance"),
         ("{", "line 1:"),
+        ({"interval": {"coverage": 0.9}}, "own.yaml has settings, not a calibration: give it by --config"),
     ],
 )
 def test_load_calibration__names_the_file_and_the_error(tmp_path, values, words) -> None:
@@ -69,6 +92,12 @@ def test_load_calibration__names_the_file_and_the_error(tmp_path, values, words)
     assert str(file) in str(caught.value)
     assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_load_config__a_calibration_is_no_file_of_settings(tmp_path) -> None:
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(rising()))
+    with pytest.raises(ConfigError, match=r"own.yaml is a calibration: give it by --calibration"):
+        load_config(tmp_path / "own.yaml")
 
 
 def test_load_calibration__names_a_missing_file() -> None:
@@ -124,7 +153,8 @@ def test_key_of__of_mccnn_has_the_digest_of_its_weights(tmp_path) -> None:
 
 def test_calibration_of__without_one_names_the_command() -> None:
     config = load_config(RANGE, {"cost": {"window": 9}, "interval": {"coverage": 0.9}})
-    with pytest.raises(ConfigError, match=r"no built-in calibration .* belongs to these settings: .* calibrate"):
+    nearest = r"\(that of paper is the nearest: cost.window is 5 there and 9 here, span is .*\)"
+    with pytest.raises(ConfigError, match=rf"no built-in .* settings {nearest}: .* calibrate"):
         resolved(config)
 
 
@@ -159,6 +189,11 @@ def test_load_config__explains_intervals(interval, words) -> None:
     with pytest.raises(ConfigError) as caught:
         load_config(RANGE, {"interval": interval})
     assert words in str(caught.value)
+
+
+def test_load_config__a_coverage_needs_classes_of_confidence() -> None:
+    with pytest.raises(ConfigError, match=r"interval.coverage is 0.9 and regularization null, .*: give regulariz"):
+        load_config(RANGE, {"interval": {"coverage": 0.9}, "regularization": None})
 
 
 def test_bound_steps__fit_in_16_bits() -> None:

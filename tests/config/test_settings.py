@@ -328,7 +328,7 @@ REFUSED = [
     ("tiles", {"overlap": 2}, "tiles.overlap is 2, allowed: >= 3 with cost.window 5"),
     ("tiles", None, "tiles is null, allowed: section of size, overlap"),
     ("products", {"keep_rejected": 1}, "products.keep_rejected is 1, allowed: true or false"),
-    ("products", None, "products is null, allowed: section of keep_rejected"),
+    ("products", None, "products is null, allowed: section of keep_rejected, compression"),
     (
         "regularisation",
         {},

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 
+from sat_intervals import SatIntervalsError
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import SURFACE
@@ -41,17 +42,103 @@ def test_evaluate_surface__worked_example(tmp_path):
     reference = np.array([[10.0, 10, 11, 12]])
     height, lower, upper = [[10.5, 9, 13, 16]], [[9, 8, 10, 15]], [[11, 9.5, 14, 17]]
     report = evaluate_surface(
-        surface(tmp_path / "dsm.tif", height, lower, upper), write(tmp_path / "reference.tif", [reference])
+        surface(tmp_path / "dsm.tif", height, lower, upper),
+        write(tmp_path / "reference.tif", [reference]),
+        registers=False,
     )
     everything = report["all"]
-    assert (everything["count"], everything["accuracy"], everything["median_width"]) == (4, 0.5, 2.0)
-    assert everything["bias"] == pytest.approx(1.25)
+    assert (everything["count"], everything["coverage"], everything["median_half_width"]) == (4, 0.5, 1.0)
+    assert (everything["bias"], everything["median"]) == (pytest.approx(1.375), pytest.approx(1.25))
     assert everything["nmad"] == pytest.approx(1.4826 * 0.75)
     assert {kind["from"]: kind["count"] for kind in report["slope"]} == {0: 1, 5: 0, 15: 2, 30: 0, 45: 1}
     assert {kind["from"]: kind["count"] for kind in report["width"]} == {0: 0, 1: 1, 2: 3, 5: 0, 10: 0, 20: 0}
-    assert report["width"][1] == {
-        "from": 1.0, "to": 2.0, "count": 1, "accuracy": 0.0, "median_width": 1.5, "bias": -1.0, "nmad": 0.0
+    assert {key: report["width"][1][key] for key in ("from", "to", "count", "coverage", "median", "le90")} == {
+        "from": 1.0, "to": 2.0, "count": 1, "coverage": 0.0, "median": -1.0, "le90": 1.0
     }  # fmt: skip
+    # Squares 1 .25 4 16; of .5 1 2 4 the rank 2.7 for LE90; of -1 .5 2 4 the ranks .15 and 2.85. Missed by 0.5 and
+    # 3 m; with a nominal coverage of .9 each counts twenty times: (9.5 + 20 x 3.5) / 4.
+    assert everything["rmse"] == pytest.approx(np.sqrt(21.25 / 4))
+    assert everything["le90"] == pytest.approx(3.4)
+    assert everything["p95_p5"] == pytest.approx(3.7 - -0.775)
+    assert everything["mean_half_width"] == pytest.approx(9.5 / 8)
+    assert everything["interval_score"] is None
+    with rasterio.open(tmp_path / "dsm.tif", "r+") as dataset:
+        dataset.update_tags(COVERAGE="0.9")
+    scored = evaluate_surface(tmp_path / "dsm.tif", tmp_path / "reference.tif", registers=False)
+    assert scored["nominal"] == 0.9
+    assert scored["all"]["interval_score"] == pytest.approx((9.5 + 20 * 3.5) / 4)
+    assert scored["all"]["needed_half_width"] == everything["le90"]
+
+
+def relief(row, column):
+    return 500 + 8 * np.sin(0.1 * column + 0.03 * row) + 5 * np.cos(0.08 * row - 0.02 * column)
+
+
+def test_evaluate_surface__registers_on_relief_and_says_what_it_moved(tmp_path):
+    row, column = np.indices((150, 160)).astype(np.float64)
+    truth = relief(row, column)
+    model = surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
+    # the reference is 3 m too far west, 2 m too far north and 5 m too low; half as coarse
+    fine = np.indices((420, 440)) / 2 - 30 + 0.5 / 2 - 0.5
+    heights = relief(fine[0] - -2, fine[1] + 3) - 5
+    place = Affine(0.5, 0, PLACE.c - 30, 0, -0.5, PLACE.f + 30)
+    reference = write(tmp_path / "reference.tif", [heights], place)
+    report = evaluate_surface(model, reference)
+    found = report["registration"]
+    assert found["is_horizontal"]
+    np.testing.assert_allclose(found["shift"], (3, -2, 5), atol=0.1)
+    assert report["before"]["median"] == pytest.approx(5, abs=0.3)
+    assert report["before"]["coverage"] < 0.05
+    assert report["all"]["le90"] < 0.4  # four heights a cell, on slopes of 40 degrees
+    assert report["all"]["coverage"] > 0.95
+    alone = evaluate_surface(model, reference, registers=False)
+    assert alone["registration"] is None
+    assert alone["all"] == alone["before"] == report["before"]
+
+
+def test_evaluate_surface__by_classes_of_a_raster(tmp_path):
+    model = surface(tmp_path / "dsm.tif", [[1.0, 2, 3, 4]], [[0.0] * 4], [[9.0] * 4])
+    reference = write(tmp_path / "reference.tif", [[[1.0, 1, 1, 1]]])
+    classes = write(tmp_path / "classes.tif", [[[7.0, 7, 2, np.nan]]])
+    report = evaluate_surface(model, reference, classes, registers=False)
+    assert [(kind["class"], kind["count"], kind["bias"]) for kind in report["classes"]] == [(2, 1, 2.0), (7, 2, 0.5)]
+    with pytest.raises(SatIntervalsError, match=r"heights.tif has values such as 1.5.*give a raster of classes"):
+        evaluate_surface(model, reference, write(tmp_path / "heights.tif", [[[1.5] * 4]]), registers=False)
+
+
+@pytest.mark.peer("xdem")
+def test_evaluate_surface__has_the_nmad_and_both_le90_of_peers(tmp_path):
+    import geoutils
+    import xdem
+
+    random = np.random.default_rng(5)
+    truth = random.normal(500, 20, (300, 400))
+    height = truth + random.standard_t(3, truth.shape) * 0.7 + 0.3
+    height[random.random(height.shape) < 0.2] = np.nan
+    model = surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
+    ours = evaluate_surface(model, write(tmp_path / "reference.tif", [truth]), registers=False)["all"]
+    alone = xdem.DEM(str(write(tmp_path / "alone.tif", [height])))
+    difference = alone - xdem.DEM(str(tmp_path / "reference.tif"))
+    values = difference.data.compressed()
+    assert ours["count"] == values.size
+    assert ours["nmad"] == pytest.approx(float(geoutils.stats.nmad(values)), abs=2e-3)
+    assert ours["p95_p5"] == pytest.approx(float(geoutils.stats.estimators.linear_error(values)), abs=2e-3)
+    assert ours["le90"] == pytest.approx(float(np.percentile(np.abs(values), 90)), abs=2e-3)
+    assert ours["rmse"] == pytest.approx(float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))), rel=1e-4)
+
+
+@pytest.mark.peer("xdem")
+def test_evaluate_surface__moves_the_reference_as_xdem_does(tmp_path):
+    import xdem
+
+    row, column = np.indices((150, 160)).astype(np.float64)
+    truth = relief(row, column)
+    model = surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
+    reference = write(tmp_path / "reference.tif", [relief(row + 2, column + 3) - 5])
+    ours = evaluate_surface(model, reference)["registration"]["shift"]
+    fit = xdem.coreg.NuthKaab().fit(xdem.DEM(str(write(tmp_path / "alone.tif", [truth]))), xdem.DEM(str(reference)))
+    theirs = [fit.meta["outputs"]["affine"][name] for name in ("shift_x", "shift_y", "shift_z")]
+    np.testing.assert_allclose(ours, theirs, atol=0.1)
 
 
 def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkeypatch):
@@ -65,13 +152,13 @@ def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkey
     reference = write(tmp_path / "reference.tif", [fine], place)
     truth, height = fine[2:-2, 2:-2].astype(np.float32), np.repeat(np.repeat(height, 2, axis=0), 2, axis=1)
     known = np.isfinite(height)
-    whole = evaluate_surface(model, reference)
+    whole = evaluate_surface(model, reference, registers=False)
     assert whole["all"]["count"] == known.sum()
     inside = ((height - 1 <= truth) & (truth <= height + 2))[known]
-    assert whole["all"]["accuracy"] == pytest.approx(inside.mean(), abs=2e-3)
-    assert whole["all"]["bias"] == pytest.approx(np.median((height - truth)[known]), abs=0.01)
-    monkeypatch.setattr("sat_intervals.evaluate.dsm._STRIP", 5 * 31 * 4)
-    assert evaluate_surface(model, reference) == whole
+    assert whole["all"]["coverage"] == pytest.approx(inside.mean(), abs=2e-3)
+    assert whole["all"]["median"] == pytest.approx(np.median((height - truth)[known]), abs=0.01)
+    monkeypatch.setattr("sat_intervals.evaluate.dsm._TILE", 14**2)
+    assert evaluate_surface(model, reference, registers=False) == whole
 
 
 def test_evaluate_surface__slope_is_that_of_the_references_own_grid(tmp_path):
@@ -80,7 +167,7 @@ def test_evaluate_surface__slope_is_that_of_the_references_own_grid(tmp_path):
     height = np.broadcast_to(0.1 * (np.arange(96.0) - 3.5), (80, 96))
     model = surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
     place = Affine(8, 0, PLACE.c, 0, -8, PLACE.f)
-    report = evaluate_surface(model, write(tmp_path / "reference.tif", [coarse], place))
+    report = evaluate_surface(model, write(tmp_path / "reference.tif", [coarse], place), registers=False)
     counts = [kind["count"] for kind in report["slope"]]
     assert counts[0] == 10 * 80  # beside the reference's outermost centres, where it is flat
     assert counts[1] == 86 * 80
@@ -92,8 +179,8 @@ def test_evaluate_surface__takes_scale_and_offset_of_the_reference(tmp_path):
     reference = write(tmp_path / "reference.tif", [[[15.0, 10]]])
     with rasterio.open(reference, "r+") as dataset:
         dataset.scales, dataset.offsets = (0.1,), (100.0,)
-    report = evaluate_surface(model, reference)["all"]
-    assert (report["count"], report["accuracy"], report["bias"]) == (2, 1.0, pytest.approx(-0.5, abs=0.51))
+    report = evaluate_surface(model, reference, registers=False)["all"]
+    assert (report["count"], report["coverage"], report["bias"]) == (2, 1.0, pytest.approx(-0.5, abs=0.51))
 
 
 @settings(deadline=None)
@@ -111,10 +198,37 @@ def test_evaluate_command__of_a_surface(tmp_path):
     reference = write(tmp_path / "reference.tif", [[[1.5, 9]]])
     result = invoke("evaluate", "--dsm", model, "--reference", reference)
     assert result.exit_code == 0
-    assert result.stdout.splitlines()[2].split() == ["all", "cells", "2", "0.500", "2.000", "-3.750", "4.818"]
+    assert result.stdout.splitlines()[2].split() == [
+        "all", "cells", "2", "-3.750", "-3.750", "4.818", "4.962", "6.350", "5.850", "0.500", "1.000", "1.000", "-"
+    ]  # fmt: skip
     assert (
         json.loads(invoke("evaluate", "--dsm", model, "--reference", reference, "--json").stdout)["all"]["count"] == 2
     )
+
+
+@pytest.mark.peer("matplotlib")
+def test_evaluate_command__writes_figures_and_pictures(tmp_path):
+    row, column = np.indices((60, 70)).astype(np.float64)
+    truth = relief(row, column)
+    model = surface(tmp_path / "dsm.tif", truth + 0.1, truth - 0.5, truth + 0.5)
+    words = "evaluate", "--dsm", model, "--reference", write(tmp_path / "reference.tif", [truth])
+    result = invoke(*words, "--pictures", tmp_path, "--no-register")
+    assert result.exit_code == 0, result.output
+    written = [tmp_path / f"dsm-{name}" for name in ("accuracy.json", "accuracy.md", "reliability.png", "errors.png",
+                                                     "profile.png")]  # fmt: skip
+    assert result.stdout.splitlines()[-5:] == [str(path) for path in written]
+    assert json.loads(written[0].read_text())["all"]["median"] == pytest.approx(0.1)
+    assert "| all cells | 4200 | 0.100 |" in written[1].read_text()
+    assert all(path.stat().st_size > 5000 for path in written[2:])
+    assert invoke(*words, "--pictures", tmp_path).exit_code == 0  # its own files are replaced
+    for line, message in (((0, 0, 1, 1), "does not cross"), ((PLACE.c, PLACE.f, PLACE.c + 70, PLACE.f - 60), "")):
+        result = invoke(*words, "--pictures", tmp_path, "--line", *line)
+        assert result.exit_code == (2 if message else 0)
+        assert message in result.stderr
+    written[1].write_text("mine")
+    result = invoke(*words, "--pictures", tmp_path)
+    assert result.exit_code == 2
+    assert "dsm-accuracy.md exists and was not made by sat-intervals" in result.stderr
 
 
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):

@@ -6,9 +6,9 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import rasterio
+from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid
 from finished import MAXIMUM, MINIMUM, write_run
 from helpers import invoke, write_pair
-from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
@@ -27,49 +27,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning"),  # as epipolar images are
 ]
 
-# Where the scene stands, and metres in a degree there, of longitude and of latitude.
-LONGITUDE, LATITUDE = 1.45, 43.6
-EAST, NORTH = 80_700.0, 111_110.0
 BAND = {band.name: index for index, band in enumerate(POINTS)}
-
-
-def camera(path, view, longitude=LONGITUDE):
-    """Write the RPC of a view of the procedural scene: column = u + a (h - h0), row down the latitudes."""
-    scale = 0.01, 60.0  # degrees, metres; over a few metres lines in degrees are straight
-    column, line, one = np.zeros(20), np.zeros(20), np.eye(20)[0]
-    column[1], column[3] = EAST / PIXEL * scale[0], VIEWS[view] * scale[1]
-    line[2] = -NORTH / PIXEL * scale[0]
-    rpc = RPC(
-        line_off=0.0, line_scale=1.0, samp_off=0.0, samp_scale=1.0,
-        lat_off=LATITUDE, lat_scale=scale[0], long_off=longitude, long_scale=scale[0],
-        height_off=DATUM, height_scale=scale[1],
-        line_num_coeff=list(line), line_den_coeff=list(one), samp_num_coeff=list(column), samp_den_coeff=list(one),
-    )  # fmt: skip
-    with rasterio.open(
-        path, "w", driver="GTiff", height=8, width=8, count=1, dtype="uint8", crs="EPSG:4326", rpcs=rpc
-    ) as dataset:
-        dataset.write(np.zeros((1, 8, 8), np.uint8))
-    return path
-
-
-def grid(path, rows, columns, *, step=20, offset=0.5):
-    """Write the grid that maps every epipolar position to the same sensor position; first pixel centre at 0.5."""
-    row, column = (np.arange(-2 * step, size + 3 * step, step, dtype=np.float64) for size in (rows, columns))
-    positions = np.stack(np.broadcast_arrays(column + offset, row[:, None] + offset))
-    place = Affine(step, 0, column[0] - step / 2, 0, step, row[0] - step / 2)
-    kind = {"height": row.size, "width": column.size, "count": 2, "dtype": "float64"}
-    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:4326", transform=place, **kind) as dataset:
-        dataset.write(positions)
-    return path
-
-
-def cameras(folder, rows, columns, longitude=LONGITUDE):
-    return [
-        camera(folder / "left_model.tif", 0, longitude),
-        camera(folder / "right_model.tif", 1, longitude),
-        grid(folder / "left_grid.tif", rows, columns),
-        grid(folder / "right_grid.tif", rows, columns),
-    ]
 
 
 def on_the_ground(row, column, height):

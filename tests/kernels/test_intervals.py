@@ -361,8 +361,8 @@ def configs(draw):
 
 @st.composite
 def subpixel(draw, config):
-    """Sub-pixel bounds for settings: with alpha, or with a coverage and some levels."""
-    if draw(st.booleans()):
+    """Sub-pixel bounds for settings: with alpha, or with a coverage and some levels, which needs classes."""
+    if config.regularization is None or draw(st.booleans()):
         return {"alpha": float(config.interval.alpha), "bounds": "subpixel"}
     levels = draw(st.integers(0, 99)) / 4, draw(st.integers(0, 199)) / 4
     return {"coverage": 0.9, "calibration": calibration(config, *levels, draw(st.sampled_from([0.9, 0.6, None])))}

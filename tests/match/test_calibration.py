@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from sat_intervals.config import load_config
 from sat_intervals.config.calibration import COVERAGES, Calibration
-from sat_intervals.match.calibration import (
+from sat_intervals.match.calibration import choose, expected, left_out, means, not_below, pooled
+from sat_intervals.match.measurement import (
     COUNTS,
     FIELDS,
     HIGH,
@@ -17,14 +18,8 @@ from sat_intervals.match.calibration import (
     SCHEMES,
     WIDTH,
     Measured,
-    choose,
-    expected,
     ladder,
-    left_out,
-    means,
     measure,
-    not_below,
-    pooled,
 )
 
 LEVELS = np.array([0.0, 1, 2, 4, 8, 16, 32, 64])
@@ -71,36 +66,38 @@ def test_choose__each_class_reaches_the_coverage_by_the_smallest_level(seed, cov
     random = np.random.default_rng(seed)
     parts = [part(random.exponential(4, 1500), random.exponential(9, 1200), str(i)) for i in range(2)]
     pool = pooled(parts)
-    choice = choose(pool, LEVELS, coverage)
-    figures = expected(pool.table, LEVELS, choice, coverage)
-    assert not choice.notes
+    choice, notes = choose(pool, LEVELS, coverage)
+    figures = expected(pool.table, LEVELS, choice)
+    assert not notes
+    assert choice.reached
     for name in ("high", "low"):
         assert figures[name] == pytest.approx(coverage, abs=1e-6)
-    higher = choose(pool, LEVELS, coverage + 0.005)
+    higher, _ = choose(pool, LEVELS, coverage + 0.005)
     assert higher.high > choice.high
 
 
 def test_choose__every_pair_weighs_the_same():
     large, small = part([1] * 9000, [1] * 9000), part([20] * 600, [1] * 600)
-    choice = choose(pooled([large, small]), LEVELS, 0.75)
+    choice, _ = choose(pooled([large, small]), LEVELS, 0.75)
     assert 16 < choice.high <= 32  # half of the weight, though a fifteenth of the pixels
 
 
 def test_choose__a_class_with_few_pixels_takes_the_level_of_the_other():
     pool = pooled([part([4] * 2000, [20] * 190)])
-    choice = choose(pool, LEVELS, 0.9)
+    choice, notes = choose(pool, LEVELS, 0.9)
     assert choice.high == choice.low <= 4
     assert choice.quantile == 0.9
-    assert choice.notes == ("190 pixels of low confidence, 200 are needed: the level of high confidence is used",)
+    assert notes == ["190 pixels of low confidence, 200 are needed: the level of high confidence is used"]
     pool = pooled([part([4] * 900, [20] * 1200)])
-    assert not choose(pool, LEVELS, 0.975).notes
-    choice = choose(pool, LEVELS, 0.99)
+    at_975, notes = choose(pool, LEVELS, 0.975)
+    assert not notes
+    choice, notes = choose(pool, LEVELS, 0.99)
     assert choice.high > 16
-    assert choice.low > choose(pool, LEVELS, 0.975).low > 31  # its own
-    assert choice.notes == ("900 pixels of high confidence, 1000 are needed: the level of low confidence is used",)
-    both = choose(pooled([part([4] * 900, [20] * 900)]), LEVELS, 0.99)
+    assert choice.low > at_975.low > 31  # its own
+    assert notes == ["900 pixels of high confidence, 1000 are needed: the level of low confidence is used"]
+    both, notes = choose(pooled([part([4] * 900, [20] * 900)]), LEVELS, 0.99)
     assert both.high <= 4
-    assert [note.split()[:4] for note in both.notes] == [["900", "pixels", "of", name] for name in ("high", "low")]
+    assert [note.split()[:4] for note in notes] == [["900", "pixels", "of", name] for name in ("high", "low")]
 
 
 @pytest.mark.parametrize("pixels", [(300, 5000), (5000, 300)])
@@ -109,29 +106,29 @@ def test_not_below__levels_of_a_class_with_few_pixels_do_not_fall(pixels):
     pool = pooled([part(random.exponential(40, pixels[0]), random.exponential(8, pixels[1]))])
     choice, chosen = None, []
     for coverage in COVERAGES:
-        choice = not_below(choose(pool, LEVELS, coverage), choice)
-        chosen.append({"coverage": coverage, "high": choice.high, "low": choice.low, "quantile": choice.quantile})
-    Calibration.model_validate({"name": "few", "key": {}, "levels": chosen})
+        choice = not_below(choose(pool, LEVELS, coverage)[0], choice)
+        chosen.append(choice)
+    Calibration(name="few", key={}, levels=tuple(chosen))
 
 
 def test_choose__says_what_no_level_reaches():
     """Truths outside the search range are missed at any level."""
     pool = pooled([part([1] * 800 + [1e9] * 200, [1] * 1000)])
-    choice = choose(pool, LEVELS, 0.9)
-    assert choice.high == LEVELS[-1]
-    assert choice.notes == ("high confidence does not reach it at any level",)
+    choice, notes = choose(pool, LEVELS, 0.9)
+    assert (choice.high, choice.reached) == (LEVELS[-1], False)
+    assert notes == ["high confidence does not reach it at any level"]
     low = part([1] * 1000, [1e9] * 500 + [1] * 500)
     low.table[:, 1 + QUANTILES.index(0.8), INSIDE] += 1
-    choice = choose(pooled([low]), LEVELS, 0.9)
-    assert (choice.low, choice.quantile) == (LEVELS[-1], 0.8)  # it comes nearest
-    assert choice.notes == ("low confidence does not reach it at any level",)
+    choice, notes = choose(pooled([low]), LEVELS, 0.9)
+    assert (choice.low, choice.quantile, choice.reached) == (LEVELS[-1], 0.8, False)  # it comes nearest
+    assert notes == ["low confidence does not reach it at any level"]
 
 
 def test_choose__the_narrowest_of_nearly_the_best_scores():
     def widen(scheme, level):
         return level * {3: 0.99, 4: 1.0}.get(scheme, 2.0)
 
-    choice = choose(pooled([part([4] * 1000, [4] * 1000, widen=widen)]), LEVELS, 0.9)
+    choice, _ = choose(pooled([part([4] * 1000, [4] * 1000, widen=widen)]), LEVELS, 0.9)
     assert choice.quantile == QUANTILES[3 - 1]
 
 

@@ -25,11 +25,11 @@ from sat_intervals.raster import write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import batch
 from sat_intervals.run.batch import match_batch
-from sat_intervals.run.cluster import connected, parse_memory
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_block
+from sat_intervals.run.workers import connected, parse_memory
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.tiles import mark_finished
 

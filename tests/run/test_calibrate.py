@@ -1,6 +1,7 @@
 """Calibrations of demo scenes: through the engine, against runs with them, and from mistaken inputs."""
 
 import json
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -9,12 +10,16 @@ import yaml
 from helpers import PLACE, invoke, write_pair
 
 from sat_intervals import SatIntervalsError, match_pair, open_image
-from sat_intervals.config import PRESETS, calibration_of, load_config
+from sat_intervals.cli.calibrate import _Settings, _subjects
+from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
+from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import write_layer
 from sat_intervals.run import tune
-from sat_intervals.run.calibrate import Subject, check_subjects, truth_of
+from sat_intervals.run.calibrate import check_subjects
+from sat_intervals.run.job import prepare
+from sat_intervals.run.measure import Subject, truth_of
 from sat_intervals.run.tune import Tuned, best_of, candidates
 
 
@@ -31,7 +36,7 @@ def scene(tmp_path_factory):
 
 def calibrated(folder, output, *options):
     result = invoke("calibrate", folder, "--output", output, "--quiet", "--name", "one", *options)
-    assert result.exit_code == 0, result.output
+    assert (result.exit_code, result.output) == (0, "")
     return output.read_bytes()
 
 
@@ -171,6 +176,50 @@ def test_calibrate__levels_out_of_order_are_refused(scene, tmp_path):
     assert "high falls" in line
 
 
+def test_match__warns_of_a_coverage_that_the_calibration_does_not_reach(scene, tmp_path):
+    content = yaml.safe_load((scene / "calibration.yaml").read_text())
+    content["levels"][8]["reached"] = False
+    (tmp_path / "short.yaml").write_text(yaml.safe_dump(content))
+    arguments = "match", scene / "left.tif", scene / "right.tif", tmp_path / "out", "--disparity", -10, 10
+    options = "--calibration", tmp_path / "short.yaml", "--strict", "--coverage", 0.98
+    result = invoke(*arguments, *options)
+    assert result.exit_code == 1
+    assert "the pairs of calibration calibration do not reach coverage 0.98 at any level" in result.output
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert any("do not reach coverage 0.98" in line for line in report["warnings"])
+    assert report["calibration"]["reached"] is False
+
+
+def test_prepare__tiles_depend_on_the_levels_of_a_calibration_only(scene, tmp_path):
+    """A calibration with another name or provenance resumes a run, one with other levels does not."""
+    content = yaml.safe_load((scene / "calibration.yaml").read_text())
+
+    def job(coverage, **changes):
+        settings = settings_with(scene, coverage=coverage, calibration=content | changes)
+        return prepare(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+
+    one, other, higher = job(0.9), job(0.9, name="other", provenance={}), job(0.95)
+    assert one.manifest == other.manifest != higher.manifest
+    assert one.name != other.name  # the name is in the files
+
+
+def test_calibrate__a_run_is_matched_again_on_this_machine(scene, tmp_path):
+    """Whatever the run's cluster was, unless the options name one."""
+    settings = settings_with(scene) | {"cluster": {"workers": 2, "store": str(tmp_path / "store")}}
+    match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
+    for given in ({}, {"cluster": {"workers": 1}}):
+        (subject,) = _subjects((tmp_path / "out",), (), _Settings(None, given, 0.0, False, False))
+        assert subject.config.cluster == Cluster(**given.get("cluster", {}))
+
+
+def test_check_subjects__needs_another_group_to_judge_with(scene, tmp_path):
+    folders = [tmp_path / "one", tmp_path / "other"]
+    for folder in folders:
+        copytree(scene, folder)
+    line = one_line(invoke("calibrate", *folders, "--by-group", "--output", tmp_path / "new.yaml"))
+    assert "all 2 pairs are of group" in line
+
+
 MCCNN = [pytest.param(preset, marks=pytest.mark.peer("onnxruntime")) for preset in PRESETS if "mccnn" in preset]
 
 
@@ -180,28 +229,51 @@ def test_calibration_of__each_preset_has_a_built_in_one(preset):
     assert calibration_of(config).name == preset
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_load_calibration__built_in_ones_come_from_the_command_and_expect_more_of_higher_coverages(preset):
+    found = load_calibration(preset)
+    for levels in found.levels:
+        assert (round(levels.high, 2), round(levels.low, 2)) == (levels.high, levels.low)
+    figures = found.provenance["expected"]
+    assert [row["coverage"] for row in figures] == list(COVERAGES)
+    for name in ("all", "high", "low", "mean_width", "median_width"):
+        assert sorted(row[name] for row in figures) == [row[name] for row in figures], name
+    assert all(abs(row["all"] - row["coverage"]) < 0.03 for row in figures)
+    assert len(found.provenance["pairs"]) == (14 if "satellite" in preset else 12)
+
+
 # ---- Tuning ------------------------------------------------------------------------------------------------
 def test_candidates__are_presets_and_a_ladder_of_different_settings():
-    found = dict(candidates(with_network=True))
     search = {"disparity": {"minimum": 0, "maximum": 1}}
+    own = load_config(search)
+    found = dict(candidates(own, with_network=True))
     assert len({str(load_config({**changes, **search}).sgm) for changes in found.values()}) >= 14
     assert {"paper", "satellite", "satellite-mccnn", "census 5, 8/64", "mccnn, 1/6"} <= found.keys()
-    assert not any("mccnn" in name for name, _ in candidates(with_network=False))
+    assert not any("mccnn" in name for name, _ in candidates(own, with_network=False))
+    other = load_config(search, {"sgm": {"p1": 9}})
+    assert next(candidates(other, with_network=False)) == ("own settings", None)
 
 
 def test_best_of__has_the_best_score_of_those_with_many_good_pixels():
     found = [Tuned(name, (), 0.9, good, {"score": score}, None) for name, good, score in CANDIDATES]
     assert best_of(found).name == "best"
+    weak = [Tuned("no truth", (), 0.9, 1.0, figures, None) for figures in ({}, {"score": np.nan})]
+    assert best_of([*weak, *found]).name == "best"
+    with pytest.raises(SatIntervalsError, match="no settings leave enough pixels"):
+        best_of(weak)
 
 
 CANDIDATES = ("few", 0.5, 3.0), ("wide", 0.8, 9.0), ("best", 0.78, 5.0)
 
 
 def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
-    changes = {"sgm": {"p2": 64}}
-    monkeypatch.setattr(tune, "candidates", lambda with_network: [("stronger", changes)])
-    result = invoke("calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml")
+    """Settings that cannot be compared are left out."""
+    found = [("weak", {"sgm": {"p2": 10**6}}), ("stronger", {"sgm": {"p2": 64}})]
+    monkeypatch.setattr(tune, "candidates", lambda own, with_network: found)
+    arguments = "calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml", "--tile-size", 128
+    result = invoke(*arguments)
     assert result.exit_code == 0, result.output
+    assert "weak is left out: sgm.p2 is 1e+06, allowed" in result.output
     line = next(line for line in result.output.splitlines() if line.startswith("stronger *"))
     kept, good, coverage = map(float, line.split()[2:5])
     assert 0.5 < good < kept < 1
@@ -210,5 +282,19 @@ def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
     result = invoke("match", *arguments, "--config", tmp_path / "tuned.yaml", "--quiet")
     assert result.exit_code == 0, result.output
     used = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
-    assert (used["sgm"]["p2"], used["interval"]["coverage"]) == (64, 0.9)
+    assert (used["sgm"]["p2"], used["interval"]["coverage"], used["tiles"]["size"]) == (64, 0.9, 128)
     assert used["interval"]["calibration"]["name"] == "stronger"
+
+
+def test_tune__a_name_and_quiet(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "candidates", lambda own, with_network: [("own settings", None)])
+    assert calibrated(scene, tmp_path / "tuned.yaml", "--tune", "--config", stronger(tmp_path))
+    written = yaml.safe_load((tmp_path / "tuned.yaml").read_text())
+    assert written["interval"]["calibration"]["name"] == "one"
+    assert written["sgm"]["p2"] == 48
+
+
+def stronger(folder):
+    file = folder / "stronger.yaml"
+    file.write_text("sgm: {p2: 48}\n")
+    return file

@@ -35,7 +35,7 @@ from sat_intervals.raster import (
 )
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.results import Run, open_results
-from sat_intervals.run import assemble
+from sat_intervals.run import strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
@@ -447,7 +447,7 @@ def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(pair)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["records", "failures", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
+@pytest.mark.parametrize("name", ["records", "parts", "arrays.zarr", "arrays.zarr/int16", "arrays.zarr/right/c"])
 def test_match__refuses_a_link_among_the_folders_of_its_tiles(pair, name, overwrite):
     folder, settings = pair
     (folder / "precious").mkdir()
@@ -574,7 +574,7 @@ def test_demo__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(tmp_pat
     names = ["left.tif", "right.tif", "truth.tif", "intervals.tif", "validity.tif", "run.json"]
     before = {name: (out / name).read_bytes() for name in names}
     with monkeypatch.context() as patch:
-        patch.setattr(assemble, "postprocess_strips", fail)
+        patch.setattr(strips, "postprocess_strip", fail)
         assert invoke(*command, "--seed", "1", "--overwrite").exit_code == 1
     assert {name: (out / name).read_bytes() for name in names} == before
     assert sorted(path.name for path in out.iterdir()) == sorted([*names, "tiles"])
@@ -649,7 +649,7 @@ def test_match_batch__that_fails_to_overwrite_keeps_the_runs(pair, monkeypatch):
     pairs = [PairOfBatch("one", str(folder / "left.tif"), str(folder / "right.tif"))]
     match_batch(pairs, folder / "out", settings)
     before = contents(folder / "out" / "one")
-    monkeypatch.setattr(assemble, "postprocess_strips", fail)
+    monkeypatch.setattr(strips, "postprocess_strip", fail)
     report = match_batch(pairs, folder / "out", settings | {"median": None}, overwrite=True)
     assert report["one"]["state"] == "failed"
     assert {name: content for name, content in contents(folder / "out" / "one").items() if name in before} == before
@@ -658,7 +658,7 @@ def test_match_batch__that_fails_to_overwrite_keeps_the_runs(pair, monkeypatch):
 def test_export__that_fails_keeps_the_files_of_before(finished, tmp_path, monkeypatch):
     export(finished, "otb", tmp_path / "otb")
     before = contents(tmp_path / "otb")
-    monkeypatch.setattr("sat_intervals.raster.writer.copy", fail)
+    monkeypatch.setattr("sat_intervals.raster.writer.template", fail)
     with pytest.raises(OutputError):
         export(finished, "otb", tmp_path / "otb")
     assert contents(tmp_path / "otb") == before
@@ -739,14 +739,14 @@ def killed(number, *arguments, **options):
         patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
         publishing.publish(*arguments)
 
-    def create(writer, file):
+    def put_together(*arguments):
         raise Killed
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
         patch.setattr("sat_intervals.raster.writer.publish", publish)
         if not number:
-            patch.setattr(OutputWriter, "_create", create)
+            patch.setattr(OutputWriter, "put_together", put_together)
         with pytest.raises(Killed):
             match_pair(*arguments, **options)
 

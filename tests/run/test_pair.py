@@ -413,6 +413,7 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     assert interval <= 0.0025
 
 
+@pytest.mark.process
 def test_connected__asyncio_is_heard_again_afterwards(tmp_path):
     def forget_a_wait():
         try:
@@ -425,8 +426,8 @@ def test_connected__asyncio_is_heard_again_afterwards(tmp_path):
     handler.emit = lambda record: heard.append(record.getMessage())
     logger.addHandler(handler)
     try:
-        with connected(Cluster(workers=1), tmp_path):
-            with connected(Cluster(workers=1), tmp_path):
+        with connected(Cluster(kind="processes", workers=1), tmp_path):
+            with connected(Cluster(kind="processes", workers=1), tmp_path):
                 forget_a_wait()
             forget_a_wait()
             logger.error("news")

@@ -25,6 +25,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
 from sat_intervals.run.job import prepare
+from sat_intervals.run.submit import DaskWorkers
 from sat_intervals.store.folder import LocalFolder
 
 pytestmark = pytest.mark.process
@@ -187,7 +188,7 @@ def test_match__goes_on_after_kill_9_of_the_command(pair, tmp_path):
         assert_nothing_final(out)
     before = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in done_tiles(out)}
     with started(pair, out, "--keep-tiles") as command:  # while it writes the files
-        wait_until(lambda: list(out.glob(".*/files/strips-*")) or command.ended, "strips")
+        wait_until(lambda: list(out.glob("tiles/parts/*")) or command.ended, "parts")
         command.kill()
     assert_nothing_final(out)
     after = {name: (out / f"tiles/records/{name}.json").stat().st_mtime_ns for name in before}
@@ -369,7 +370,9 @@ def test_match__names_the_tile_that_outgrows_its_workers_and_no_other(uneven, tm
             started(uneven, out, "--cluster", address, "--log-file", str(log)) as command,
         ):
             assert command.end() == 1, command.output
-            alone = r"match_block of \(0, Step\(tile=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
+            alone = (
+                r"match_block of \(0, Step\(block=Tile\(grid_row=0, grid_column=0, .*: its workers died; it is tried"
+            )
             assert re.search(alone, log.read_text())
             assert re.findall(r"tile (\d_\d): every worker that matched it died", command.output) == ["0_0"]
             assert "give workers more memory, or choose smaller tiles" in command.output
@@ -446,7 +449,7 @@ def test_match_jobs__keeps_few_tiles_in_flight_however_many_there_are(pair, tmp_
                 futures.append(len(client.futures))
                 known.append(len(cluster.scheduler.tasks))
 
-            for matched in run.match_jobs(client, [job], progress):
+            for matched in run.match_jobs(DaskWorkers(client), [job], progress):
                 assert not matched.failures
     assert len(futures) >= 1 + 500 + 3 * 500  # blocks of 2 x 2 tiles and three wavefronts, one before the first ends
     assert max(futures) <= 6  # two a core, and those that are just being released

@@ -26,7 +26,8 @@ from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_run
 from sat_intervals.run import cluster, submit
 from sat_intervals.run.cluster import connected
-from sat_intervals.run.submit import Submission, Task
+from sat_intervals.run.submit import Submission
+from sat_intervals.run.workers import Task
 
 
 # ---- Files that are none ---------------------------------------------------------------------------------------
@@ -285,13 +286,14 @@ def test_connected__ends_when_worker_processes_do_not_start(tmp_path, monkeypatc
         pass
 
 
+@pytest.mark.process
 def test_connected__names_the_settings_with_which_dask_cannot_start(tmp_path):
     (tmp_path / "file").touch()
     with (
         dask.config.set({"temporary-directory": str(tmp_path / "file" / "inside")}),
         pytest.raises(
-            RunError, match=r"^dask cannot start here: .*Not a directory.*: check its settings, such as DASK_"
+            RunError, match=r"did not start within 120 s \(.*Not a directory.*\): .* another DASK_TEMPORARY_DIRECTORY"
         ),
-        connected(Cluster(), tmp_path),
+        connected(Cluster(kind="processes", workers=1), tmp_path),
     ):
         pass

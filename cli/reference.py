@@ -1,0 +1,80 @@
+"""``sat-intervals reference``: true disparities of a run from reference heights."""
+
+from pathlib import Path
+
+import click
+
+from sat_intervals.cli.options import log_options, path, quiet_option, sensor_options
+
+# Metres of height above which a shift is rather a mistake, and pixels of row misfit.
+_SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
+
+
+@click.command(short_help="Turn reference heights into true disparities of a run.")
+@click.argument("out", callback=path)
+@click.option("--heights", callback=path, metavar="FILE", help="Raster of heights, in any CRS.")
+@click.option("--points", callback=path, metavar="FILE", help="Points: CSV, LAS, LAZ, GeoPackage.")
+@click.option("--ellipsoid", is_flag=True, help="Heights are above the ellipsoid of WGS 84.")
+@click.option("--geoid", callback=path, metavar="FILE", help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
+@click.option("--crs", metavar="EPSG", help="CRS of the heights, in place of the file's.")
+@click.option("--no-register", is_flag=True, help="Do not move the reference to the points of the run.")
+@click.option("--output", callback=path, metavar="FILE", help="File to write; default truth.tif in OUT.")
+@sensor_options
+@quiet_option
+@log_options
+def reference(
+    out: Path,
+    heights: Path | None,
+    points: Path | None,
+    ellipsoid: bool,
+    geoid: Path | None,
+    crs: str | None,
+    no_register: bool,
+    output: Path | None,
+    sensor_files: tuple[Path, Path, Path, Path],
+    quiet: bool,
+) -> None:
+    """Write the disparities that reference heights have in the finished run OUT: OUT/truth.tif.
+
+    Give it to calibrate or evaluate as --truth. It has the disparity of the height that the left sensor sees at each
+    pixel, and NaN elsewhere. Heights need a CRS and what they refer to: --ellipsoid or --geoid, unless the file says
+    so. A CSV file has the columns longitude, latitude, height, or x, y, height with --crs.
+
+    The reference is first moved by its constant shift from OUT/points.tif (easting, northing, height), which is
+    printed with its standard deviation. On flat ground only the height is moved.
+
+    Models and grids are those of `triangulate`. Needs shareloc: pip install 'sat-intervals[dsm]'; points other than CSV
+    need pip install 'sat-intervals[reference]'.
+    """
+    if (heights is None) == (points is None):
+        raise click.UsageError("give either --heights or --points.")
+    if ellipsoid and geoid:
+        raise click.UsageError("--ellipsoid and --geoid exclude each other.")
+    from sat_intervals.cli.console import Console
+    from sat_intervals.cli.tables import registration_lines
+    from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
+    from sat_intervals.raster import Vertical
+
+    vertical = Vertical(ellipsoid, geoid)
+    given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
+    files = SensorFiles(*sensor_files)
+    with Console(quiet) as console:
+        report = make_truth(out, files, given, path=output, registers=not no_register, progress=console.progress)
+    if report["registration"]:
+        for line in registration_lines(report["registration"]):
+            console.say(line)
+        up = report["registration"]["shift"][2]
+        if abs(up) > _SUSPECT_HEIGHT:
+            click.echo(
+                f"warning: the reference was moved by {up:.1f} m in height: check what its heights refer to", err=True
+            )
+    misfit = report["row_misfit"]
+    if misfit:
+        console.say(f"row misfit of models and grids: {misfit[0]:.2g} px in the median, {misfit[1]:.2g} px at most")
+        if misfit[0] > _SUSPECT_ROWS:
+            click.echo(f"warning: rows of both images differ by {misfit[0]:.2g} px: check models and grids", err=True)
+    console.say(
+        f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "
+        f"{100 * report['outside_range']:.1f} % of them outside the search range"
+    )
+    console.say(str(output or out / "truth.tif"))

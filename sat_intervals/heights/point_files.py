@@ -1,0 +1,189 @@
+"""Read points with heights in parts: CSV, GeoPackage and other vector files (pyogrio), LAS and LAZ (laspy)."""
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import Frame, Vertical
+
+# Points read at a time.
+_PART = 500_000
+# Names of columns, in lower case; the first found counts. Those of ICESat-2 products are among them.
+_DEGREES = (("longitude", "lon", "long"), ("latitude", "lat"))
+_METRES = (("x", "easting", "east"), ("y", "northing", "north"))
+_HEIGHTS = ("height", "h", "z", "elevation", "ellipsoidal_height", "h_mean", "h_te_best_fit", "h_te_median", "h_ph")
+_EXTRA = "pip install 'sat-intervals[reference]'"
+# Classes of LAS points that are noise.
+_NOISE = 7, 18
+
+
+class PointFile:
+    """Points of a file, and the frame of their coordinates.
+
+    Parameters
+    ----------
+    path
+        ``.csv`` with a header, ``.las``, ``.laz``, or a file that GDAL reads as vectors, such as ``.gpkg``.
+    crs
+        Replaces the CRS of the file. Longitude and latitude of a CSV file are on the WGS 84 ellipsoid without it.
+    vertical
+        What its heights refer to.
+
+    Raises
+    ------
+    SatIntervalsError
+        The file cannot be read, or lacks heights, a CRS or a vertical reference.
+    """
+
+    def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
+        if not path.is_file():
+            raise SatIntervalsError(f"{path}: no such file: give a file of points")
+        self._path, ending = path, path.suffix.lower()
+        readers = {".csv": (_crs_of_table, _table), ".las": (_crs_of_las, _las), ".laz": (_crs_of_las, _las)}
+        crs_of, self._parts = readers.get(ending, (_crs_of_vectors, _vectors))
+        own = crs_of(path)
+        self.frame = Frame(str(path), crs or own, vertical)
+
+    def parts(self) -> Iterator[np.ndarray]:
+        """Yield ``(n, 3)`` float64 x, y and height in the frame; points without one of them are left out."""
+        try:
+            for part in self._parts(self._path):
+                yield part[np.isfinite(part).all(axis=1)]
+        except SatIntervalsError:
+            raise
+        except Exception as error:  # the libraries raise many types
+            raise _unreadable(self._path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> SatIntervalsError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return SatIntervalsError(f"{path} cannot be read as points: {reason}")
+
+
+def _columns(path: Path, names: list[str]) -> tuple[list[int], bool]:
+    """Return the columns of x, y and height in a table, and whether x and y are degrees."""
+    known = [name.strip().lower() for name in names]
+
+    def place(choices: tuple[str, ...]) -> int | None:
+        return next((known.index(name) for name in choices if name in known), None)
+
+    height = place(_HEIGHTS)
+    for axes, is_degrees in ((_DEGREES, True), (_METRES, False)):
+        x, y = map(place, axes)
+        if x is not None and y is not None and height is not None:
+            return [x, y, height], is_degrees
+    raise SatIntervalsError(
+        f"{path} has the columns {', '.join(names)[:200]}: name them longitude, latitude, height, or x, y, height with "
+        "--crs"
+    )
+
+
+def _header(path: Path) -> list[str]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            return next(csv.reader(stream), [])
+    except (UnicodeDecodeError, csv.Error, OSError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _crs_of_table(path: Path) -> str | None:
+    _, is_degrees = _columns(path, _header(path))
+    return "EPSG:4326" if is_degrees else None
+
+
+def _table(path: Path) -> Iterator[np.ndarray]:
+    chosen, _ = _columns(path, _header(path))
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        lines = csv.reader(stream)
+        next(lines)
+        part: list[list[float]] = []
+        for line in lines:
+            if line:
+                part.append([_number(path, lines.line_num, line, place) for place in chosen])
+            if len(part) == _PART:
+                yield np.array(part)
+                part = []
+        if part:
+            yield np.array(part)
+
+
+def _number(path: Path, line: int, cells: list[str], place: int) -> float:
+    try:
+        return float(cells[place]) if cells[place].strip() else float("nan")
+    except (ValueError, IndexError) as error:
+        cell = cells[place] if place < len(cells) else "nothing"
+        raise SatIntervalsError(f"{path}, line {line}: {cell!r} is not a number: fix this line") from error
+
+
+def _opened_las(path: Path) -> Any:
+    try:
+        import laspy
+    except ModuleNotFoundError as error:
+        raise SatIntervalsError(f"LAS and LAZ files need laspy: {_EXTRA}") from error
+    try:
+        return laspy.open(path)
+    except Exception as error:  # laspy and its decoders raise many types
+        raise _unreadable(path, error) from error
+
+
+def _crs_of_las(path: Path) -> str | None:
+    with _opened_las(path) as file:
+        try:
+            crs = file.header.parse_crs()
+        except Exception as error:
+            raise _unreadable(path, error) from error
+        return None if crs is None else str(crs.to_wkt())
+
+
+def _las(path: Path) -> Iterator[np.ndarray]:
+    """Yield points but those marked as noise or withheld."""
+    with _opened_las(path) as file:
+        for points in file.chunk_iterator(_PART):
+            kept = ~np.isin(np.asarray(points.classification), _NOISE) & (np.asarray(points.withheld) == 0)
+            yield np.column_stack([points.x, points.y, points.z])[kept]
+
+
+def _vector_library() -> tuple[Any, Any]:
+    try:
+        import pyogrio
+        import shapely
+    except ModuleNotFoundError as error:
+        raise SatIntervalsError(f"GeoPackage and other vector files need pyogrio and shapely: {_EXTRA}") from error
+    return pyogrio, shapely
+
+
+def _crs_of_vectors(path: Path) -> str | None:
+    pyogrio, _ = _vector_library()
+    try:
+        crs = pyogrio.read_info(path)["crs"]
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    return None if crs is None else str(crs)
+
+
+def _vectors(path: Path) -> Iterator[np.ndarray]:
+    """Yield points of the first layer; the height is that of the geometry, else a column."""
+    pyogrio, shapely = _vector_library()
+    fields = [str(name) for name in pyogrio.read_info(path)["fields"]]
+    column = next((name for choice in _HEIGHTS for name in fields if name.lower() == choice), None)
+    skipped = 0
+    while True:
+        _, _, geometry, values = pyogrio.raw.read(
+            path, columns=[column] if column else [], skip_features=skipped, max_features=_PART
+        )
+        if not len(geometry):
+            return
+        skipped += len(geometry)
+        points = shapely.from_wkb(geometry)
+        if set(np.unique(shapely.get_type_id(points))) - {-1, 0}:
+            raise SatIntervalsError(f"{path} has geometries that are no points: give points")
+        places = np.column_stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])
+        if column and not np.isfinite(places[:, 2]).any():
+            places[:, 2] = values[0]
+        elif not column and not shapely.has_z(points).any():
+            raise SatIntervalsError(f"{path} has points without heights: give 3D points, or a column named height")
+        yield places

@@ -1,0 +1,192 @@
+"""Disparities of a raster of heights: each pixel's line of sight is followed down to the first height that it meets.
+
+Lines of sight are those of the lattice of `triangulate`, in cells of the raster. So the disparity of a height is the
+one that `triangulate` turns into this height.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.heights.sensors import Lattice, Sensors
+from sat_intervals.kernels.sight import seen_disparities, tops
+from sat_intervals.raster import HeightRaster, Projection
+from sat_intervals.tiling import Window
+
+# Side of a tile in pixels, fewer for fine references: at most this many cells of the reference below its pixels.
+_TILE, _LEAST, _CELLS = 256, 32, 1024
+# Tiles at once: their windows of a fine reference are most of the memory.
+_THREADS = 3
+# Degrees: a pixel on a steeper patch between four heights has no disparity, as the place of a wall is known to a cell.
+_STEEPEST = 70.0
+# Cells around a window of the reference, for interpolation and the curvature of lines of sight.
+_MARGIN = 3
+
+
+class Shift(NamedTuple):
+    """Metres from the reference to the run: easting, northing, height."""
+
+    east: float = 0.0
+    north: float = 0.0
+    up: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What maps pixels of a run to the ground: sensors, region, width of the right image, and the map of the shift."""
+
+    sensors: Sensors
+    region: Window
+    right_width: int
+    projection: Projection
+
+
+class _FarError(Exception):
+    """The lattice must reach further: to this minimum and maximum of the disparity."""
+
+
+class RasterSight:
+    """Disparities of a raster of heights, strip by strip.
+
+    Parameters
+    ----------
+    scene
+        Sensors and pixels.
+    raster
+        The heights.
+    shift
+        Added to the reference.
+    search
+        Range of disparities to begin with.
+    """
+
+    def __init__(self, scene: Scene, raster: HeightRaster, shift: Shift, search: tuple[int, int]) -> None:
+        self._scene, self._raster, self._shift = scene, raster, shift
+        self._search = search
+        self._lattice = self._new_lattice()
+        self._heights: dict[int, tuple[float, float]] = {}
+        self._steepest = np.tan(np.radians(_STEEPEST)) * raster.cell / raster.frame.unit
+
+    def strips(self, pixel: float) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the first row and the disparities ``(rows, columns)``, NaN if unknown, of strips from the top.
+
+        ``pixel`` is the size of a pixel on the ground in metres.
+        """
+        side = int(_CELLS * self._raster.cell / pixel) // _LEAST * _LEAST
+        side = min(_TILE, max(_LEAST, side))
+        height, width = self._scene.region.height, self._scene.region.width
+        with ThreadPoolExecutor(_THREADS) as threads:
+            for row in range(0, height, side):
+                window = Window(row, 0, min(side, height - row), width)
+                yield row, self._strip(threads, window, side)
+
+    def _strip(self, threads: ThreadPoolExecutor, window: Window, side: int) -> np.ndarray:
+        """Return the disparities of a strip; the lattice is extended until it reaches all heights."""
+        while True:
+            sights, first, step = self._sights(window)
+            tiles = [
+                Window(0, column, window.height, min(side, window.width - column))
+                for column in range(0, window.width, side)
+            ]
+            try:
+                parts = list(threads.map(partial(self._tile, sights=sights, first=first, step=step), tiles))
+            except _FarError as far:
+                self._search = far.args[0]
+                self._lattice = self._new_lattice()
+                continue
+            return np.concatenate(parts, axis=1)
+
+    def _new_lattice(self) -> Lattice:
+        return Lattice(self._scene.sensors, self._scene.region, self._scene.right_width, *self._search)
+
+    def _sights(self, window: Window) -> tuple[np.ndarray, tuple[float, float, float], tuple[float, float, float]]:
+        """Return lines of sight in cells of the reference, from the highest point, and the place and step of nodes."""
+        nodes, (row, column, disparity) = self._lattice.nodes(window)
+        longitude, latitude, height = (nodes[..., index] for index in range(3))
+        x, y = self._scene.projection.place(longitude, latitude)
+        longitude, latitude = self._scene.projection.degrees(x - self._shift.east, y - self._shift.north)
+        sights = np.stack(self._raster.positions(longitude, latitude, height - self._shift.up), axis=-1)
+        row_step, column_step, step = self._lattice.spacing
+        if np.nanmedian(height[:, :, -1] - height[:, :, 0]) > 0:
+            sights, disparity, step = sights[:, :, ::-1], disparity + step * (nodes.shape[2] - 1), -step
+        return np.ascontiguousarray(sights), (row, column, disparity), (row_step, column_step, step)
+
+    def _tile(
+        self, tile: Window, sights: np.ndarray, first: tuple[float, float, float], step: tuple[float, float, float]
+    ) -> np.ndarray:
+        """Return the disparities of the pixels of a tile, whose columns count from the strip's first pixel."""
+        begin = min(int(tile.column / step[1]), sights.shape[1] - 2)
+        end = min(int((tile.column_stop - 1) / step[1]) + 1, sights.shape[1] - 1)
+        sights = np.ascontiguousarray(sights[:, begin : end + 1])
+        below = self._below(sights, tile.column) if np.isfinite(sights).any() else None
+        if below is None:
+            return np.full((tile.height, tile.width), np.nan)
+        window, surface = below
+        self._check_reach(sights, surface, first[2], step[2])
+        relative = sights - np.array([window.column, window.row, 0.0])
+        place = first[0], begin * step[1] - tile.column, first[2]
+        return np.asarray(
+            seen_disparities(surface, tops(surface), relative, step, place, (tile.height, tile.width), self._steepest)
+        )
+
+    def _below(self, sights: np.ndarray, column: int) -> tuple[Window, np.ndarray] | None:
+        """Read the heights that lines of sight can meet; None if there are none.
+
+        The window follows from the range of heights and the other way round: it grows until both agree.
+        """
+        ends = float(np.nanmin(sights[..., 2])), float(np.nanmax(sights[..., 2]))
+        begin = self._heights.get(column, (sum(ends) / 2,) * 2)  # those of the tile above
+        found = self._grown(sights, begin)
+        if found is None:
+            found = self._grown(sights, ends)
+        if found is not None:
+            self._heights[column] = float(np.nanmin(found[1])), float(np.nanmax(found[1]))
+        return found
+
+    def _grown(self, sights: np.ndarray, heights: tuple[float, float]) -> tuple[Window, np.ndarray] | None:
+        """Read below a range of heights, which grows to that of the heights found; None if there are none."""
+        low, high = heights
+        while True:
+            window = self._window(sights, low, high).clipped(Window(0, 0, *self._raster.shape))
+            if window.height < 2 or window.width < 2:
+                return None
+            surface = self._raster.read(window)
+            known = surface[np.isfinite(surface)]
+            if not known.size:
+                return None
+            lowest, highest = float(known.min()), float(known.max())
+            if low <= lowest and highest <= high:
+                return window, surface
+            low, high = min(low, lowest), max(high, highest)
+
+    def _window(self, sights: np.ndarray, low: float, high: float) -> Window:
+        """Return the cells under lines of sight between two heights."""
+        top, bottom = sights[:, :, 0], sights[:, :, -1]
+        fall = bottom - top
+        places = []
+        for height in (low, high):
+            part = (height - top[..., 2]) / fall[..., 2]
+            places.append(top[..., :2] + part[..., np.newaxis] * fall[..., :2])
+        x, y = (np.stack(places)[..., index] for index in range(2))
+        x, y = x[np.isfinite(x)], y[np.isfinite(y)]
+        if not x.size:
+            return Window(0, 0, 0, 0)
+        left, above = int(np.floor(x.min())) - _MARGIN, int(np.floor(y.min())) - _MARGIN
+        return Window(above, left, int(y.max()) + _MARGIN + 1 - above, int(x.max()) + _MARGIN + 1 - left)
+
+    def _check_reach(self, sights: np.ndarray, surface: np.ndarray, first: float, step: float) -> None:
+        """Raise `_FarError` if lines of sight begin below the highest height or end above the lowest."""
+        top, bottom = np.nanmin(sights[:, :, 0, 2]), np.nanmax(sights[:, :, -1, 2])
+        last = first + step * (sights.shape[2] - 1)
+        fall = (top - bottom) / (last - first)  # metres a pixel, signed
+        above, beneath = float(np.nanmax(surface)) - top, bottom - float(np.nanmin(surface))
+        if above < 0 and beneath < 0:
+            return
+        ends = first - (above / fall if above >= 0 else 0), last + (beneath / fall if beneath >= 0 else 0)
+        margin = 8 + 0.1 * (max(ends) - min(ends))
+        lowest, highest = int(np.floor(min(ends) - margin)), int(np.ceil(max(ends) + margin))
+        raise _FarError((min(lowest, self._search[0]), max(highest, self._search[1])))

@@ -1,0 +1,241 @@
+"""Estimate the constant shift between heights at points and a surface of heights.
+
+The shift is that of Nuth and Kaab (2011), easting, northing and height. They solve it from slope and aspect by least
+squares, which needs smooth ground. In towns the horizontal part shows at walls only. So here the mean of clipped
+differences is minimised itself, by a search in ever smaller steps. xdem registers whole rasters in memory, and states
+no uncertainty.
+
+The surface is cut into blocks. Differences within a block are correlated, so uncertainties come from what differs
+between blocks.
+
+Letters: i, j row and column of a block's surface.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sat_intervals.kernels.compiled import cached
+
+REACH = 48
+"""Cells: largest shift that is searched; surfaces reach as far beyond the points."""
+LEAST = 30
+"""Points on known heights that an estimate needs."""
+# Steps of the search in cells: on some points, then on all.
+_COARSE, _FINE = (4.0, 2.0, 1.0), (0.5, 0.2, 0.1, 0.05, 0.02)
+_SEARCHED, _LEAST_BLOCKS = 8_000, 4
+# Differences count up to this many standard deviations, and those to this many cells at least.
+_CLIP, _FLOOR = 3.0, 1.0
+# Cells of the shift that must raise the loss: by so many cells, and by so many standard errors.
+_PROBE, _LEAST_RISE, _CLEARLY = 4.0, 0.02, 5.0
+# Standard deviation that interpolation between cells adds, in cells: no spread between blocks shows it.
+_BETWEEN = 0.1
+# Makes a median of absolute values a standard deviation.
+_NORMAL = 1.4826
+_DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.7071]])
+
+
+class Blocks(NamedTuple):
+    """Heights at points, and surfaces of blocks of the ground.
+
+    Attributes
+    ----------
+    surface
+        ``(blocks, rows, columns)`` heights, NaN where unknown; north up.
+    cell
+        Side of a cell in metres.
+    block, x, y
+        ``(n,)``: the block of each point, and its column and row there; cell centres are integers.
+    height
+        ``(n,)`` metres.
+    moves
+        +1 if the surface is to be moved, -1 if the points are.
+    """
+
+    surface: np.ndarray
+    cell: float
+    block: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    height: np.ndarray
+    moves: int
+
+
+class Registration(NamedTuple):
+    """A shift in metres, easting, northing and height, to be added to what moves.
+
+    Attributes
+    ----------
+    shift, deviation
+        ``(3,)``: the shift and its standard deviation; without a horizontal part, it is 0 with deviation NaN.
+    is_horizontal
+        Whether there is a horizontal part.
+    used
+        Points used.
+    before, after
+        Differences of what stands still - what moves, of all points, without and with the shift.
+    """
+
+    shift: np.ndarray
+    deviation: np.ndarray
+    is_horizontal: bool
+    used: int
+    before: np.ndarray
+    after: np.ndarray
+
+    def report(self) -> dict[str, Any]:
+        """Return plain values, None for a deviation that is unknown; `summary` of differences before and after."""
+        return {
+            "shift": self.shift.tolist(),
+            "deviation": [None if np.isnan(value) else float(value) for value in self.deviation],
+            "is_horizontal": self.is_horizontal,
+            "used": self.used,
+            "before": summary(self.before),
+            "after": summary(self.after),
+        }
+
+
+@cached
+def sampled(surface, block, x, y):
+    """Return ``(n,)`` bilinear heights, NaN where unknown."""
+    result = np.full(x.size, np.nan)
+    _, rows, columns = surface.shape
+    for n in range(x.size):
+        if not (0 <= x[n] <= columns - 1 and 0 <= y[n] <= rows - 1):
+            continue
+        i, j = min(int(y[n]), rows - 2), min(int(x[n]), columns - 2)
+        v, u = y[n] - i, x[n] - j
+        upper = (1 - u) * surface[block[n], i, j] + u * surface[block[n], i, j + 1]
+        lower = (1 - u) * surface[block[n], i + 1, j] + u * surface[block[n], i + 1, j + 1]
+        result[n] = (1 - v) * upper + v * lower
+    return result
+
+
+def register(blocks: Blocks) -> Registration | None:
+    """Estimate the shift; None with fewer than `LEAST` points on known heights."""
+    before = _differences(blocks, np.zeros(2))
+    if np.isfinite(before).sum() < LEAST:
+        return None
+    place = _searched(blocks)
+    found = None if place is None else _with_deviation(blocks, place)
+    if found is None:
+        found = _vertical(blocks, before)
+    shift, deviation = found
+    after = _differences(blocks, shift[:2])
+    known = np.isfinite(after)
+    return Registration(
+        shift,
+        deviation,
+        bool(np.isfinite(deviation[0])),
+        int(known.sum()),
+        before[np.isfinite(before)],
+        after[known] - shift[2],
+    )
+
+
+def _differences(blocks: Blocks, shift: np.ndarray) -> np.ndarray:
+    """Return differences at all points for a horizontal shift in metres."""
+    east, north = blocks.moves * shift / blocks.cell
+    height = sampled(blocks.surface, blocks.block, blocks.x - east, blocks.y + north)
+    return np.asarray(blocks.moves * (blocks.height - height))
+
+
+def _thinned(blocks: Blocks) -> Blocks:
+    every = slice(None, None, max(1, blocks.x.size // _SEARCHED))
+    thin = [np.ascontiguousarray(values[every]) for values in (blocks.block, blocks.x, blocks.y, blocks.height)]
+    return blocks._replace(block=thin[0], x=thin[1], y=thin[2], height=thin[3])
+
+
+def _clipped(blocks: Blocks, shift: np.ndarray, most: float) -> np.ndarray:
+    """Return distances of differences from their median, up to ``most``; NaN where unknown."""
+    differences = _differences(blocks, shift)
+    return np.minimum(np.abs(differences - _median(differences)), most)
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of the known values; NaN without."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def _most(blocks: Blocks, shift: np.ndarray) -> float:
+    """Return the distance from the median up to which differences count."""
+    scale = _NORMAL * _median(_clipped(blocks, shift, np.inf))
+    return _CLIP * max(scale, _FLOOR * blocks.cell)
+
+
+def _searched(blocks: Blocks) -> np.ndarray | None:
+    """Return the horizontal shift with the least mean clipped difference; None if it is at the end of the reach."""
+    thin, place = _thinned(blocks), np.zeros(2)
+    enough = 0.5 * np.isfinite(_differences(thin, place)).sum()
+    reach = float(REACH)
+    for step in (*_COARSE, *_FINE):
+        sample = thin if step in _COARSE else blocks
+        most = _most(sample, place)
+        steps = np.arange(-reach, reach + step / 2, step) * blocks.cell
+        losses = {}
+        for move in sorted(((x, y) for x in steps for y in steps), key=lambda move: np.hypot(*move)):
+            clipped = _clipped(sample, place + move, most)
+            if np.isfinite(clipped).sum() > (enough if sample is thin else 0):
+                losses[move] = float(np.nanmean(clipped))
+        place = place + min(losses, key=lambda move: losses[move])
+        reach = 2 * step
+    return None if np.abs(place).max() >= (REACH - _COARSE[0]) * blocks.cell else place
+
+
+def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the whole shift and its standard deviation; None if shifts further on do not fit clearly worse.
+
+    Noise has slopes too, but no place where they fit. The deviation is that of the zero of the loss's derivative.
+    """
+    most, step = _most(blocks, place), _PROBE * blocks.cell
+    here = _clipped(blocks, place, most)
+    sides = [[_clipped(blocks, place + side * step * way, most) for side in (-1, 1)] for way in _DIRECTIONS]
+    for before, after in sides:
+        rise, error = _mean_of_blocks(blocks, before + after - 2 * here)
+        if not rise > max(_CLEARLY * error, _LEAST_RISE * blocks.cell):
+            return None
+    if len(np.unique(blocks.block[np.isfinite(here)])) < _LEAST_BLOCKS:
+        return None
+    bends = [float(np.nanmean(before + after - 2 * here)) / step**2 for before, after in sides]
+    bend = np.array([[bends[0], (bends[2] - bends[3]) / 2], [(bends[2] - bends[3]) / 2, bends[1]]])
+    errors = [_mean_of_blocks(blocks, (after - before) / (2 * step))[1] for before, after in sides[:2]]
+    inverse = np.linalg.inv(bend)
+    up, deviation = _vertical(blocks, _differences(blocks, place))
+    across = np.sqrt(inverse**2 @ np.square(errors) + (_BETWEEN * blocks.cell) ** 2)
+    return np.array([*place, up[2]]), np.array([*across, deviation[2]])
+
+
+def _mean_of_blocks(blocks: Blocks, values: np.ndarray) -> tuple[float, float]:
+    """Return the mean over points and its standard error, from what differs between blocks."""
+    known = np.isfinite(values)
+    sums, counts = (np.bincount(blocks.block[known], weights, len(blocks.surface)) for weights in (values[known], None))
+    sums, counts = sums[counts > 0], counts[counts > 0]
+    mean = float(sums.sum() / counts.sum())
+    if len(counts) < 2:
+        return mean, np.inf
+    spread = ((sums - mean * counts) ** 2).sum() * len(counts) / (len(counts) - 1)
+    return mean, float(np.sqrt(spread)) / float(counts.sum())
+
+
+def _vertical(blocks: Blocks, differences: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median difference as shift, with its standard deviation."""
+    known = np.isfinite(differences)
+    up = float(np.median(differences[known]))
+    far = np.abs(differences - up)
+    scale = max(_NORMAL * float(np.median(far[known])), 1e-6)
+    _, error = _mean_of_blocks(blocks, np.clip(differences - up, -1.5 * scale, 1.5 * scale))
+    return np.array([0.0, 0.0, up]), np.array([np.nan, np.nan, 1.2 * error])
+
+
+def summary(differences: np.ndarray) -> dict[str, float]:
+    """Return ``count``, ``bias`` (mean), ``median``, ``nmad``, ``rmse`` and ``le90`` (90 % of the absolute values)."""
+    median = float(np.median(differences))
+    return {
+        "count": differences.size,
+        "bias": float(np.mean(differences)),
+        "median": median,
+        "nmad": _NORMAL * float(np.median(np.abs(differences - median))),
+        "rmse": float(np.sqrt(np.mean(np.square(differences)))),
+        "le90": float(np.percentile(np.abs(differences), 90)),
+    }

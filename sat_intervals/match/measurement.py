@@ -1,0 +1,90 @@
+"""Measure intervals that were made at a ladder of levels against a truth (docs/coverage.md).
+
+Every pair is matched at each rung of the ladder, through the whole chain. Confidence classes are `HIGH` and low.
+Low-confidence pixels are measured once for each quantile of the regularisation, and once without it.
+
+Letters of shapes: rungs (levels of the ladder), schemes (high, then low with each of QUANTILES), fields.
+"""
+
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.config import Config
+
+# Quantiles of the regularisation that are tried; None: no regularisation.
+QUANTILES = (None, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+HIGH, SCHEMES = 0, 1 + len(QUANTILES)
+
+# Rungs: level 0, and from a fraction of the span to the level that holds every candidate, a third of an octave apart.
+_LOWEST, _RUNGS = 1 / 256, 25
+# Widths are counted in steps of 1/64 px up to 8 px, and of 1 % above.
+_STEPS, _FINE, _RATIO = 64, 8, 1.01
+_COARSE = ceil(np.log(32000 / _FINE) / np.log(_RATIO)) + 1
+WIDTHS = np.concatenate([np.arange(_FINE * _STEPS) / _STEPS, _FINE * _RATIO ** (np.arange(_COARSE) + 0.5)])
+# Place of a width among them, by its number of steps.
+_UPTO = np.arange(32000 * _STEPS + 1)
+_ABOVE = _FINE * _STEPS + np.log(np.maximum(_UPTO, _FINE * _STEPS) / (_FINE * _STEPS)) / np.log(_RATIO)
+_PLACES = np.where(_UPTO < _FINE * _STEPS, _UPTO, _ABOVE).astype(np.int16)
+# Fields of a measurement: pixels that hold the truth, sum of widths, sum of distances that miss, counts by width.
+INSIDE, WIDTH, MISSED, COUNTS = 0, 1, 2, 3
+FIELDS = COUNTS + WIDTHS.size
+
+
+class Measured(NamedTuple):
+    """Measurements of a pair, or of a block of one.
+
+    Attributes
+    ----------
+    group
+        Parts of one group are left out together.
+    weight
+        Of a pixel: one over the pixels of the pair, so that every pair weighs the same.
+    table
+        ``(rungs, schemes, fields)`` float64 sums over kept pixels with truth.
+    known, good
+        Pixels with truth, and those of them that are kept and within 1 px of it.
+    """
+
+    group: str
+    weight: float
+    table: np.ndarray
+    known: int
+    good: int
+
+    @property
+    def kept(self) -> int:
+        """Return the number of kept pixels with truth."""
+        return int(self.table[0, [HIGH, HIGH + 1], COUNTS:].sum())
+
+
+def ladder(config: Config) -> np.ndarray:
+    """Levels at which pairs are matched: ascending float64, the last holds every possible candidate."""
+    levels = np.geomspace(config.cost_span * _LOWEST, config.largest_sum, _RUNGS)
+    return np.concatenate([[0.0], levels])
+
+
+def measure(
+    lower: np.ndarray, upper: np.ndarray, truth: np.ndarray, tolerance: float, part: np.ndarray, parts: int
+) -> np.ndarray:
+    """Measure some intervals: ``(parts, fields)``.
+
+    Parameters
+    ----------
+    lower, upper, truth
+        ``(pixels,)`` finite numbers of pixels.
+    tolerance
+        Distance up to which a truth outside an interval counts as inside.
+    part, parts
+        Part of each pixel, and number of parts.
+    """
+    width = upper.astype(np.float64) - lower
+    missed = np.maximum(np.maximum(lower - truth, truth - upper) - tolerance, 0)
+    place = _PLACES[np.rint(width * _STEPS).astype(np.int64)]
+    fields = np.zeros((parts, FIELDS))
+    for field, weights in ((INSIDE, missed == 0), (WIDTH, width), (MISSED, missed)):
+        fields[:, field] = np.bincount(part, weights, parts)
+    counts = np.bincount(part * WIDTHS.size + place, minlength=parts * WIDTHS.size)
+    fields[:, COUNTS:] = counts.reshape(parts, -1)
+    return fields

@@ -1,0 +1,81 @@
+"""Read a raster of reference heights in its own grid and CRS, in parts."""
+
+import math
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from rasterio.transform import Affine
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster.frame import Frame, Places, Vertical
+from sat_intervals.raster.images import open_image, opened
+from sat_intervals.raster.windows import read_window
+from sat_intervals.tiling import Window
+
+# Heights of the ground on Earth in metres; others are no-data values that the file does not declare.
+_GROUND = -600.0, 9500.0
+# Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
+_BLOCK, _KEPT = 512, 128
+
+
+class HeightRaster:
+    """The first band of a raster of heights, and where its cells are.
+
+    Parameters
+    ----------
+    path
+        Any raster that GDAL reads by windows; scale and offset of the band are applied.
+    crs
+        Replaces the CRS of the file.
+    vertical
+        What its heights refer to.
+
+    Raises
+    ------
+    SatIntervalsError
+        The file cannot be read, or lacks a CRS, a transform or a vertical reference.
+    """
+
+    def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
+        self._image = open_image(path, band=1)
+        place = self._image.georeferencing
+        with opened(self._image.path) as dataset:
+            own = dataset.crs.to_wkt() if dataset.crs else None
+            self._scale, self._offset = dataset.scales[0], dataset.offsets[0]
+            level = dataset.tags().get("HEIGHTS", "")
+        if place.transform is None:
+            raise SatIntervalsError(f"{path} has no transform from pixels to its CRS: give a georeferenced raster")
+        self.frame = Frame(str(path), crs or own, vertical, level)
+        self._to_cells: Affine = ~place.transform
+        self.shape = self._image.height, self._image.width
+        """Rows and columns."""
+        a, b, _, d, e, _ = place.transform[:6]
+        self.cell = math.sqrt(abs(a * e - b * d)) * self.frame.metres
+        """Side of a cell in metres, about."""
+        self._block = lru_cache(_KEPT)(self._read_block)
+        if min(self.shape) < 2:
+            raise SatIntervalsError(f"{path} has {self.shape[0]} x {self.shape[1]} cells: give at least 2 x 2")
+
+    def positions(self, longitude: np.ndarray, latitude: np.ndarray, height: np.ndarray) -> Places:
+        """Return columns and rows (cell centres are integers) and heights of points, as in the file; see `Frame`."""
+        x, y, z = self.frame.from_ellipsoid(longitude, latitude, height)
+        a, b, c, d, e, f = self._to_cells[:6]
+        return a * x + b * y + c - 0.5, d * x + e * y + f - 0.5, z
+
+    def read(self, window: Window) -> np.ndarray:
+        """Read a window inside the raster as float32; NaN where there is no height. Thread-safe."""
+        heights = np.empty((window.height, window.width), np.float32)
+        for i in range(window.row // _BLOCK, (window.row_stop - 1) // _BLOCK + 1):
+            for j in range(window.column // _BLOCK, (window.column_stop - 1) // _BLOCK + 1):
+                block = Window(i * _BLOCK, j * _BLOCK, _BLOCK, _BLOCK)
+                common = block.clipped(window)
+                heights[common.relative_to(window).slices] = self._block(i, j)[common.relative_to(block).slices]
+        return heights
+
+    def _read_block(self, i: int, j: int) -> np.ndarray:
+        block = Window(i * _BLOCK, j * _BLOCK, _BLOCK, _BLOCK).clipped(Window(0, 0, *self.shape))
+        pixels, state = read_window(self._image, block)
+        heights = (pixels * self._scale + self._offset).astype(np.float32)
+        metres = heights * self.frame.unit
+        return np.where((state == 0) & (metres >= _GROUND[0]) & (metres <= _GROUND[1]), heights, np.float32(np.nan))

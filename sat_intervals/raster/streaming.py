@@ -1,0 +1,92 @@
+"""Compress a file's rows as they come: rows of blocks, and those of its overviews, in temporary files."""
+
+import errno
+import os
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sat_intervals.raster.cog import BLOCK, Part, compressed, factors
+from sat_intervals.raster.files import File
+
+# Columns that a thread compresses at a time.
+_COLUMNS = 4 * BLOCK
+
+
+class Stream:
+    """A file's rows from the top, in `parts` once a row of blocks is full.
+
+    Rows that wait for a full row of blocks are in a file too, so that memory does not grow with the width.
+    """
+
+    def __init__(self, file: File, place: Path, shape: tuple[int, int], threads: int | None) -> None:
+        """``place``: the final file; temporary ones are beside it, ``strips-0-<name>`` and so on."""
+        self._file, self._place, self._threads = file, place, threads
+        self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
+        self._rows = [0 for _ in self._shapes]
+        self._sizes = [0 for _ in self._shapes]
+        self._buffers = [self._buffer(level) for level in range(len(self._shapes))]
+        self.parts: list[list[Part]] = [[] for _ in self._shapes]
+
+    def _path(self, kind: str, level: int) -> Path:
+        return self._place.with_name(f"{kind}-{level}-{self._place.name}")
+
+    def _buffer(self, level: int) -> np.ndarray:
+        shape = len(self._file.bands), BLOCK, self._shapes[level][1]
+        with open(self._path("rows", level), "wb") as stream:  # a full disk is an error here, not a signal later
+            os.posix_fallocate(stream.fileno(), 0, int(np.prod(shape)) * np.dtype(self._file.dtype).itemsize)
+        return np.memmap(self._path("rows", level), self._file.dtype, "r+", shape=shape)
+
+    def write(self, row: int, bands: np.ndarray) -> None:
+        """Write ``(bands, rows, width)``, which begin at ``row``: the one after the last."""
+        assert row == self._rows[0]
+        self._add(0, bands)
+
+    def _add(self, level: int, bands: np.ndarray) -> None:
+        height, buffer = self._shapes[level][0], self._buffers[level]
+        while bands.shape[1]:
+            filled = self._rows[level] % BLOCK
+            taken = min(BLOCK - filled, bands.shape[1])
+            buffer[:, filled : filled + taken] = bands[:, :taken]
+            self._rows[level] += taken
+            bands = bands[:, taken:]
+            if filled + taken == BLOCK or self._rows[level] == height:
+                self._end_row(level, buffer[:, : filled + taken])
+
+    def _end_row(self, level: int, rows: np.ndarray) -> None:
+        """Compress a row of blocks, and add its reduced rows to the next level."""
+        columns = (rows[:, :, first : first + _COLUMNS] for first in range(0, rows.shape[2], _COLUMNS))
+        start = self._sizes[level]
+        with ThreadPoolExecutor(self._threads) as pool, open(self._path("strips", level), "ab") as out:
+            sizes, checksum = [], 0
+            for blocks in pool.map(partial(compressed, file=self._file), columns):
+                out.write(blocks.content)
+                checksum = zlib.crc32(blocks.content, checksum)
+                sizes += blocks.sizes
+            length = out.tell() - start
+        self._sizes[level] += length
+        self.parts[level].append(Part(sizes, checksum, partial(self._read, level, start, length, checksum)))
+        if level + 1 < len(self._shapes):
+            self._add(level + 1, rows[:, ::2, ::2])
+
+    def _read(self, level: int, start: int, length: int, checksum: int) -> bytes:
+        with open(self._path("strips", level), "rb") as stream:
+            stream.seek(start)
+            content = stream.read(length)
+        if zlib.crc32(content) != checksum:
+            raise OSError(errno.EIO, "the content read back differs from that written")
+        return content
+
+    def check_complete(self) -> None:
+        """Raise if rows are missing."""
+        if self._rows[0] != self._shapes[0][0]:
+            raise OSError(errno.EIO, f"{self._rows[0]} of {self._shapes[0][0]} rows were written")
+
+    def remove(self) -> None:
+        """Delete the temporary files."""
+        for level in range(len(self._shapes)):
+            for kind in ("rows", "strips"):
+                self._path(kind, level).unlink(missing_ok=True)

@@ -1,0 +1,275 @@
+"""Match pairs with truth at a ladder of levels, tile by tile, and measure their intervals."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from decimal import Decimal
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sat_intervals.config import Calibration, Config, Interval, key_of
+from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.match.histogram import bias_histogram
+from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ladder, measure
+from sat_intervals.match.postprocess import (
+    ConfidenceScale,
+    RawRows,
+    confidence_scale,
+    filter_rows,
+    halo,
+    regularized,
+    widened,
+    with_halo,
+)
+from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.products import INVALID
+from sat_intervals.progress import Progress
+from sat_intervals.raster import Image, open_image
+from sat_intervals.results import Layer
+from sat_intervals.run.job import Job, prepare
+from sat_intervals.run.pair import check_failures, match_jobs, measure_images
+from sat_intervals.run.strips import STRIP_PIXELS, check_done, check_matched
+from sat_intervals.run.workers import Workers, connected
+from sat_intervals.store.folder import LocalFolder
+from sat_intervals.tiling import Window
+
+FEWEST = 1000  # pixels with truth, of all pairs
+# A single pair is judged in blocks, this many along each side.
+_BLOCKS = 4
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A pair with truth to calibrate with.
+
+    Attributes
+    ----------
+    name
+        For people.
+    group
+        Subjects of one group are left out together.
+    left, right
+        The images.
+    truth
+        True disparity of the region.
+    config
+        Settings, with the search range of the pair.
+    window
+        Region of the left image; None: all of it.
+    tolerance
+        Distance in pixels up to which a truth outside an interval counts as inside.
+    remove_bias
+        Whether to add the median of disparity - truth over kept pixels to the truth.
+    """
+
+    name: str
+    group: str
+    left: Image
+    right: Image
+    truth: Layer
+    config: Config
+    window: Window | None = None
+    tolerance: float = 0.0
+    remove_bias: bool = False
+
+
+def truth_of(left: Image, path: str | Path) -> Layer:
+    """Open the truth of a whole left image; raise if it has another size."""
+    truth = open_image(path)
+    if (truth.height, truth.width) != (left.height, left.width):
+        raise SatIntervalsError(
+            f"{truth.path} has {truth.height} x {truth.width} pixels, {left.path} {left.height} x {left.width}: "
+            "give the truth of the left image"
+        )
+    return Layer(truth, 0, 0)
+
+
+def check_enough(pixels: int, subjects: Sequence[Subject], what: str) -> None:
+    """Raise if there are too few pixels with truth."""
+    if pixels < FEWEST:
+        files = ", ".join(subject.truth.image.path for subject in subjects[:3])
+        raise SatIntervalsError(
+            f"{files}: {pixels} {what}, at least {FEWEST} are needed: give more pairs, or check truth and masks"
+        )
+
+
+def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progress) -> list[Measured]:
+    """Match subjects at every level of the ladder, in ``folder``, and measure their intervals.
+
+    Parameters
+    ----------
+    subjects
+        See `check_subjects`.
+    folder
+        Where tiles are kept meanwhile; all workers must see it.
+    progress
+        Called with the stages of `match_pair`, and ``subjects``.
+
+    Returns
+    -------
+    One measurement for each subject; for a single one, one for each of 16 blocks.
+
+    Raises
+    ------
+    SatIntervalsError
+        Fewer than 1000 kept pixels have a truth, or a pair cannot be matched.
+    RunError
+        Tiles failed.
+    """
+    found: list[Measured] = []
+    levels = ladder(subjects[0].config)
+    compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
+    scratch = Path(tempfile.mkdtemp(prefix=".calibrate-", dir=folder))
+    try:
+        with connected(subjects[0].config.cluster, scratch) as client:
+            for number, subject in enumerate(subjects):
+                one = progress if len(subjects) == 1 else partial(_of_all, progress, number, len(subjects))
+                one("subjects", 0, 1)
+                found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    progress("subjects", len(subjects), len(subjects))
+    check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
+    return found
+
+
+def _of_all(progress: Progress, number: int, total: int, *_: object) -> None:
+    """Report the progress of one of several subjects."""
+    progress("subjects", number, total)
+
+
+def _of_subject(
+    client: Workers, subject: Subject, levels: np.ndarray, folder: Path, in_blocks: bool, progress: Progress
+) -> list[Measured]:
+    """Match a subject, with two levels of the ladder at a time, and measure it."""
+    gauge: _Gauge | None = None
+    with ExitStack() as stack:
+        jobs = [
+            _begun(subject, levels[first : first + 2], folder / str(first), stack) for first in range(0, levels.size, 2)
+        ]
+        # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
+        batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
+        for batch in batches:
+            for job in batch:
+                measure_images(client, job, progress)
+            for matched in match_jobs(client, batch, progress):
+                job = matched.job
+                check_failures(job, matched.failures)
+                gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)
+                gauge.add(job, 2 * jobs.index(job))
+                job.store.remove()
+    assert gauge is not None  # there are jobs
+    return gauge.measured()
+
+
+def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) -> Job:
+    """Prepare the job that matches a subject at two levels; open its store."""
+    config = _at_levels(subject.config, float(levels[0]), float(levels[1]), None)
+    job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name)
+    stack.enter_context(LocalFolder(job.store.home).locked())
+    job.begin()
+    stack.callback(job.store.remove)
+    return job
+
+
+def _at_levels(config: Config, high: float, low: float, quantile: float | None) -> Config:
+    """Return settings whose intervals are cut at two levels, whatever the coverage, and without local ranges."""
+    rows = [{"coverage": coverage, "high": high, "low": low, "quantile": quantile} for coverage in COVERAGES]
+    constant = Calibration.model_validate({"name": "constant", "key": key_of(config), "levels": rows})
+    interval = Interval(coverage=Decimal(str(COVERAGES[0])), calibration=constant)
+    disparity = config.disparity.model_copy(update={"local": False, "grid": None})
+    return config.model_copy(update={"interval": interval, "disparity": disparity})
+
+
+class _Gauge:
+    """Measures the intervals of a subject, job by job."""
+
+    def __init__(self, job: Job, subject: Subject, rungs: int, in_blocks: bool) -> None:
+        self._subject, self._in_blocks = subject, in_blocks
+        region = job.store.grid.region
+        self._shape = region.height, region.width
+        parts = _BLOCKS**2 if in_blocks else 1
+        self._tables = np.zeros((parts, rungs, SCHEMES, FIELDS))
+        self._known, self._good = np.zeros((2, parts))
+        self._bias = self._found_bias(job) if subject.remove_bias else 0.0
+
+    def measured(self) -> list[Measured]:
+        """Return the measurement of each part."""
+        names = [f"block {part}" for part in range(len(self._tables))] if self._in_blocks else [self._subject.group]
+        parts = [
+            Measured(name, 1.0, table, int(known), int(good))
+            for name, table, known, good in zip(names, self._tables, self._known, self._good, strict=True)
+        ]
+        kept = sum(part.kept for part in parts)
+        return [part._replace(weight=1 / max(kept, 1)) for part in parts]
+
+    def _found_bias(self, job: Job) -> float:
+        histogram = bias_histogram()
+        for row, strip, first, last, scale in _strips(job):
+            rows, truth = filter_rows(strip, scale, job.config), self._truth(row, last - first)
+            chosen = (rows.validity[first:last] & INVALID == 0) & np.isfinite(truth)
+            histogram.add(rows.disparity[first:last][chosen].astype(np.float64) - truth[chosen])
+        return histogram.median() or 0.0
+
+    def _truth(self, row: int, height: int) -> np.ndarray:
+        return self._subject.truth.read(Window(row, 0, height, self._shape[1]))
+
+    def _parts(self, row: int, height: int) -> np.ndarray:
+        """Number of the part of each pixel of some rows."""
+        if not self._in_blocks:
+            return np.zeros((height, self._shape[1]), np.int64)
+        rows, columns = (np.arange(side) * _BLOCKS // side for side in self._shape)
+        return _BLOCKS * rows[row : row + height, None] + columns
+
+    def add(self, job: Job, rung: int) -> None:
+        """Measure a job, whose levels are the rungs ``rung`` and ``rung + 1``."""
+        config = job.config
+        for row, strip, first, last, scale in _strips(job):
+            inner = slice(first, last)
+            truth, parts = self._truth(row, last - first) + self._bias, self._parts(row, last - first)
+            for cut in (0, 1):
+                lower, upper = (strip.lower_low, strip.upper_low) if cut else (strip.lower, strip.upper)
+                rows = filter_rows(
+                    strip._replace(lower=lower, upper=upper, lower_low=lower, upper_low=upper), scale, config
+                )
+                assert rows.low is not None  # checked
+                disparity, kept = rows.disparity[inner], rows.validity[inner] & INVALID == 0
+                if rung + cut == 0:
+                    self._count(truth, np.where(kept, disparity, np.nan), parts)
+                kept &= np.isfinite(truth)
+                low, high = kept & rows.low[inner], kept & ~rows.low[inner]
+                for scheme, quantile in enumerate((None, *QUANTILES)):
+                    chosen = np.flatnonzero(high if scheme == HIGH else low)
+                    bounds = regularized(rows, first, last, config, quantile)
+                    middle, lower, upper, true, part = (
+                        band.ravel()[chosen] for band in (disparity, *bounds, truth, parts)
+                    )
+                    lower, upper = widened(lower, upper, middle, config)
+                    tolerance, number = self._subject.tolerance, len(self._tables)
+                    self._tables[:, rung + cut, scheme] += measure(lower, upper, true, tolerance, part, number)
+
+    def _count(self, truth: np.ndarray, disparity: np.ndarray, parts: np.ndarray) -> None:
+        known = np.isfinite(truth)
+        good = known & (np.abs(disparity - truth) <= 1)
+        for counts, chosen in ((self._known, known), (self._good, good)):
+            counts += np.bincount(parts[chosen], minlength=counts.size)
+
+
+def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:
+    """Yield first row of the region, raw rows with their halo, ``first`` and ``last`` of `with_halo`, and the scale."""
+    records, region = job.store.records(), job.store.grid.region
+    check_done(job, records)
+    histogram = job.store.histogram(records)
+    check_matched(job, records, int(histogram.sum()))
+    assert job.config.ambiguity is not None  # checked
+    scale = confidence_scale(job.config.ambiguity, histogram)
+    row = 0
+    raw = (RawRows(**strip) for strip in job.store.strips(max(1, STRIP_PIXELS // region.width), records))
+    for rows, first, last in with_halo(raw, halo(job.config)):
+        yield row, rows, first, last, scale
+        row += last - first

@@ -1,0 +1,83 @@
+"""Draw how a surface model compares with reference heights: reliability of intervals, map of errors, profile."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.evaluate.dsm import Comparison, Profile, error_map
+from sat_intervals.show.canvas import DPI, INK, NOTHING, page, pointed_ends, say_empty
+from sat_intervals.show.legend import BLUE, ORANGE
+
+# Cells of a class that are worth a point, and pixels of the longer side of a map.
+_WORTH, _LONGEST = 50, 900
+
+
+def draw_reliability(report: dict[str, Any], path: Path, name: str, dpi: int = DPI) -> None:
+    """Draw the half widths of intervals against those that would have been needed, and coverage, by class of width."""
+    nominal = report["nominal"]
+    kinds = [kind for kind in report["width"] if kind["with_interval"] >= _WORTH]
+    with page(path, (9.0, 4.2), dpi, f"{name}: intervals and reference") as figure:
+        left, right = figure.subplots(1, 2)
+        stated = [kind["mean_half_width"] for kind in kinds]
+        if nominal is not None:
+            needed = [kind["needed_half_width"] for kind in kinds]
+            left.plot(stated, needed, "o-", color=BLUE, lw=1, ms=5)
+            left.set_ylabel(f"|height - reference| of {100 * nominal:g} % of cells (m)")
+            right.axhline(nominal, color=INK, lw=0.8, ls="--", label="nominal")
+        ends = [max(0.05, 0.8 * min(stated, default=0.1)), 1.25 * max(stated, default=10.0)]
+        left.plot(ends, ends, color=INK, lw=0.8, ls="--", label="intervals as wide as needed")
+        left.set(xlabel="mean half width of intervals (m)", xscale="log", yscale="log")
+        left.legend(loc="upper left", frameon=False)
+        right.bar(range(len(kinds)), [kind["coverage"] for kind in kinds], color=BLUE, width=0.7)
+        right.axhline(report["all"]["coverage"] or 0.0, color=ORANGE, lw=1, label="measured, all cells")
+        right.set_xticks(range(len(kinds)), [_limits(kind) for kind in kinds], fontsize=8)
+        right.set(xlabel="width of the interval (m)", ylabel="share of reference heights inside", ylim=(0, 1.15))
+        right.legend(loc="upper right", frameon=False, ncols=2)
+        for place, kind in enumerate(kinds):
+            right.text(place, 0.02, f"{kind['with_interval']:,}", ha="center", fontsize=7, color="white", rotation=90)
+
+
+def _limits(kind: dict[str, Any]) -> str:
+    return f"{kind['from']:g}+" if kind["to"] is None else f"{kind['from']:g}-{kind['to']:g}"
+
+
+def draw_error_map(given: Comparison, nmad: float, path: Path, dpi: int = DPI) -> None:
+    """Draw height - reference, within three NMAD of 0; large surfaces are sampled."""
+    errors, extent = error_map(given, _LONGEST)
+    end = max(3 * nmad, 0.1)
+    tall = float(np.clip(errors.shape[0] / errors.shape[1], 0.2, 5))
+    width = min(7.0, 7.0 / tall)
+    with page(path, (width + 1.8, width * tall + 0.8), dpi, f"{given.surface.name} - {given.reference.name}") as figure:
+        panel = figure.subplots()
+        panel.set_facecolor(NOTHING)
+        drawn = panel.imshow(errors, extent=extent, cmap="RdBu_r", vmin=-end, vmax=end, interpolation="nearest")
+        panel.ticklabel_format(style="plain", useOffset=False)
+        panel.tick_params(labelsize=8, colors=INK)
+        panel.set(xlabel="easting (m)", ylabel="northing (m)")
+        panel.locator_params(nbins=4)
+        say_empty(panel, errors, "no common height")
+        bar = figure.colorbar(drawn, ax=panel, extend=pointed_ends(errors, -end, end), shrink=0.8)
+        bar.set_label("height - reference (m), red: too high")
+
+
+def draw_height_profile(profile: Profile, path: Path, names: Sequence[str], dpi: int = DPI) -> None:
+    """Draw heights, their intervals and the reference along a line; ``names`` of surface and reference."""
+    with page(path, (11.0, 4.0), dpi, f"{names[0]} and {names[1]} along a line") as figure:
+        chart = figure.subplots()
+        chart.fill_between(
+            profile.distance, profile.lower, profile.upper, color=BLUE, alpha=0.3, lw=0, label="interval"
+        )
+        chart.plot(profile.distance, profile.height, color=BLUE, lw=1, label="height")
+        chart.plot(profile.distance, profile.reference, color=ORANGE, lw=1, label="reference")
+        (x, y), (last_x, last_y) = profile.ends
+        chart.set(xlabel=f"metres from {x:.1f}, {y:.1f} to {last_x:.1f}, {last_y:.1f}", ylabel="height (m)")
+        chart.legend(loc="upper right", frameon=False, ncols=3)
+        chart.margins(x=0)
+        known = profile.reference[np.isfinite(profile.reference)]
+        if known.size:  # wide intervals would flatten the ground
+            low, high = np.percentile(known, (0, 100))
+            room = max(0.5 * (high - low), 5.0)
+            chart.set_ylim(low - room, high + room)
+        say_empty(chart, profile.height, "no height")

@@ -1,0 +1,47 @@
+"""Strips of a region give the same final bands as the whole region."""
+
+import numpy as np
+import pytest
+
+from sat_intervals.config import load_config
+from sat_intervals.match.postprocess import (
+    ConfidenceScale,
+    RawRows,
+    cut_rows,
+    halo,
+    postprocess_rows,
+    postprocess_strip,
+)
+from sat_intervals.products import NO_DISPARITY, REGULARIZED
+
+ROWS, COLUMNS, MINIMUM, COUNT = 90, 70, -9, 21
+
+
+def raw_rows() -> RawRows:
+    """Noise with areas of low confidence and pixels without disparity."""
+    random = np.random.default_rng(0)
+    winner = random.integers(MINIMUM + 2, MINIMUM + COUNT - 2, (ROWS, COLUMNS)).astype(np.int16)
+    lower, upper = winner - random.integers(0, 3, winner.shape), winner + random.integers(0, 3, winner.shape)
+    disparity = (winner + random.uniform(-0.5, 0.5, winner.shape)).astype(np.float32)
+    right = random.integers(MINIMUM, MINIMUM + COUNT, (ROWS, COLUMNS + COUNT - 1)).astype(np.int16)
+    ambiguity = random.integers(0, 60, winner.shape).astype(np.uint32)
+    winner[random.random(winner.shape) < 0.05] = NO_DISPARITY
+    validity = np.where(winner == NO_DISPARITY, 4, 0).astype(np.uint16)
+    return RawRows(winner, lower.astype(np.int16), upper.astype(np.int16), disparity, ambiguity, validity, right)
+
+
+@pytest.mark.parametrize("sections", [{}, {"median": {"size": 7}, "regularization": {"depth": 4}}, {"median": None}])
+def test_postprocess_strip__equals_the_whole_region_in_every_bit(sections):
+    search = {"minimum": MINIMUM, "maximum": MINIMUM + COUNT - 1}
+    config = load_config({"disparity": search, "cross_check": {"tolerance": 9}} | sections)
+    raw, scale, margin = raw_rows(), ConfidenceScale(3.0, 70.0), halo(config)
+    whole = postprocess_rows(raw, 0, ROWS, scale, config)
+    assert (whole.validity & REGULARIZED != 0).any()
+    for first in range(0, ROWS, 32):
+        last = min(first + 32, ROWS)
+        top, bottom = max(0, first - margin), min(ROWS, last + margin)
+        pieces = (cut_rows(raw, row, min(row + 11, bottom)) for row in range(top, bottom, 11))
+        parts = list(postprocess_strip(pieces, first - top, last - first, scale, config))
+        for name in ("disparity", "lower", "upper", "confidence", "validity"):
+            found = np.concatenate([getattr(part, name) for part in parts])
+            np.testing.assert_array_equal(found, getattr(whole, name)[first:last], err_msg=name)

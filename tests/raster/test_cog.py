@@ -1,0 +1,159 @@
+"""Cloud-Optimized GeoTIFFs put together from parts: valid, equal to what was written, the same bytes in any order."""
+
+import random
+import warnings
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import PLACE
+from hypothesis import given
+from hypothesis import strategies as st
+from rasterio.errors import NotGeoreferencedWarning
+from rio_cogeo.cogeo import cog_validate
+
+from sat_intervals.products import Band
+from sat_intervals.raster import POINT_FILES, RUN_FILES, File, Georeferencing, cog, north_up, run_files
+from sat_intervals.raster.cog import BLOCK, Part, codec_versions, combined, compressed, factors, put_together, template
+from sat_intervals.raster.streaming import Stream
+
+INTERVALS, VALIDITY = RUN_FILES
+COUNTS = File("counts.tif", "int16", -9999, (Band("count", "", "of something"),))
+
+
+def noise(file: File, height: int, width: int) -> np.ndarray:
+    values = np.random.default_rng(0).normal(0, 9, (len(file.bands), height, width)).astype(file.dtype)
+    values[:, 0] = 0 if file.nodata is None else np.array(file.nodata).astype(file.dtype)
+    return values
+
+
+def parts_of(bands: np.ndarray, file: File, order: random.Random | None = None) -> list[list[Part]]:
+    """Parts of every level, made in some order."""
+    levels = factors(*bands.shape[1:])
+    places = [(k, row) for k, f in enumerate(levels) for row in range(0, -(-bands.shape[1] // f), BLOCK)]
+    if order:
+        order.shuffle(places)
+    made = {}
+    for k, row in places:
+        blocks = compressed(bands[:, :: levels[k], :: levels[k]][:, row : row + BLOCK], file)
+        made[k, row] = Part(blocks.sizes, zlib.crc32(blocks.content), lambda content=blocks.content: content)
+    return [[made[place] for place in sorted(made) if place[0] == k] for k in range(len(levels))]
+
+
+def write(path: Path, bands: np.ndarray, file: File, place: Georeferencing = PLACE, **options) -> dict[str, int]:
+    made = template(file, place, {"ALPHA": "0.9"}, path)
+    return put_together(path, made, bands.shape[1:], parts_of(bands, file, **options))
+
+
+def assert_valid(path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        assert cog_validate(path, strict=True) == (True, [], [])
+
+
+@pytest.mark.parametrize(
+    ("file", "shape", "is_big"),
+    [
+        (INTERVALS, (1, 1), False),
+        (INTERVALS, (513, 700), False),
+        (INTERVALS, (513, 700), True),
+        (VALIDITY, (512, 512), False),
+        (VALIDITY, (1100, 40), True),
+        (COUNTS, (3, 1100), False),
+        (*POINT_FILES, (20, 513), False),
+    ],
+)
+def test_put_together__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file, shape, is_big):
+    monkeypatch.setattr(cog, "_CLASSIC", 0 if is_big else 1 << 32)
+    bands, path = noise(file, *shape), tmp_path / file.name
+    made = write(path, bands, file)
+    content = path.read_bytes()
+    assert made == {"bytes": len(content), "crc32": zlib.crc32(content)}
+    assert content[2] == (43 if is_big else 42)
+    assert_valid(path)
+    for level, factor in enumerate(factors(*shape)):
+        options = {"overview_level": level - 1} if level else {}
+        with rasterio.open(path, **options) as dataset:
+            np.testing.assert_array_equal(dataset.read(), bands[:, ::factor, ::factor])
+            assert dataset.block_shapes[0] == (BLOCK, BLOCK)
+            np.testing.assert_equal(dataset.nodata, file.nodata)
+    with rasterio.open(path) as dataset:
+        assert (dataset.tags()["ALPHA"], dataset.tags(1)["meaning"]) == ("0.9", file.bands[0].meaning)
+        assert Georeferencing.of(dataset) == PLACE
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lerc", "none"])
+def test_put_together__with_other_compressions(tmp_path, compression):
+    for file, shape in zip(run_files(compression), [(513, 40), (40, 30)], strict=True):
+        bands, path = noise(file, *shape), tmp_path / file.name
+        write(path, bands, file)
+        assert_valid(path)
+        with rasterio.open(path) as dataset:
+            assert dataset.profile.get("compress", "none") == file.compression
+            error = 0.01001 if file.compression == "lerc" else 0
+            np.testing.assert_allclose(dataset.read(), bands, rtol=0, atol=error)
+
+
+def test_put_together__gives_the_same_bytes_whatever_the_order(tmp_path):
+    bands = noise(INTERVALS, 1100, 600)
+    whole = write(tmp_path / "a.tif", bands, INTERVALS)
+    assert whole == write(tmp_path / "b.tif", bands, INTERVALS, order=random.Random(1))
+    assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
+
+
+def test_put_together__has_the_tags_of_gdals_own_driver(tmp_path):
+    bands, place = noise(VALIDITY, 600, 700), north_up(32631, 3e5, 4.8e6, 0.5)
+    write(tmp_path / "ours.tif", bands, VALIDITY, place)
+    options = {"count": 1, "dtype": "uint16", **place.creation_options()}
+    with rasterio.open(tmp_path / "plain.tif", "w", driver="GTiff", height=600, width=700, **options) as plain:
+        plain.update_tags(ALPHA="0.9")
+        VALIDITY.describe(plain)
+        plain.write(bands)
+    rasterio.shutil.copy(tmp_path / "plain.tif", tmp_path / "theirs.tif", driver="COG", compress="DEFLATE")
+    with rasterio.open(tmp_path / "ours.tif") as ours, rasterio.open(tmp_path / "theirs.tif") as theirs:
+        assert ours.profile == theirs.profile
+        for of_band in ((), (1,)):
+            for domain in (None, "IMAGE_STRUCTURE"):
+                assert ours.tags(*of_band, ns=domain) == theirs.tags(*of_band, ns=domain) | (
+                    {} if domain or of_band else {"ALPHA": "0.9"}
+                )
+
+
+@pytest.mark.parametrize("rows", [100, 512, 1100])
+def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
+    bands = noise(INTERVALS, 1100, 600)
+    stream = Stream(INTERVALS, tmp_path / "a.tif", bands.shape[1:], 2)
+    for row in range(0, 1100, rows):
+        stream.write(row, bands[:, row : row + rows])
+    expected = parts_of(bands, INTERVALS)
+    assert [[part.read() for part in level] for level in stream.parts] == [
+        [part.read() for part in level] for level in expected
+    ]
+    stream.remove()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_compressed__refuses_blocks_that_decode_to_something_else(monkeypatch):
+    class Losing(cog.gdal.DatasetWriter):
+        def write(self, bands):
+            super().write(bands * (bands > 0))
+
+    monkeypatch.setattr(cog.gdal, "DatasetWriter", Losing)
+    with pytest.raises(OSError, match="differs from that written"):
+        compressed(noise(INTERVALS, 20, 30), INTERVALS)
+
+
+def test_codec_versions__follow_the_bytes_of_blocks(monkeypatch):
+    before = codec_versions("deflate")
+    monkeypatch.setitem(cog._LEVELS, "deflate", {"zlevel": 9})
+    assert codec_versions("deflate") == before  # once a process
+    codec_versions.cache_clear()
+    assert codec_versions("deflate")["codecs"] != before["codecs"]
+    codec_versions.cache_clear()
+
+
+@given(first=st.binary(), second=st.binary())
+def test_combined__equals_the_checksum_of_both(first, second):
+    assert combined(zlib.crc32(first), zlib.crc32(second), len(second)) == zlib.crc32(first + second)

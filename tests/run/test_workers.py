@@ -1,0 +1,70 @@
+"""Threads behind the interface of workers: bounded, in order of need, tried again, without dask."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from sat_intervals.config import Cluster
+from sat_intervals.run import workers
+from sat_intervals.run.workers import Task, Threads, connected
+
+
+def test_threads__yield_every_outcome_and_try_again():
+    tries = []
+
+    def work(number):
+        tries.append(number)
+        if number == 3 or (number == 2 and tries.count(2) < 3):
+            raise OSError("disk gone")
+        return number**2
+
+    with connected(Cluster(workers=2), None) as threads:
+        outcomes = {outcome.label: outcome for outcome in threads.outcomes(Task(n, work, (n,), 2) for n in range(5))}
+    assert {label: outcome.result for label, outcome in outcomes.items()} == {0: 0, 1: 1, 2: 4, 3: None, 4: 16}
+    assert str(outcomes[3].error) == "disk gone"
+    assert sorted(tries) == [0, 1, *[2] * 3, *[3] * 3, 4]
+
+
+def test_threads__take_a_task_once_another_has_made_it_ready():
+    ended: list[int] = []
+
+    def tasks() -> Iterator[Task | None]:
+        yield Task(0, ended.append, (0,), 0)
+        while not ended:
+            yield None
+        yield Task(1, ended.append, (1,), 0)
+
+    with connected(Cluster(workers=4), None) as threads:
+        assert [outcome.label for outcome in threads.outcomes(tasks())] == [0, 1]
+    assert ended == [0, 1]
+
+
+def test_threads__keep_two_tasks_per_thread_in_flight_and_drop_the_rest_at_the_end(monkeypatch):
+    monkeypatch.setattr(workers, "CHECK_EVERY", 0.01)
+    started, go = [], threading.Event()
+
+    def work(number):
+        started.append(number)
+        go.wait(10)
+
+    asked = []
+    threads = Threads(2)
+    outcomes = threads.outcomes(asked.append(n) or Task(n, work, (n,), 0) for n in range(99))
+    assert next(outcomes) is None  # nothing ends: the caller may look around
+    assert (len(asked), len(started)) == (4, 2)
+    outcomes.close()
+    go.set()
+    threads.close()
+    time.sleep(0.05)
+    assert started == [0, 1]
+
+
+@pytest.mark.parametrize("module", ["sat_intervals.run.pair", "sat_intervals.run.batch"])
+def test_threads__need_neither_dask_nor_xarray(module):
+    code = f"import sys, {module}; print(*{{'dask', 'distributed', 'xarray'}} & sys.modules.keys())"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == []
