@@ -13,7 +13,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lint bench bench-seams tune calibration coverage pictures docs dist clean
+.PHONY: demo test test-all lint bench bench-seams surface-bounds tune calibration coverage pictures docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -50,6 +50,10 @@ tune: $(VENV)/.has-mccnn
 # The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; about half an hour.
 calibration: $(VENV)/.has-mccnn
 	$(BIN)/python tests/benchmarks/calibrations.py
+
+# The table of docs/heights.md: coverage and width of the bounds of a surface's cells, on exact scenes; minutes.
+surface-bounds: $(VENV)/.has-dsm
+	$(BIN)/python -W ignore tests/benchmarks/surface_bounds.py
 
 # The tables of docs/coverage.md, on the same pairs; about five minutes after `make calibration`, else half an hour more.
 coverage: $(VENV)/.has-mccnn

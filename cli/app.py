@@ -23,6 +23,7 @@ from sat_intervals.cli.evaluate import evaluate
 from sat_intervals.cli.export import export
 from sat_intervals.cli.logs import printable
 from sat_intervals.cli.match import match
+from sat_intervals.cli.pair_surface import surface
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
@@ -41,17 +42,17 @@ _ITEM = "\n  "
 # Exit status of a process ended by SIGPIPE.
 READER_GONE = 141
 _NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
-RESUMED = ("match", "demo", "batch")
+RESUMED = ("match", "demo", "batch", "surface")
 STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
     "Match": (match, batch, status),
     "Look": (plot, report, project),
-    "Heights": (triangulate, dsm),
+    "Heights": (surface, triangulate, dsm),
     "Compare with a truth": (reference, evaluate, calibrate, ablate),
     "Use elsewhere": (export, stac),
 }
 # Commands of every day, which the command without arguments shows.
-_DAILY = (demo, match, status, report, project, triangulate, dsm, evaluate, export)
+_DAILY = (demo, match, status, report, project, surface, triangulate, dsm, evaluate, export)
 
 
 class _Commands(click.Group):

@@ -1,26 +1,104 @@
 """``sat-intervals dsm``: make a surface model with height intervals."""
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
 
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
+
+# Copied from `sat_intervals.heights.choices`, which --help must not import.
+BOUNDS = ("envelope", "mean", "median", "nearest", "agreeing")
+
+_CELL_OPTIONS = (
+    click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
+    click.option(
+        "--grid-like", callback=path, metavar="FILE", help="North-up raster whose grid and CRS the surface takes."
+    ),
+    click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points."),
+    click.option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."),
+    click.option("--geoid", callback=path, metavar="FILE", help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
+    click.option(
+        "--bounds",
+        "--interval",
+        "bounds",
+        type=click.Choice(BOUNDS),
+        help="Interval of a cell: envelope of its points' intervals; mean or median of their bounds; that of the point "
+        "nearest to the cell's height; intersection of those that agree. Default: median for runs with a coverage, "
+        "else envelope.",
+    ),
+    click.option(
+        "--keep-open/--drop-open",
+        "keeps_open",
+        default=None,
+        help="Whether points count whose interval is open at an end of the search range; default: not with a coverage.",
+    ),
+    click.option(
+        "--outliers",
+        type=float,
+        metavar="METRES",
+        help="Leave out points farther than this from the median height within 2 pixels; default: none.",
+    ),
+    click.option("--max-width", type=float, metavar="METRES", help="Leave out cells with a wider interval."),
+    click.option("--min-confidence", type=float, metavar="C", help="Leave out cells of lower confidence, 0 to 1."),
+)
+
+
+def cell_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`."""
+
+    @wraps(command)
+    def with_cells(**given: Any) -> Any:
+        of_choices = ("bounds", "keeps_open", "outliers", "max_width", "min_confidence")
+        choices = {name: given.pop(name) for name in of_choices}
+        cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
+        like = given.pop("grid_like")
+        if (like is None) == (cells["resolution"] is None):
+            raise click.UsageError("give either --resolution or --grid-like.")
+        from sat_intervals.heights.choices import SurfaceChoices
+
+        cells |= {"resolution": like or cells["resolution"], "choices": SurfaceChoices(**choices)}
+        return command(cells=cells, **given)
+
+    for option in reversed(_CELL_OPTIONS):
+        with_cells = option(with_cells)
+    return with_cells
+
+
+def say_surface(console: "Console", report: dict[str, Any]) -> None:
+    """Print what a surface has: cells, filled share, half widths, and what was left out."""
+    from sat_intervals.heights.dsm import WIDE
+
+    console.say(
+        f"{report['rows']} x {report['columns']} cells in {report['crs']} from {report['points']} points, "
+        f"{100 * report['filled']:.1f} % with a height"
+    )
+    if report["median_half_width"] is not None:
+        console.say(
+            f"median half width +-{report['median_half_width']:.2f} m, {100 * report['wide']:.1f} % wider than "
+            f"+-{WIDE:g} m, by --bounds {report['bounds']}"
+        )
+    for name, what in (
+        ("outliers", "points left out as outliers"),
+        ("open", "points left out, with intervals open at an end of the search range"),
+        ("poor_cells", "cells left out for their width or confidence"),
+    ):
+        if report[name]:
+            console.say(f"{report[name]} {what}")
+    if report["disagreeing"] is not None:
+        console.say(f"where runs overlap, {100 * report['disagreeing']:.1f} % of the cells disagree")
+    for out in report["without_intervals"]:
+        click.echo(f"{out} was matched without intervals: cells without another run have no height bounds", err=True)
+
 
 @click.command(short_help="Make a surface model with height intervals from one or several runs.")
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--resolution", type=float, required=True, metavar="METRES", help="Side of a cell.")
-@click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points.")
-@click.option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell.")
-@click.option(
-    "--interval",
-    type=click.Choice(["envelope", "mean"]),
-    default="envelope",
-    show_default=True,
-    help="Interval of a cell: envelope of its points' intervals, or weighted mean of their bounds.",
-)
-@click.option("--geoid", callback=path, metavar="FILE", help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
+@cell_options
 @click.option(
     "--output",
     callback=path,
@@ -30,17 +108,7 @@ from sat_intervals.cli.options import json_option, log_options, path, quiet_opti
 @json_option
 @quiet_option
 @log_options
-def dsm(
-    outs: tuple[Path, ...],
-    resolution: float,
-    crs: str | None,
-    radius: float | None,
-    interval: Literal["envelope", "mean"],
-    geoid: Path | None,
-    output: Path | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def dsm(outs: tuple[Path, ...], cells: dict[str, Any], output: Path | None, as_json: bool, quiet: bool) -> None:
     """Make a surface model from the points that `triangulate` wrote to the folders OUT.
 
     Bands: height, height_lower, height_upper, count, confidence, agreement. Heights refer to the WGS 84 ellipsoid
@@ -55,24 +123,8 @@ def dsm(
 
     output = output or outs[0] / "dsm.tif"
     with Console(quiet or as_json) as console:
-        report = make_surface(
-            outs,
-            output,
-            resolution=resolution,
-            crs=crs,
-            radius=radius,
-            interval=interval,
-            geoid=geoid,
-            progress=console.progress,
-        )
+        report = make_surface(outs, output, **cells, progress=console.progress)
     if as_json:
         say_json(report)
-    console.say(
-        f"{report['rows']} x {report['columns']} cells in {report['crs']} from {report['points']} points, "
-        f"{100 * report['filled']:.1f} % with a height"
-    )
-    if report["disagreeing"] is not None:
-        console.say(f"where runs overlap, {100 * report['disagreeing']:.1f} % of the cells disagree")
-    for out in report["without_intervals"]:
-        click.echo(f"{out} was matched without intervals: cells without another run have no height bounds", err=True)
+    say_surface(console, report)
     console.say(str(output))

@@ -52,7 +52,7 @@ def plot(
     OUT/range.png      if the search range was found, or is local: matches, ranges of cells
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
-    OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence
+    OUT/dsm.png        if dsm.tif exists: hillshade, height, half width, confidence
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.

@@ -40,7 +40,7 @@ def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], as_json:
         (lowest, highest), residual = report["height"], report["residual"][1]
         console.say(
             f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid, "
-            f"lines of sight at most {residual:.2g} m apart"
+            f"lines of sight at most {residual:.2g} m apart (this tests models and grids, not the matches)"
         )
     else:
         console.say("no valid pixels, so no points")

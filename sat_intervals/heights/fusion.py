@@ -20,15 +20,17 @@ class RunCells(NamedTuple):
     points: np.ndarray
 
 
-def cells_of_run(gathered: np.ndarray, interval: str) -> RunCells:
-    """Return heights and bounds from sums over points, see `kernels.splat`; ``interval`` as in `make_surface`."""
+def cells_of_run(gathered: np.ndarray, bounds: str) -> RunCells:
+    """Return heights and bounds from sums over points, see `PointCloud.splat`; ``bounds`` as in `SurfaceChoices`."""
     weight = np.where(gathered[COUNT] > 0, gathered[WEIGHT], np.nan)
     bounded = np.where(gathered[BOUNDED] > 0, gathered[BOUNDED], np.nan)
-    if interval == "mean":
+    if bounds == "mean":
         lower, upper = gathered[LOWER] / bounded, gathered[UPPER] / bounded
     else:
         lower, upper = (np.where(np.isnan(bounded), np.nan, gathered[index]) for index in (LEAST, MOST))
     height, confidence = gathered[HEIGHT] / weight, gathered[CONFIDENCE] / weight
+    if bounds not in ("envelope", "mean"):  # heights do not depend on the bounds
+        lower, upper = np.minimum(lower, height), np.maximum(upper, height)
     return RunCells(weight, height, lower, upper, confidence, gathered[COUNT])
 
 
@@ -55,6 +57,18 @@ def fused(runs: Sequence[RunCells]) -> np.ndarray:
         "agreement": np.where(several, overlapping, np.nan),
     }
     return np.stack([bands[band.name] for band in SURFACE]).astype(np.float32)
+
+
+def without_poor_cells(bands: np.ndarray, max_width: float | None, min_confidence: float | None) -> int:
+    """Set the cells of wider intervals or lower confidence to NaN, in place; return their number."""
+    band = dict(zip((band.name for band in SURFACE), bands, strict=True))
+    poor = np.zeros(bands.shape[1:], np.bool_)
+    if max_width is not None:
+        poor |= np.isfinite(band["height"]) & ~(band["height_upper"] - band["height_lower"] <= max_width)
+    if min_confidence is not None:
+        poor |= np.isfinite(band["height"]) & ~(band["confidence"] >= min_confidence)
+    bands[:, poor] = np.nan
+    return int(poor.sum())
 
 
 def _outwards(bound: np.ndarray, end: float) -> np.ndarray:

@@ -9,13 +9,32 @@ from typing import NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.splat import empty_cells, splat
-from sat_intervals.products import POINTS
+from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.kernels.disparity import median
+from sat_intervals.kernels.splat import (
+    AGREEING,
+    BOUNDED,
+    HEIGHT,
+    LEAST,
+    MEDIAN,
+    MOST,
+    NEAREST,
+    WEIGHT,
+    cell_bounds,
+    empty_cells,
+    reaching,
+    splat,
+)
+from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, POINTS
 from sat_intervals.raster import Projection, read_layers
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Window
 
 _POINT = {band.name: index for index, band in enumerate(POINTS)}
+# Bounds that need all points of a cell at once.
+LISTED = {"median": MEDIAN, "nearest": NEAREST, "agreeing": AGREEING}
+# Pixels around a point whose median tells outliers.
+_NEAR = 2
 # Side of a window of points in pixels: some tens of megabytes.
 WINDOW = 512
 
@@ -85,22 +104,53 @@ def read_points(path: Path, window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 class PointCloud:
-    """The points of one run, read by windows, and the map extent of each window."""
+    """The points of one run that contribute, read by windows, and the map extent of each window.
 
-    def __init__(self, run: Run, projection: Projection) -> None:
+    Attributes
+    ----------
+    points
+        Number of points that contribute.
+    outliers, open
+        Numbers of points left out: outliers, and others whose interval is open at an end of the search range.
+    """
+
+    def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices | None = None) -> None:
         self.run = run
         self._path = run.out / "points.tif"
         self._projection = projection
+        self._choices = choices or SurfaceChoices().for_runs([run])
         self._extents: list[tuple[Window, Extent]] = []
-        self.points = 0
+        self.points = self.outliers = self.open = 0
         for tile in Grid(Window(0, 0, *run.shape), WINDOW):
             self._scan(tile.core)
 
+    def _kept(self, window: Window) -> tuple[np.ndarray, np.ndarray, int, int]:
+        """Return the bands of a window, the mask of the points that contribute, and the numbers left out."""
+        bands, known = read_points(self._path, window)
+        outlying = open_ended = np.zeros(known.shape, np.bool_)
+        if self._choices.outliers is not None:
+            outlying = known & self._outlying(window, self._choices.outliers)
+        if not self._choices.keeps_open:
+            validity = self.run.read_bands(window).validity.astype(np.int64)
+            open_ended = known & ~outlying & (validity & (OPEN_BELOW | OPEN_ABOVE) != 0)
+        return bands, known & ~outlying & ~open_ended, int(outlying.sum()), int(open_ended.sum())
+
+    def _outlying(self, window: Window, limit: float) -> np.ndarray:
+        """Return the mask of points farther than a limit (metres) from the median of the points near them."""
+        around = window.grown(_NEAR, _NEAR).clipped(Window(0, 0, *self.run.shape))
+        bands, known = read_points(self._path, around)
+        height = np.where(known, bands[_POINT["height"]], 0)
+        base = np.median(height[known]) if known.any() else 0  # float32 then keeps millimetres
+        away = np.abs(height - base - median((height - base).astype(np.float32), known, 2 * _NEAR + 1))
+        return np.asarray((away > limit)[window.relative_to(around).slices])
+
     def _scan(self, window: Window) -> None:
         """Count the points of a window and find their extent."""
-        bands, known = read_points(self._path, window)
+        bands, known, outliers, open_ended = self._kept(window)
         longitude, latitude = bands[_POINT["longitude"]], bands[_POINT["latitude"]]
         self.points += int(known.sum())
+        self.outliers += outliers
+        self.open += open_ended
         if known.any():
             longitude, latitude = longitude[known], latitude[known]
             if np.isnan(self._projection.undulation(longitude, latitude)).any():
@@ -124,18 +174,25 @@ class PointCloud:
         left, bottom, right, top = zip(*(extent for _, extent in self._extents), strict=True)
         return Extent(min(left), min(bottom), max(right), max(top))
 
+    def points_per_cell(self, resolution: float) -> float:
+        """Return the mean number of points in a cell with points, by its side in metres."""
+        areas = ((e.right - e.left) * (e.top - e.bottom) for _, e in self._extents)
+        return max(self.points * resolution**2 / max(sum(areas), resolution**2), 1e-9)
+
     def splat(self, cells: Cells, window: Window, radius: float, ended: threading.Event) -> np.ndarray:
         """Accumulate the points in a window of the cells, see `kernels.splat`; ``radius`` in metres.
 
-        Stops early once ``ended`` is set.
+        Of bounds in LISTED, the layers LEAST and MOST get the bounds of each cell. Stops early once ``ended`` is set.
         """
         gathered = empty_cells(window.height, window.width)
-        place = cells.extent(window)
+        how = LISTED.get(str(self._choices.bounds))
+        near = []
+        place, reach = cells.extent(window), radius / cells.resolution
         for source, extent in self._extents:
             if ended.is_set():
                 break
             if extent.grown(radius).intersects(place):
-                bands, known = read_points(self._path, source)
+                bands, known, _, _ = self._kept(source)
                 longitude, latitude, height, lower, upper = (
                     bands[_POINT[name]][known]
                     for name in ("longitude", "latitude", "height", "height_lower", "height_upper")
@@ -143,9 +200,31 @@ class PointCloud:
                 confidence = self.run.read_bands(source).confidence
                 x, y = self._projection.place(longitude, latitude)
                 down = self._projection.undulation(longitude, latitude)
-                splat(
+                points = (
                     (x - place.left) / cells.resolution, (place.top - y) / cells.resolution,
-                    height - down, lower - down, upper - down, confidence[known].astype(np.float64),
-                    radius / cells.resolution, gathered,
+                    height - down, lower - down, upper - down,
                 )  # fmt: skip
+                splat(*points, confidence[known].astype(np.float64), reach, gathered)
+                if how is not None:
+                    near.append(_within(points, window, max(reach, 0.5)))
+        if how is not None and near:
+            _set_bounds(gathered, np.concatenate(near, axis=1), reach, how)
         return gathered
+
+
+def _within(points: tuple[np.ndarray, ...], window: Window, reach: float) -> np.ndarray:
+    """Return column, row, height and both bounds of the points with bounds within reach of a window: ``(5, n)``."""
+    column, row, _, lower, upper = points
+    inside = (-reach <= column) & (column <= window.width + reach) & (-reach <= row) & (row <= window.height + reach)
+    return np.stack([values[inside & np.isfinite(lower) & np.isfinite(upper)] for values in points])
+
+
+def _set_bounds(gathered: np.ndarray, points: np.ndarray, reach: float, how: int) -> None:
+    """Replace the layers LEAST and MOST by bounds from all points of each cell."""
+    column, row, height, lower, upper = points
+    shape = gathered.shape[1:]
+    starts, of_cells = reaching(column, row, reach, *shape)
+    with np.errstate(invalid="ignore"):
+        middle = (gathered[HEIGHT] / gathered[WEIGHT]).ravel()
+    bounds = cell_bounds(starts, of_cells, height, lower, upper, middle, how).reshape(2, *shape)
+    gathered[[LEAST, MOST]] = np.where(gathered[BOUNDED] > 0, bounds, gathered[[LEAST, MOST]])

@@ -1,4 +1,4 @@
-"""Accumulation of ground points in the cells of a grid.
+"""Accumulation of ground points in the cells of a grid, and bounds of a cell from those of all its points.
 
 Letters: n point; i, j row and column of a cell; u, v column and row of a point, in cells from the first cell's centre.
 """
@@ -60,3 +60,88 @@ def splat(column, row, height, lower, upper, confidence, radius, cells):
                 cells[UPPER, i, j] += weight * upper[n]
                 cells[LEAST, i, j] = min(cells[LEAST, i, j], lower[n])
                 cells[MOST, i, j] = max(cells[MOST, i, j], upper[n])
+
+
+# What `cell_bounds` takes.
+MEDIAN, NEAREST, AGREEING = range(3)
+
+
+@cached
+def reaching(column, row, radius, rows, columns):
+    """Return which points reach each cell, by the rule of `splat`.
+
+    Parameters
+    ----------
+    column, row, radius
+        As in `splat`.
+    rows, columns
+        Size of the grid.
+
+    Returns
+    -------
+    ``starts (rows * columns + 1,)`` and ``points``: those of cell ``i * columns + j`` are ``points[starts[cell] :
+    starts[cell + 1]]``, in their order.
+    """
+    starts = np.zeros(rows * columns + 1, np.int64)
+    points = np.empty(0, np.int32)
+    reach = max(radius, 0.5)
+    for filling in range(2):
+        for n in range(column.size):
+            u, v = column[n] - 0.5, row[n] - 0.5
+            for i in range(max(0, int(np.ceil(v - reach))), min(rows, int(np.floor(v + reach)) + 1)):
+                for j in range(max(0, int(np.ceil(u - reach))), min(columns, int(np.floor(u + reach)) + 1)):
+                    if (i - v) ** 2 + (j - u) ** 2 > radius**2 and max(abs(i - v), abs(j - u)) > 0.5:
+                        continue
+                    cell = i * columns + j
+                    if filling:
+                        points[starts[cell]] = n
+                    starts[cell + (not filling)] += 1
+        if filling:  # each start has moved to the next one
+            starts[1:] = starts[:-1].copy()
+            starts[0] = 0
+        else:
+            starts = np.cumsum(starts)
+            points = np.empty(starts[-1], np.int32)
+    return starts, points
+
+
+@cached
+def cell_bounds(starts, points, height, lower, upper, middle, how):
+    """Return bounds of each cell from those of its points, see `reaching`: ``(2, cells)``, NaN without any.
+
+    Parameters
+    ----------
+    height, lower, upper
+        ``(n,)`` of the points, without NaN.
+    middle
+        ``(cells,)``, the height of each cell.
+    how
+        MEDIAN of the bounds; bounds of the point NEAREST to the cell's height, the first of several; AGREEING: the
+        intersection of the largest number of intervals that meet, the lowest of several.
+    """
+    bounds = np.full((2, middle.size), np.nan)
+    for cell in range(middle.size):
+        first, last = starts[cell], starts[cell + 1]
+        if first == last:
+            continue
+        if how == NEAREST:
+            best = points[first]
+            for n in points[first + 1 : last]:
+                if abs(height[n] - middle[cell]) < abs(height[best] - middle[cell]):
+                    best = n
+            bounds[0, cell], bounds[1, cell] = lower[best], upper[best]
+            continue
+        lows, ups = np.sort(lower[points[first:last]]), np.sort(upper[points[first:last]])
+        count = last - first
+        if how == MEDIAN:
+            bounds[0, cell] = (lows[(count - 1) // 2] + lows[count // 2]) / 2
+            bounds[1, cell] = (ups[(count - 1) // 2] + ups[count // 2]) / 2
+            continue
+        most = ended = 0
+        for begun in range(count):
+            while ups[ended] < lows[begun]:
+                ended += 1
+            if begun + 1 - ended > most:
+                most = begun + 1 - ended
+                bounds[0, cell], bounds[1, cell] = lows[begun], ups[ended]
+    return bounds

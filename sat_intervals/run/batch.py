@@ -14,14 +14,13 @@ from typing import Any
 
 from sat_intervals.config import Config, load_config
 from sat_intervals.config.pairs import REPORT, PairOfBatch
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
 from sat_intervals.raster.identity import check_not_replaced
-from sat_intervals.results import open_run
-from sat_intervals.run.inputs import changes_since, with_range_of
-from sat_intervals.run.job import Job, Search, fitted_to_jobs, prepare
+from sat_intervals.run.before import report_before
+from sat_intervals.run.job import Job, Search, prepare
 from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
 from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, find_on, match_jobs, measure_images
 from sat_intervals.run.status import read_report
@@ -135,16 +134,8 @@ def _window(pair: PairOfBatch) -> Window | None:
 
 def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
     """Return counts and seconds of a pair's complete run, None without one; raise if settings or images differ."""
-    folder = out / pair.name
-    if not is_complete(folder):
-        return None
-    run = open_run(folder)
-    config = fitted_to_jobs(with_range_of(run.report, settings))
-    if changes := changes_since(run.report, *_images(pair), config, _window(pair)):
-        raise SatIntervalsError(
-            f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
-        )
-    return {name: run.report[name] for name in ("counts", "seconds", "warnings") if name in run.report}
+    report = report_before(*_images(pair), out / pair.name, settings, _window(pair))
+    return report and {name: report[name] for name in ("counts", "seconds", "warnings") if name in report}
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack, find: Search) -> Job:

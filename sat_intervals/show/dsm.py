@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
-from sat_intervals.raster import is_surface, read_place, read_small_layers
+from sat_intervals.raster import Georeferencing, is_surface, read_place, read_small_layers, read_tags
 from sat_intervals.show.canvas import (
     DPI,
     INK,
@@ -21,13 +21,16 @@ from sat_intervals.show.canvas import (
     page,
     pointed_ends,
     say_empty,
-    widest,
 )
 
 _LONGEST = 5.5  # inches of the longer side of a map
 _STRETCHED = 5.0  # largest ratio of the sides of a map
 _SUN = np.array([-0.5, 0.5, np.sqrt(0.5)])  # direction to the sun (east, north, up): north-west, 45 degrees high
 _FLATTENED = 0.3  # factor on heights before slopes: noise of 0.1 m is steep between cells of 0.5 m
+_NO_DATA = "#a8c4dd"
+# Percentile of half widths at the end of their scale, which is at most so many times their median: a strip of wide
+# intervals then leaves the others their colours.
+_MOST, _TIMES = 98, 12
 _BAND = {band.name: index for index, band in enumerate(SURFACE)}
 
 
@@ -52,7 +55,7 @@ def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
     drawn = fitting(shape, inches, dpi)
     bands = read_small_layers(surface, drawn)
     height = bands[_BAND["height"]].astype(np.float64)
-    widths = bands[_BAND["height_upper"]] - bands[_BAND["height_lower"]]
+    halves = (bands[_BAND["height_upper"]] - bands[_BAND["height_lower"]]) / 2
     agreement = bands[_BAND["agreement"]]
     across, down = (
         size * whole / part for size, whole, part in zip(place.pixel_size, shape[::-1], drawn[::-1], strict=True)
@@ -64,17 +67,44 @@ def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
     if not np.isfinite(agreement).any():
         last = ("Confidence", "0 to 1", bands[_BAND["confidence"]])
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
-    caption = f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}"
+    caption = (
+        f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}, "
+        f"{_figures(height, halves)}\n{_frame(surface, place)}"
+    )
     with page(path, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
         panels = figure.subplots(2, 2).ravel()
-        _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west", ""), "gray", (0, 1))
+        _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west; blue: no data", ""), "gray", (0, 1))
+        panels[0].set_facecolor(_NO_DATA)  # flat ground is grey too
         _draw(panels[1], extent, height, ("Height", "m"), "viridis", limits(height, (0, 1)))
-        name = "Interval width", "m, square-root scale"
-        end = widest(widths)
-        bar = _draw(panels[2], extent, widths, name, "magma", (0, end), 0.5)
+        name = "Half width of the interval", "m, square-root scale"
+        end = _end_of_scale(halves)
+        bar = _draw(panels[2], extent, halves, name, "magma", (0, end), 0.5)
         assert bar
-        add_histogram(bar, widths, end, step=end / 40)
+        add_histogram(bar, halves, end, step=end / 40)
         _draw(panels[3], extent, last[2], last[:2], "cividis", (0, 1))
+
+
+def _figures(height: np.ndarray, halves: np.ndarray) -> str:
+    """Return filled share and median half width for the caption."""
+    filled = f"{100 * np.isfinite(height).mean():.1f} % filled"
+    known = halves[np.isfinite(halves)]
+    return f"{filled}, median +-{np.median(known):.2f} m" if known.size else filled
+
+
+def _frame(surface: Path, place: Georeferencing) -> str:
+    """Return the CRS and what heights refer to."""
+    assert place.crs is not None
+    code = place.crs.to_epsg()
+    return f"{f'EPSG:{code}' if code else place.crs.to_string()[:60]}, heights {read_tags(surface).get('HEIGHTS', '')}"
+
+
+def _end_of_scale(halves: np.ndarray) -> float:
+    """Return the end of the scale of half widths in metres; 1 without any."""
+    known = halves[np.isfinite(halves)]
+    if not known.size:
+        return 1.0
+    middle, most = np.percentile(known, (50, _MOST))
+    return float(min(most, _TIMES * middle)) or 1.0
 
 
 def _relief(height: np.ndarray, across: float, down: float) -> np.ndarray:

@@ -15,11 +15,12 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 
 from sat_intervals import SatIntervalsError
+from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
-from sat_intervals.kernels.splat import COUNT, empty_cells, splat
-from sat_intervals.products import POINTS, SURFACE
-from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, Projection
+from sat_intervals.kernels.splat import AGREEING, COUNT, MEDIAN, NEAREST, cell_bounds, empty_cells, reaching, splat
+from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
+from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, Projection, north_up, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -28,13 +29,13 @@ BAND = {band.name: index for index, band in enumerate(SURFACE)}
 LEFT, TOP = 370_000.0, 4_830_000.0
 
 
-def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run=FINISHED):
+def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run=FINISHED, validity=0):
     """A run whose pixels are points at map places (metres from LEFT, TOP; y upwards), NaN height for none."""
     x, y, height = (np.atleast_2d(np.asarray(values, np.float64)) for values in (x, y, height))
     folder.mkdir(exist_ok=True)
     bands = np.full((4, *height.shape), 1.0, np.float32)
     bands[3] = confidence
-    out = write_run(folder, bands, np.zeros(height.shape, np.uint16))
+    out = write_run(folder, bands, np.broadcast_to(np.uint16(validity), height.shape))
     longitude, latitude = TO_DEGREES.transform(LEFT + x, TOP + y)
     nothing = np.isnan(height)
     layers = dict.fromkeys((band.name for band in POINTS), np.zeros(height.shape)) | {
@@ -116,7 +117,7 @@ def test_make_surface__the_envelope_holds_every_point_and_the_mean_lies_inside(t
     height = random.normal(100, 5, x.shape)
     out = write_points(tmp_path / "a", x, -y, height)
     wide, place, _ = surface_of([out], tmp_path, radius=1.0)
-    narrow, _, _ = surface_of([out], tmp_path, radius=1.0, interval="mean")
+    narrow, _, _ = surface_of([out], tmp_path, radius=1.0, choices=SurfaceChoices(bounds="mean"))
     row, column = cell_of(place, LEFT + x, TOP - y)
     assert (wide[1, row, column].astype(np.float64) <= height - 1).all()
     assert (wide[2, row, column].astype(np.float64) >= height + 2).all()
@@ -167,29 +168,139 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     assert_array_equal(tiled[3], whole[3])
 
 
-@pytest.mark.parametrize("interval", ["envelope", "mean"])
-def test_make_surface__of_a_run_without_intervals_has_heights_alone(tmp_path, interval):
+def with_coverage(out):
+    """Say in the report of a run that it has a coverage."""
+    report = json.loads((out / "run.json").read_text())
+    report["settings"] |= {"interval": {"alpha": None, "coverage": 0.9, "bounds": "subpixel"}}
+    (out / "run.json").write_text(json.dumps(report))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("bounds", "expected"),
+    [("envelope", (0, 40)), ("median", (5, 13)), ("nearest", (9.5, 12.5)), ("agreeing", (9.5, 11))],
+)
+def test_make_surface__bounds_of_a_cell_worked_example(tmp_path, bounds, expected):
+    # Four points at the centre of a cell, of height 10, 11, 11 and 12 (mean 11): 0 to 40, 9.5 to 12.5 (the first of
+    # the two nearest), 9 to 11, 1 to 13.5. Sorted lower bounds 0, 1, 9, 9.5; upper bounds 11, 12.5, 13.5, 40. All four
+    # meet in 9.5 to 11.
+    height = np.array([10.0, 11, 11, 12])
+    lower, upper = height - [0, 9.5, 9, 1], np.array([40, 12.5, 11, 13.5]) - height
+    out = write_points(tmp_path / "a", [0.5] * 4, [-0.5] * 4, height, lower=[lower], upper=[upper])
+    surface, place, _ = surface_of([out], tmp_path, radius=0.6, choices=SurfaceChoices(bounds=bounds))
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(surface[:3, i, j], (11, *expected), atol=1e-4)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_cell_bounds__equal_their_slow_twins(seed):
+    random = np.random.default_rng(seed)
+    count = random.integers(1, 12)
+    height = random.integers(0, 20, count).astype(float)
+    lower, upper = height - random.integers(0, 5, count), height + random.integers(0, 5, count)
+    where = np.full(count, 0.5)
+    starts, points = reaching(where, where, 0.6, 1, 2)
+    assert_array_equal(starts, [0, count, count])
+    middle = np.array([height.mean(), np.nan])
+    of = [cell_bounds(starts, points, height, lower, upper, middle, how) for how in (MEDIAN, NEAREST, AGREEING)]
+    assert all(np.isnan(bounds[:, 1]).all() for bounds in of)
+    assert_allclose(of[0][:, 0], [np.median(lower), np.median(upper)])
+    best = abs(height - height.mean()).argmin()
+    assert_array_equal(of[1][:, 0], [lower[best], upper[best]])
+    meeting = [((lower <= x) & (x <= upper)).sum() for x in np.sort(lower)]
+    x = np.sort(lower)[np.argmax(meeting)]
+    assert_array_equal(of[2][:, 0], [x, upper[(lower <= x) & (x <= upper)].min()])
+
+
+@pytest.mark.parametrize("bounds", BOUNDS[2:])
+def test_make_surface__heights_do_not_depend_on_the_bounds(tmp_path, bounds, monkeypatch):
+    random = np.random.default_rng(1)
+    x, y = random.uniform(0, 9, (2, 20, 20))
+    out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
+    wide, _, _ = surface_of([out], tmp_path)
+    narrow, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds=bounds))
+    assert_array_equal(narrow[0], wide[0])
+    assert (narrow[1:3][[0, 1]] >= wide[[1, 1]])[0][np.isfinite(wide[0])].all()
+    assert (narrow[1] <= narrow[0])[np.isfinite(wide[0])].all()
+    assert (narrow[2] <= wide[2])[np.isfinite(wide[0])].all()
+    monkeypatch.setattr("sat_intervals.heights.dsm._LISTED_POINTS", 100)  # small tiles
+    tiled, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds=bounds))
+    assert_allclose(tiled, narrow, atol=1e-4)
+
+
+def test_make_surface__a_coverage_means_medians_without_open_points(tmp_path):
+    validity = [[0, 0, OPEN_ABOVE]]
+    out = write_points(tmp_path / "a", [0.5] * 3, [-0.5] * 3, [10.0, 14.0, 30.0], validity=validity)
+    before, place, report = surface_of([out], tmp_path, radius=0.6)
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(before[:4, i, j], [18, 9, 32, 3])
+    assert (report["bounds"], report["open"]) == ("envelope", 0)
+    surface, _, report = surface_of([with_coverage(out)], tmp_path, radius=0.6)
+    assert_allclose(surface[:4, i, j], [12, 11, 14, 2])
+    assert (report["bounds"], report["open"], report["median_half_width"]) == ("median", 1, 1.505)
+
+
+def test_make_surface__outliers_are_left_out_and_counted(tmp_path):
+    x, y = np.meshgrid(np.arange(9) + 0.5, np.arange(9) + 0.5)
+    height = 10 + x
+    height[4, 4] = 60
+    out = write_points(tmp_path / "a", x, -y, height)
+    surface, place, report = surface_of([out], tmp_path, radius=0.6, choices=SurfaceChoices(outliers=20))
+    assert (report["outliers"], report["points"]) == (1, 80)
+    i, j = cell_of(place, LEFT, TOP)
+    assert np.isnan(surface[0, i + 4, j + 4])
+    assert_allclose(surface[0, i + 4, j + 5], 15.5)
+
+
+def test_make_surface__poor_cells_are_no_data(tmp_path):
+    out = write_points(
+        tmp_path / "a", [0.5, 5.5, 9.5], [-0.5] * 3, [10.0] * 3, upper=[[2, 9, 2]], confidence=[[0.9, 0.9, 0.2]]
+    )
+    choices = SurfaceChoices(max_width=5, min_confidence=0.5)
+    surface, place, report = surface_of([out], tmp_path, radius=0.6, choices=choices)
+    i, j = cell_of(place, LEFT, TOP)
+    assert_array_equal(np.isfinite(surface[0, i, [j, j + 5, j + 9]]), [True, False, False])
+    assert report["poor_cells"] == 2
+    assert np.isfinite(surface[3]).sum() == 1
+
+
+def test_make_surface__takes_the_grid_of_a_raster(tmp_path):
+    out = write_points(tmp_path / "a", [0.5, 4.5], [-0.5, -0.5], [10.0, 20.0])
+    like = tmp_path / "like.tif"
+    write_layer(like, np.zeros((5, 7), np.float32), 0, north_up(32631, x=LEFT - 0.3, y=TOP + 1.3, pixel=2.0))
+    surface, place, report = surface_of([out], tmp_path, resolution=like, crs=None)
+    assert (place.c, place.f, place.a, surface.shape[1:]) == (LEFT - 0.3, TOP + 1.3, 2, (5, 7))
+    assert report["crs"] == "EPSG:32631"
+    assert_allclose(surface[0, 0, [0, 2]], [10, 20])
+    write_layer(like, np.zeros((5, 7), np.float32), 0, north_up(32631, x=LEFT + 900, y=TOP, pixel=2.0))
+    with pytest.raises(SatIntervalsError, match="no point reaches the grid"):
+        surface_of([out], tmp_path, resolution=like, crs=None)
+
+
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_make_surface__of_a_run_without_intervals_has_heights_alone(tmp_path, bounds):
     plain = write_points(tmp_path / "a", [0.5, 4.5], [-0.5, -0.5], [10.0, 20.0], lower=np.nan, upper=np.nan)
     report = json.loads((plain / "run.json").read_text())
     report["settings"] |= {"interval": None, "regularization": None}
     (plain / "run.json").write_text(json.dumps(report))
-    surface, place, report = surface_of([plain], tmp_path, radius=0.6, interval=interval)
+    surface, place, report = surface_of([plain], tmp_path, radius=0.6, choices=SurfaceChoices(bounds=bounds))
     i, j = cell_of(place, LEFT, TOP)
     assert_allclose(surface[0, i, [j, j + 4]], [10, 20])
     assert np.isnan(surface[1:3]).all()
     assert report["without_intervals"] == [str(plain)]
     other = write_points(tmp_path / "b", [0.5], [-0.5], [11.0])
-    surface, place, _ = surface_of([plain, other], tmp_path, radius=0.6, interval=interval)
+    surface, place, _ = surface_of([plain, other], tmp_path, radius=0.6, choices=SurfaceChoices(bounds=bounds))
     assert_allclose(surface[:4, i, j], [10.5, 10, 13, 2])
     assert np.isnan(surface[1:3, i, j + 4]).all()
     assert np.isnan(surface[BAND["agreement"]]).all()
 
 
-@pytest.mark.parametrize("interval", ["envelope", "mean"])
-def test_make_surface__a_point_without_bounds_counts_for_the_height_alone(tmp_path, interval):
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_make_surface__a_point_without_bounds_counts_for_the_height_alone(tmp_path, bounds):
     lower = np.array([[1.0, np.nan]])
     out = write_points(tmp_path / "a", [0.5, 0.5], [-0.5, -0.5], [10.0, 10.0], lower=lower, upper=2 * lower)
-    surface, place, _ = surface_of([out], tmp_path, radius=0.6, interval=interval)
+    surface, place, _ = surface_of([out], tmp_path, radius=0.6, choices=SurfaceChoices(bounds=bounds))
     i, j = cell_of(place, LEFT, TOP)
     assert_allclose(surface[:4, i, j], [10, 9, 12, 2])
 
@@ -315,6 +426,9 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([empty], [], "no valid pixel"),
         (far, [], "choose a coarser --resolution, or runs of one place"),
         ([far[0]], ["--resolution", "-1"], "resolution is -1 m: give one above 0, up to 10000"),
+        ([far[0]], ["--grid-like", "x.tif"], "give either --resolution or --grid-like"),
+        ([far[0]], ["--max-width", "-2"], "max_width is -2 m: give one above 0, or leave it out"),
+        ([far[0]], ["--min-confidence", "3"], "min_confidence is 3: give one from 0 to 1"),
         ([far[0]], ["--radius", "1e9"], "radius is 1e+09 m: give one above 0"),
         ([far[0], far[0]], [], "is given 2 times: give each run once"),
         (

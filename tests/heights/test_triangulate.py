@@ -360,3 +360,32 @@ def test_triangulate_command__needs_a_run(tmp_path):
     result = invoke("triangulate", tmp_path, *given(files))
     assert result.exit_code == 2
     assert "give the folder of a finished run" in result.output
+
+
+def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, monkeypatch):
+    scene = make_scene(120, 150, seed=4)
+    write_pair(tmp_path, scene)
+    files = cameras(tmp_path, *scene.truth.shape)
+    options = ["--left-model", "--right-model", "--left-grid", "--right-grid"]
+    sensors = [str(word) for pair in zip(options, files, strict=True) for word in pair]
+    images = [str(tmp_path / name) for name in ("left.tif", "right.tif")]
+    search = ["--disparity", str(scene.minimum), str(scene.maximum)]
+    out, steps = tmp_path / "one", tmp_path / "steps"
+    command = ["surface", *images, str(out), *sensors, *search, "--resolution", "1"]
+    wrong = invoke(*command[:-1], "-1")
+    assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
+    monkeypatch.setattr("sat_intervals.heights.dsm.PointCloud", None)  # an error of the last step
+    assert invoke(*command).exit_code == 1
+    monkeypatch.undo()
+    before = (out / "run.json").read_bytes()
+    result = invoke(*command)
+    assert result.exit_code == 0, result.stderr
+    assert (out / "run.json").read_bytes() == before
+    assert "% with a height" in result.stdout
+    assert "median half width +-" in result.stdout
+    assert invoke("match", *images, str(steps), *search, "--quiet").exit_code == 0
+    assert invoke("triangulate", str(steps), *sensors, "--quiet").exit_code == 0
+    assert invoke("dsm", str(steps), "--resolution", "1", "--quiet").exit_code == 0
+    assert np.array_equal(read(out / "dsm.tif"), read(steps / "dsm.tif"), equal_nan=True)
+    other = invoke(*command, "--preset", "satellite")
+    assert (other.exit_code, "already holds another run" in other.stderr) == (2, True)

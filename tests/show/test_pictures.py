@@ -300,7 +300,7 @@ def test_plot__draws_the_surface_of_a_run(tmp_path, words, shape, agreement, las
     write_surface(out, height, agreement)
     done = invoke("plot", out, "--dpi", "40")
     assert done.output.split() == [str(out / "overview.png"), str(out / "dsm.png")]
-    titles = ["Hillshade, sun in the north-west", "Height", "Interval width", last]
+    titles = ["Hillshade, sun in the north-west; blue: no data", "Height", "Half width of the interval", last]
     assert [word for word in words if word in titles][-4:] == titles
     assert len(np.unique(pixels_of(out / "dsm.png").reshape(-1, 3), axis=0)) > 20
 

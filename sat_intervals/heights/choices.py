@@ -1,0 +1,65 @@
+"""How the interval of a cell is made from its points, and which points and cells are left out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.results import Run
+
+Bounds = Literal["envelope", "mean", "median", "nearest", "agreeing"]
+BOUNDS = "envelope", "mean", "median", "nearest", "agreeing"
+
+
+@dataclass(frozen=True)
+class SurfaceChoices:
+    """What `make_surface` does with points and cells.
+
+    Attributes
+    ----------
+    bounds
+        Interval of a cell: ``envelope`` contains those of all its points; ``mean`` is the weighted mean of their
+        bounds, ``median`` the median; ``nearest`` is that of the point nearest to the cell's height; ``agreeing`` is
+        the intersection of the largest number of intervals that meet. The last three are widened to the cell's height.
+        None means ``median`` for runs with a coverage, else ``envelope``.
+    keeps_open
+        Whether points whose interval is open at an end of the search range contribute. None: not with a coverage.
+    outliers
+        Leave out points more than so many metres from the median of the points within 2 pixels; None: none.
+    max_width
+        Leave out cells with a wider interval (metres).
+    min_confidence
+        Leave out cells of lower confidence, 0 to 1.
+    """
+
+    bounds: Bounds | None = None
+    keeps_open: bool | None = None
+    outliers: float | None = None
+    max_width: float | None = None
+    min_confidence: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.bounds is not None and self.bounds not in BOUNDS:
+            raise SatIntervalsError(f"bounds is {self.bounds!r}, allowed: {', '.join(BOUNDS)}")
+        for name, value in (("outliers", self.outliers), ("max_width", self.max_width)):
+            if value is not None and not 0 < value < float("inf"):
+                raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, or leave it out")
+        if self.min_confidence is not None and not 0 <= self.min_confidence <= 1:
+            raise SatIntervalsError(f"min_confidence is {self.min_confidence:g}: give one from 0 to 1")
+
+    def for_runs(self, runs: Sequence[Run]) -> "SurfaceChoices":
+        """Return the choices with the defaults of these runs, which depend on whether all have a coverage."""
+        intervals = [run.config.interval for run in runs]
+        covered = all(interval is not None and interval.coverage is not None for interval in intervals)
+        return replace(
+            self,
+            bounds=self.bounds or ("median" if covered else "envelope"),
+            keeps_open=not covered if self.keeps_open is None else self.keeps_open,
+        )
+
+    def tags(self) -> dict[str, str]:
+        """Return tags of the surface: its bounds, and what was left out."""
+        limits = {"OUTLIERS": (self.outliers, " m"), "MAX_WIDTH": (self.max_width, " m")}
+        limits |= {"MIN_CONFIDENCE": (self.min_confidence, "")}
+        tags = {name: f"{value:g}{unit}" for name, (value, unit) in limits.items() if value is not None}
+        return {"INTERVAL": str(self.bounds), **tags, **({} if self.keeps_open else {"OPEN_POINTS": "left out"})}
