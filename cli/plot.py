@@ -49,10 +49,10 @@ def plot(
     OUT/overview.png   always: left image, disparity, width, confidence, validity
     OUT/errors.png     with a truth and intervals: pixels whose interval misses it
     OUT/coverage.png   likewise: nominal and measured coverage, width
-    OUT/range.png      if the search range was found, or is local: matches, ranges of cells
+    OUT/range.png      for a found or local search range: matches, cells
     OUT/profile.png    with --row: interval, disparity and truth along a row
     OUT/curve.png      with --pixel: cost curve of a pixel and its interval
-    OUT/dsm.png        if dsm.tif exists: hillshade, height, half width, confidence
+    OUT/dsm.png        if dsm.tif exists: hillshade, height, width, confidence
 
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.

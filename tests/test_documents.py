@@ -152,7 +152,7 @@ def in_documents(line: str) -> str:
     """Return a command of a document for the files of `place`; a run replaces that of the command before."""
     line = re.sub(r"(left|right)\.geom", r"\1_model.tif", line)
     line = line.replace("--row 640", "--row 64").replace("--disparity -60 0", "--disparity -12 40")
-    return f"{line} --overwrite" if re.match(r"sat-intervals (match .*(?<!--dry-run)$|batch)", line) else line
+    return f"{line} --overwrite" if re.match(r"sat-intervals (match .*(?<!--dry-run)$|surface|batch)", line) else line
 
 
 @pytest.mark.process

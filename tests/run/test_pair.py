@@ -76,7 +76,8 @@ def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_pa
     if "coverage" in interval:
         chosen = report["settings"]["interval"]["calibration"]
         assert report["calibration"] == {
-            "name": "flat", "sha256": load_calibration(chosen).sha256, "high": 30.5, "low": 9.25, "quantile": 0.8
+            "name": "flat", "sha256": load_calibration(chosen).sha256, "coverage": 0.8,
+            "high": 30.5, "low": 9.25, "quantile": 0.8, "reached": True,
         }  # fmt: skip
         assert tags["CALIBRATION"] == f"flat {report['calibration']['sha256']}"
         assert tags["COVERAGE"].startswith("0.8 (")
