@@ -207,8 +207,10 @@ def _with_deviation(blocks: Blocks, place: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _mean_of_blocks(blocks: Blocks, values: np.ndarray) -> tuple[float, float]:
-    """Return the mean over points and its standard error, from what differs between blocks."""
+    """Return the mean over points and its standard error, from what differs between blocks; NaN without points."""
     known = np.isfinite(values)
+    if not known.any():
+        return np.nan, np.inf
     sums, counts = (np.bincount(blocks.block[known], weights, len(blocks.surface)) for weights in (values[known], None))
     sums, counts = sums[counts > 0], counts[counts > 0]
     mean = float(sums.sum() / counts.sum())

@@ -269,7 +269,7 @@ def test_evaluate_surface__refuses_a_reference_above_a_geoid(tmp_path):
     with pytest.raises(SatIntervalsError, match=r"reference.tif has heights of EGM96 height, .* with --geoid"):
         evaluate_surface(surface, reference)
     above_geoid = dsm(tmp_path / "geoid.tif", "above egm96.gtx")
-    assert evaluate_surface(above_geoid, reference)["all"]["accuracy"] == 1
+    assert evaluate_surface(above_geoid, reference)["all"]["coverage"] == 1
 
 
 def test_evaluate_surface__refuses_a_reference_of_a_local_crs(tmp_path):
