@@ -26,6 +26,7 @@ _SETTINGS = """\
 # Settings with their calibration, found by sat-intervals calibrate --tune.
 # Use them with: sat-intervals match LEFT RIGHT OUT --disparity MIN MAX --config FILE
 """
+_HEADS = _CALIBRATION, _SETTINGS
 
 
 @click.command(short_help="Find the levels that reach a coverage, on pairs with known truth.")
@@ -86,7 +87,8 @@ def calibrate(
     settings = _Settings(config_file, given, tolerance, remove_bias, by_group)
     subjects = _subjects(pairs, truth, settings)
     inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
-    check_not_replaced([*inputs, config_file], [output])
+    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
+    check_not_replaced([*inputs, *described, *truth, config_file], [output])
     folder = _checked_folder(output)
     check_subjects(subjects)
     with Console(quiet or as_json) as console:
@@ -189,6 +191,8 @@ def _checked_folder(output: Path) -> Path:
     folder = output.absolute().parent
     if output.is_dir() or not os.access(folder, os.W_OK):
         raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")
+    if output.exists() and not output.read_bytes().startswith(tuple(head[:15].encode() for head in _HEADS)):
+        raise SatIntervalsError(f"{output} exists and was not made by sat-intervals calibrate: move it away")
     return folder
 
 

@@ -186,4 +186,5 @@ def means(groups: Iterable[Mapping[str, float]]) -> dict[str, float]:
     for name in found[0] if found else ():
         known = [one[name] for one in found if np.isfinite(one[name])]
         figures[name] = float(np.mean(known)) if known else np.nan
-    return figures | {"lowest": min(one["all"] for one in found)} if found else {}
+    known = [one["all"] for one in found if np.isfinite(one["all"])]
+    return figures | {"lowest": min(known, default=np.nan)} if found else {}

@@ -112,7 +112,8 @@ class Job:
         check_output(self.out, overwrite)
         restore(self.out, RUN_FILES)
         self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
-        self.store.steps.check_space(handed_bytes(self.store.grid, self.config))
+        if self.waiting():
+            self.store.steps.check_space(handed_bytes(self.store.grid, self.config))
         if self.found or self.local:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
             self.store.write_search(search, _origin(self.inputs))

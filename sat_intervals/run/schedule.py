@@ -19,8 +19,8 @@ from sat_intervals.tiling import Grid, Tile
 
 # Blocks along each side of the grid, at least, if there are as many tiles: for several workers.
 _BLOCKS = 4
-# Blocks, at most, whose order `time_of` follows step by step, in a second; workers hardly wait for each other in more.
-_SIMULATED = 1000
+# Blocks, at most, whose order `time_of` follows step by step, in about a second.
+_SIMULATED = 2000
 
 
 def blocks_of(grid: Grid, config: Config) -> Grid:

@@ -5,6 +5,7 @@ overview is made of two rows of the level below it, so the parts form a binary t
 """
 
 import os
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.match import postprocess
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, RUN_FILES, Copy, Part, codec_versions, compressed, factors, run_files
@@ -30,6 +32,8 @@ STRIP_PIXELS = 1 << 19
 _COMPRESSED = 12
 # Pixels for the next level, not compressed: every second row and column of all files.
 _HALF = "half"
+# What finishes rows decides their bytes, too.
+_CODE = zlib.crc32(Path(postprocess.__file__).read_bytes())
 # Increase when parts change.
 _LAYOUT = 1
 
@@ -41,7 +45,7 @@ def parts_of(job: Job, codecs: Mapping[str, Any] | None = None) -> Parts:
 
 
 def _codecs(job: Job) -> dict[str, Any]:
-    return codec_versions(job.config.products.compression)
+    return codec_versions(job.config.products.compression) | {"code": _CODE}
 
 
 def strip_bytes(width: int) -> int:
@@ -270,7 +274,8 @@ def copy_part(job: Job, codecs: Mapping[str, Any], place: Place, kind: str, path
             content = parts.read(place, kind, record or {"files": {kind: ()}})
         except DamagedTilesError as error:
             return str(error)
-        with open(path, "r+b") as stream:
+        # not for reading: NFS would write whole pages, over bytes of the neighbours
+        with open(os.open(path, os.O_WRONLY), "wb") as stream:
             stream.seek(offset)
             stream.write(content)
             stream.flush()

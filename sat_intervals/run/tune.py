@@ -58,9 +58,17 @@ def candidates(own: Config, *, with_network: bool) -> Iterator[tuple[str, dict[s
     ``own`` settings, None, are the first if they are none of these.
     """
     changes = dict(_ladder(with_network=with_network))
-    if key_of(own) not in [key_of(_changed(own, one)) for one in changes.values()]:
+    if not any(_is_same(own, one) for one in changes.values()):
         yield "own settings", None
     yield from changes.items()
+
+
+def _is_same(own: Config, changes: Mapping[str, Any]) -> bool:
+    """Return whether changes leave the key of settings as it is; no, if the settings do not allow them."""
+    try:
+        return key_of(_changed(own, changes)) == key_of(own)
+    except SatIntervalsError:
+        return False
 
 
 def _ladder(*, with_network: bool) -> Iterator[tuple[str, dict[str, Any]]]:

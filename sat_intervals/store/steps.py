@@ -78,7 +78,7 @@ class Steps:
         if free is not None and free < needed:
             raise StoreError(
                 f"{self.folder} has {free / 1e6:,.1f} MB free, path states and matching costs need {needed / 1e6:,.1f} "
-                "MB: free disk space, choose another --store, or give --overlap 100"
+                "MB: free disk space and rerun; or, with --overwrite, choose another --store or --overlap 100"
             )
 
 

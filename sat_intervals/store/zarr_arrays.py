@@ -4,7 +4,7 @@ import asyncio
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -323,6 +323,11 @@ class _CheckedStore(WrapperStore[Store]):
         if isinstance(byte_range, OffsetByteRequest):
             return whole[byte_range.offset :]
         return whole if byte_range is None else whole[-byte_range.suffix :]
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        return [await self.get(key, prototype, part) for key, part in key_ranges]
 
     def _stamp(self, key: str) -> tuple[int, ...]:
         """Return inode, size and times of a local file, which change with it; empty for a remote one."""

@@ -87,7 +87,7 @@ def test_match_pair__of_blocks_of_exact_tiles_equals_the_whole(folder, tmp_path,
 
 def test_match_pair__resumes_inside_a_block(folder, whole, tmp_path, monkeypatch):
     def write_record(store, tile, record):
-        if tile.name == "1_0":
+        if tile.name == "0_1":  # the last of its block
             raise RunError("killed inside a block")
         return original(store, tile, record)
 
@@ -97,6 +97,9 @@ def test_match_pair__resumes_inside_a_block(folder, whole, tmp_path, monkeypatch
         patch.setattr(Store, "write_record", write_record)
         with pytest.raises(RunError, match=r"tiles failed(.|\n)*tile 1_1: killed inside a block"):
             match(folder, tmp_path / "out", 64, {"cluster": {"retries": 0}})
+    done = {path.stem for path in (tmp_path / "out/tiles/records").iterdir()}
+    assert "1_0" in done
+    assert "0_1" not in done
     match(folder, tmp_path / "out", 64, {"cluster": {"retries": 0}})
     assert hashes(tmp_path / "out") == hashes(whole)
 

@@ -134,6 +134,10 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     assert "options of match" in one_line(invoke("calibrate", scene, *output, "--coverage", 0.9))
     assert "existing folder" in one_line(invoke("calibrate", scene, "--output", tmp_path / "no" / "new.yaml"))
     assert "truth.tif" in one_line(invoke("calibrate", scene, "--output", scene / "truth.tif"))
+    assert "is an input" in one_line(invoke("calibrate", scene, "--output", scene / "meta.json"))
+    (tmp_path / "other.yaml").write_text("tiles: {size: 512}\n")
+    assert "was not made by" in one_line(invoke("calibrate", scene, "--output", tmp_path / "other.yaml"))
+    assert (tmp_path / "other.yaml").read_text() == "tiles: {size: 512}\n"
     assert not (tmp_path / "new.yaml").exists()
 
 

@@ -150,3 +150,5 @@ def test_time_of__is_that_of_all_steps_for_one_worker_and_of_the_longest_chain_f
     assert time_of(GRID, 1000, 1.0, 4.0) >= 7 + 4
     assert time_of(GRID, 1, 1.0, 4.0) > time_of(GRID, 4, 1.0, 4.0) > time_of(GRID, 1, 1.0, 4.0) / 4
     assert time_of(GRID, 4, 0.0, 4.0) == 20
+    many = Grid(Window(0, 0, 40 * 64, 40 * 64), 64)
+    assert time_of(many, 64, 0.085, 0.45) > 1.05 * time_of(many, 1, 0.085, 0.45) / 64
