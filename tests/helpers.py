@@ -27,7 +27,7 @@ from sat_intervals.tiling import Window
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
 PLACE = north_up(32631, 300_000, 4_800_000, 0.5)
-PATIENCE = 60.0
+PATIENCE = 150.0
 
 
 def write_pair(folder: Path, scene: Scene, *, group: str = "all", **sections: Any) -> dict[str, Any]:
