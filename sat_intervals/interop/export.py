@@ -1,7 +1,8 @@
 """Export a run to the file formats of other photogrammetry tools.
 
 All of them define disparity as ``x_right - x_left`` of the epipolar pair, as here, and none uses a CRS. The files have
-the size of the left image; pixels outside the matched region are invalid.
+the size of the left image; pixels outside the matched region are invalid. Those for OTB keep the transform of the left
+image, which is the place of its pixels in OTB's grids.
 """
 
 from collections.abc import Callable
@@ -113,7 +114,8 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
     for file in files:
         check_marked(folder / file.name)
-    with OutputWriter(folder, files, *shape, Georeferencing(), MARK) as writer:
+    place = Georeferencing(transform=run.left_georeferencing.transform if form == "otb" else None)
+    with OutputWriter(folder, files, *shape, place, MARK) as writer:
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))
