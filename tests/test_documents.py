@@ -138,6 +138,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / pair / "meta.json").write_text('{"disparity": [-12, 40]}')
         for side in ("left", "right", "truth"):
             copies.setdefault(side, []).append(f"{pair}/{side}.tif")
+    copies |= {f"{side}_model": [f"raw_{side}.tif"] for side in ("left", "right")}
     for side, names in copies.items():
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

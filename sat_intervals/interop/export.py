@@ -52,13 +52,13 @@ def _cars(prefix: str, config: Config) -> list[Raster]:
 
 
 def _asp(prefix: str, config: Config) -> list[Raster]:
-    """Return the input of ``parallel_stereo --entry-point 5``: horizontal, vertical, 1 = valid."""
+    """Return the input of ``parallel_stereo --entry-point 5``, not run with it: horizontal, vertical, 1 = valid."""
     file = _file(f"{prefix}-F.tif", "horizontal", "vertical", "valid")
     return [(file, lambda pixels: _two(np.nan_to_num(pixels.disparity), pixels.valid))]
 
 
 def _s2p(prefix: str, config: Config) -> list[Raster]:
-    """Return the files of s2p after matching a tile: NaN = no disparity, 1 = valid in the mask."""
+    """Return the files of s2p after matching a tile, not run with it: NaN = no disparity, 1 = valid in the mask."""
     confidence: Raster = (
         _file("rectified_disp_confidence.tif", "confidence", nodata=float("nan")),
         lambda pixels: pixels.confidence,
@@ -78,7 +78,7 @@ def _otb(prefix: str, config: Config) -> list[Raster]:
     ]
 
 
-FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "asp": _asp, "s2p": _s2p, "otb": _otb}
+FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "otb": _otb, "asp": _asp, "s2p": _s2p}
 
 
 def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
