@@ -1,6 +1,5 @@
 """Options and output shared by the commands that evaluate pairs with known truth."""
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import log_options, preset_option
+from sat_intervals.cli import options
+from sat_intervals.cli.options import json_option, log_options, preset_option
 
 if TYPE_CHECKING:
     from sat_intervals.evaluate.paper import SceneMetrics
@@ -23,7 +23,7 @@ def finite(context: click.Context, parameter: click.Parameter, value: float) -> 
 
 def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of commands that evaluate pairs with known truth."""
-    options = [
+    added = [
         click.option(
             "--config", "config_file", type=click.Path(path_type=Path), help="Settings to match pairs with (YAML)."
         ),
@@ -41,11 +41,11 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             metavar="PX",
             help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
         ),
-        click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
+        json_option,
         click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
     ]
-    for option in reversed(options):
+    for option in reversed(added):
         command = option(command)
     return command
 
@@ -65,4 +65,4 @@ def overrides(
 def say_json(scenes: "list[SceneMetrics]") -> None:
     """Print reports of scenes as JSON: the report of one scene, or reports by name of several."""
     reports = {scene.name: scene.report for scene in scenes}
-    click.echo(json.dumps(scenes[0].report if len(scenes) == 1 else reports, indent=1))
+    options.say_json(scenes[0].report if len(scenes) == 1 else reports)
