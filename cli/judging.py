@@ -2,15 +2,18 @@
 
 import json
 import math
-from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import log_options, preset_option
+from sat_intervals.cli.options import Command, log_options, preset_option, with_options
 
 if TYPE_CHECKING:
+    from sat_intervals.config import Config
+    from sat_intervals.config.pairs import Pair
     from sat_intervals.evaluate.paper import SceneMetrics
 
 
@@ -21,9 +24,59 @@ def finite(context: click.Context, parameter: click.Parameter, value: float) -> 
     return value
 
 
-def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of commands that evaluate pairs with known truth."""
-    options = [
+tolerance_option = click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    callback=finite,
+    metavar="PX",
+    help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
+)
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How pairs with known truth are matched, compared with it and printed."""
+
+    config_file: Path | None
+    preset: str | None
+    accurate: bool
+    tolerance: float
+    as_json: bool
+    quiet: bool
+
+    def load(self, pair: "Pair", cost: str | None, **sections: Any) -> "Config":
+        """Load the settings to match a pair with."""
+        from sat_intervals.config import load_config
+
+        sections["disparity"] = {"minimum": pair.minimum, "maximum": pair.maximum}
+        if self.preset is not None:
+            sections["preset"] = self.preset
+        if cost is not None:
+            sections["cost"] = {"method": cost}
+        if self.accurate:
+            sections["cross_check"] = {"method": "accurate"}
+        return load_config(self.config_file, sections)
+
+
+def judging_options(command: Command) -> Command:
+    """Add the options of commands that evaluate pairs with known truth; the command gets ``judging``, a `Judging`."""
+
+    @wraps(command)
+    def with_judging(
+        *,
+        config_file: Path | None,
+        preset: str | None,
+        accurate: bool,
+        tolerance: float,
+        as_json: bool,
+        quiet: bool,
+        **others: Any,
+    ) -> Any:
+        return command(judging=Judging(config_file, preset, accurate, tolerance, as_json, quiet), **others)
+
+    return with_options(
+        with_judging,
         click.option(
             "--config", "config_file", type=click.Path(path_type=Path), help="Settings to match pairs with (YAML)."
         ),
@@ -33,33 +86,11 @@ def judging_options(command: Callable[..., Any]) -> Callable[..., Any]:
             is_flag=True,
             help="Cross-check against a right view that is matched on its own, as in the paper's implementation.",
         ),
-        click.option(
-            "--tolerance",
-            type=click.FloatRange(min=0),
-            default=0.0,
-            callback=finite,
-            metavar="PX",
-            help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
-        ),
+        tolerance_option,
         click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
         click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
-
-
-def overrides(
-    minimum: int, maximum: int, accurate: bool, preset: str | None, cost: str | None = None
-) -> dict[str, Any]:
-    """Return the settings of a pair and of the command line as sections."""
-    sections: dict[str, Any] = {"disparity": {"minimum": minimum, "maximum": maximum}}
-    if preset is not None:
-        sections["preset"] = preset
-    if cost is not None:
-        sections["cost"] = {"method": cost}
-    return sections | ({"cross_check": {"method": "accurate"}} if accurate else {})
+    )
 
 
 def say_json(scenes: "list[SceneMetrics]") -> None:
