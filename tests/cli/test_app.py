@@ -15,7 +15,7 @@ from sat_intervals.demo import make_scene
 # Commands that print figures.
 WITH_JSON = (
     "ablate", "batch", "calibrate", "demo", "dsm", "evaluate", "match", "plan", "range", "reference", "status",
-    "triangulate",
+    "surface", "triangulate",
 )  # fmt: skip
 
 
