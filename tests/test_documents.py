@@ -213,3 +213,5 @@ def test_site__has_a_page_for_every_document_and_every_setting() -> None:
         site.adapted("[a](../METHOD.md#1) [b](docs/x.md) [c](../README.md)")
         == "[a](METHOD.md#1) [b](x.md) [c](index.md)"
     )
+    assert site.adapted("[docs/x.md](docs/x.md#y)") == "[x](x.md#y)"
+    assert site.adapted("![a](.github/pictures/b.png)") == "[![a](pictures/b.png)](pictures/b.png)"
