@@ -153,8 +153,11 @@ def gallery() -> str:
     return "\n".join(lines)
 
 
-# Long commands and results are read without scrolling.
-STYLE = ".md-typeset pre > code { white-space: pre-wrap; }\n"
+# Long commands and wide tables are read without scrolling.
+STYLE = """\
+.md-typeset pre > code { white-space: pre-wrap; }
+.md-typeset table:not([class]) th, .md-typeset table:not([class]) td { min-width: 0; padding: 0.5em 0.6em; }
+"""
 RUN = "import sys; from sat_intervals.cli import main; sys.argv[0] = 'sat-intervals'; main()"
 
 
