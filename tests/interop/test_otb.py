@@ -29,7 +29,7 @@ TURNS, SHIFTS, SIDE = (np.radians(8), np.radians(11)), ((20.0, -30.0), (15.0, -3
 
 def run(words, folder):
     """Run a command of OTB, of rasterio or of this tool; return what it prints."""
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=100)
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
