@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 import rasterio
-from finished import FINISHED, write_run
+from finished import FINISHED, write_file, write_run
 from helpers import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,7 +20,7 @@ from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.splat import AGREEING, COUNT, MEDIAN, NEAREST, cell_bounds, empty_cells, reaching, splat
 from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
-from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, Projection, north_up, write_layer
+from sat_intervals.raster import POINT_FILES, Projection, north_up, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -46,9 +46,7 @@ def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run
         "height_upper": height + upper,
     }
     points = np.stack([np.where(nothing, np.nan, layers[band.name]) for band in POINTS])
-    with OutputWriter(out, POINT_FILES, *height.shape, Georeferencing(), {"RUN": run}) as writer:
-        writer.write(0, points)
-        writer.publish()
+    write_file(out / "points.tif", POINT_FILES[0], points, tags={"RUN": run})
     return out
 
 
