@@ -7,8 +7,7 @@ from rasterio import Env
 
 from sat_intervals.config import load_config
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION, Bands
-from sat_intervals.raster import RUN_FILES, Georeferencing, OutputWriter, gdal, north_up, surface_file, write_layer
-from sat_intervals.raster.cog import BLOCK
+from sat_intervals.raster import RUN_FILES, Georeferencing, gdal, north_up, surface_file, write_layer
 from sat_intervals.run.statistics import Tally
 from sat_intervals.show.legend import PIXEL_CLASSES
 
@@ -39,14 +38,9 @@ def write_run(folder, bands, validity, truth=None, image=None):
 
 
 def write_file(path, file, bands, place=NOWHERE, tags=None):
-    """Write bands as one of our files; a small one without its usual blocks of 512 pixels, which take most time."""
+    """Write bands as one of our files, but as a plain GeoTIFF: blocks of 512 pixels take longer than most tests."""
     bands = bands.reshape(-1, *bands.shape[-2:]).astype(file.dtype)
     count, height, width = bands.shape
-    if max(height, width) > BLOCK:
-        with OutputWriter(path.parent, [file], height, width, place, tags or {}) as writer:
-            writer.write(0, bands)
-            writer.publish()
-        return
     kind = {"count": count, "height": height, "width": width, "dtype": file.dtype, "nodata": file.nodata}
     with Env(), gdal.create(str(path), **kind, **place.creation_options()) as dataset:
         dataset.update_tags(**tags or {})

@@ -214,7 +214,7 @@ def test_cell_bounds__equal_their_slow_twins(seed):
 @pytest.mark.parametrize("bounds", BOUNDS[2:])
 def test_make_surface__heights_do_not_depend_on_the_bounds(tmp_path, bounds, monkeypatch):
     random = np.random.default_rng(1)
-    x, y = random.uniform(0, 9, (2, 20, 20))
+    x, y = random.uniform(0, 6, (2, 14, 14))
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     wide, _, _ = surface_of([out], tmp_path)
     narrow, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds=bounds))
