@@ -128,6 +128,7 @@ def exchange(files):
 DAMAGES = {
     "missing": lambda files: [file.unlink() for file in files],
     "empty": lambda files: [file.write_bytes(b"") for file in files],
+    "short": lambda files: [file.write_bytes(file.read_bytes()[:-1]) for file in files],
     "flipped": flip,
     "exchanged": exchange,
 }
