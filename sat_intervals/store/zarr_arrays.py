@@ -5,9 +5,9 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import zarr
 from numcodecs import blosc
-from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store
+from zarr.abc.store import ByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.codecs import BloscCodec
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import FsspecStore, LocalStore, MemoryStore, StorePath, WrapperStore
@@ -290,7 +290,7 @@ def _compressed(chunk: np.ndarray) -> bytes:
     return bytes(blosc.compress(chunk, b"lz4", 1, blosc.SHUFFLE, 0, chunk.itemsize))
 
 
-def checksum(content: bytes | memoryview) -> list[int]:
+def checksum(content: bytes | bytearray | memoryview) -> list[int]:
     """Return size in bytes and CRC-32 of a file."""
     return [len(content), zlib.crc32(content)]
 
@@ -304,39 +304,36 @@ class _CheckedStore(WrapperStore[Store]):
         self._checked = _CHECKED if isinstance(store, LocalStore) else {}
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        wanted = list(self._checksums.get(key, ()))
-        file = f"{self._store}/{key}", wanted[1] if wanted else -1
-        stamp = self._stamp(key)
-        if self._checked.get(file) == stamp:
-            part = await self._store.get(key, prototype, byte_range)
-            if part is not None and self._stamp(key) == stamp:
-                return part
-        whole = await self._store.get(key, prototype)
-        content = b"" if whole is None else whole.to_bytes()
-        if whole is None or await asyncio.to_thread(checksum, content) != wanted:
+        read = await self._store.get(key, prototype, byte_range)
+        content = b"" if read is None else read.to_bytes()
+        if not await asyncio.to_thread(_is_intact, content, byte_range, self._checksums.get(key, (-1, 0))):
             raise DamagedFileError(key)
-        if len(self._checked) > _MOST_CHECKED:
-            self._checked.clear()
-        self._checked[file] = stamp
-        if isinstance(byte_range, RangeByteRequest):
-            return whole[byte_range.start : byte_range.end]
-        if isinstance(byte_range, OffsetByteRequest):
-            return whole[byte_range.offset :]
-        return whole if byte_range is None else whole[-byte_range.suffix :]
+        return read
 
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
         return [await self.get(key, prototype, part) for key, part in key_ranges]
 
-    def _stamp(self, key: str) -> tuple[int, ...]:
-        """Return inode, size and times of a local file, which change with it; empty for a remote one."""
-        if not isinstance(self._store, LocalStore):
-            return ()
-        with suppress(OSError):
-            status = (self._store.root / key).stat()
-            return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-        return (0,)
+
+def _is_intact(content: bytes, byte_range: ByteRequest | None, checksums: Sequence[int]) -> bool:
+    """Return whether a file, or a range of whole pieces of a shard, has these checksums."""
+    size, _, *pieces = checksums
+    if byte_range is None:
+        return checksum(content) == list(checksums[:2])
+    if isinstance(byte_range, RangeByteRequest):
+        first, last = byte_range.start, byte_range.end
+    else:
+        assert isinstance(byte_range, SuffixByteRequest)  # for the index
+        first, last = size - byte_range.suffix, size
+    starts = accumulate(pieces[::2], initial=0)
+    place, view = 0, memoryview(content)
+    for start, length, crc in zip(starts, pieces[::2], pieces[1::2], strict=False):
+        if first <= start < last:
+            if checksum(view[place : place + length]) != [length, crc]:
+                return False
+            place += length
+    return place == len(content) > 0
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:
