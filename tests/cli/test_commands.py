@@ -539,7 +539,7 @@ def test_match__prints_plain_lines_and_a_table(done):
     assert any(re.fullmatch(r"matching tiles: \d+/20, (\d+/s|\d+ s each), \d+ s left", line) for line in lines)
     assert "matching tiles: 20/20" in lines
     assert "postprocessing rows: 200/200" in lines
-    assert "writing files" in lines
+    assert "writing files: 2/2" in lines
     assert lines[-4:-1] == [str(out / name) for name in ("intervals.tif", "validity.tif", "run.json")]
     assert lines[-1] == f"next: sat-intervals report {out}"
     report = json.loads((out / "run.json").read_text())
