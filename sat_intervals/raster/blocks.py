@@ -4,6 +4,7 @@ import errno
 import struct
 import zlib
 from functools import cache
+from io import BytesIO
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ class CompressedRow(NamedTuple):
     """A compressed row of blocks as in a file: sizes of the blocks alone, bytes with what is around each."""
 
     sizes: list[int]
-    content: bytearray
+    content: bytes
 
 
 def factors(height: int, width: int) -> list[int]:
@@ -55,13 +56,12 @@ def compressed(bands: np.ndarray, file: File) -> CompressedRow:
         They differ.
     """
     sizes: list[int] = []
-    content = bytearray()
+    content = BytesIO()  # its value is no copy
     for first in range(0, bands.shape[2], COLUMNS):
         for block in _compressed(bands[:, :, first : first + COLUMNS], file):
             sizes.append(len(block))
-            for piece in (struct.pack("<I", len(block)), block, block[-4:]):
-                content += piece
-    return CompressedRow(sizes, content)
+            content.writelines((struct.pack("<I", len(block)), block, block[-4:]))
+    return CompressedRow(sizes, content.getvalue())
 
 
 def _compressed(bands: np.ndarray, file: File) -> list[memoryview]:

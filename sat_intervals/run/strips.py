@@ -7,6 +7,7 @@ overview is made of two rows of the level below it, so the parts form a binary t
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -225,10 +226,9 @@ def _write(job: Job, parts: Parts, key: PartKey, rasters: Sequence[np.ndarray], 
         del made
     halves = [raster[:, ::2, ::2] for raster in rasters]
     if key[0] + 1 < len(rows_of_levels(job)):
-        content = bytearray()
-        for band in (band for half in halves for band in half):
-            content += band.tobytes()
-        files[_HALF] = parts.write(key, _HALF, content)
+        content = BytesIO()
+        content.writelines(band.tobytes() for half in halves for band in half)
+        files[_HALF] = parts.write(key, _HALF, content.getvalue())
     parts.write_record(key, {**record, "blocks": blocks, "half": halves[0].shape[1:], "files": files})
 
 

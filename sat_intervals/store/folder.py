@@ -31,7 +31,7 @@ class Folder(Protocol):
     def write(self, name: str, text: str) -> None:
         """Write a file atomically."""
 
-    def write_bytes(self, name: str, content: bytes | bytearray) -> None:
+    def write_bytes(self, name: str, content: bytes) -> None:
         """Write a file that exists only when it is complete."""
 
     def create(self, name: str, text: str) -> bool:

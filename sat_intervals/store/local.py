@@ -61,7 +61,7 @@ class LocalFolder:
         """See `Folder`."""
         self.write_bytes(name, text.encode())
 
-    def write_bytes(self, name: str, content: bytes | bytearray) -> None:
+    def write_bytes(self, name: str, content: bytes) -> None:
         """See `Folder`."""
         with self._written(name, content) as (temporary, file):
             os.replace(temporary, file)
@@ -80,7 +80,7 @@ class LocalFolder:
         return True
 
     @contextmanager
-    def _written(self, name: str, content: bytes | bytearray) -> Iterator[tuple[Path, Path]]:
+    def _written(self, name: str, content: bytes) -> Iterator[tuple[Path, Path]]:
         """Write a temporary file, deleted after the block; yield it and the final path."""
         file = self.path / name
         temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")

@@ -79,7 +79,7 @@ class Parts:
         name = self._name(key)
         return unsealed(self.folder.read(f"{PARTS}/{name}.json"), name)
 
-    def write(self, key: PartKey, kind: str, content: bytes | bytearray) -> list[int]:
+    def write(self, key: PartKey, kind: str, content: bytes) -> list[int]:
         """Write a content of a part; return its size and checksum."""
         self.folder.write_bytes(f"{PARTS}/{self._name(key)}_{kind}", content)
         return checksum(content)

@@ -70,7 +70,7 @@ class RemoteFolder:
         """See `Folder`."""
         self.write_bytes(name, text.encode())
 
-    def write_bytes(self, name: str, content: bytes | bytearray) -> None:
+    def write_bytes(self, name: str, content: bytes) -> None:
         """See `Folder`."""
         with self._reached(name) as (system, path):
             system.pipe_file(path, content)

@@ -292,7 +292,7 @@ def _compressed(chunk: np.ndarray) -> bytes:
     return bytes(blosc.compress(chunk, b"lz4", 1, blosc.SHUFFLE, 0, chunk.itemsize))
 
 
-def checksum(content: bytes | bytearray | memoryview) -> list[int]:
+def checksum(content: bytes | memoryview) -> list[int]:
     """Return size in bytes and CRC-32 of a file."""
     return [len(content), zlib.crc32(content)]
 
