@@ -675,7 +675,7 @@ def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_pa
     ("size", "others", "reason"),
     [
         (3 << 20, 0, "has 3.1 MB free, files may need 3.5 MB"),
-        (6 << 20, 0, "has 6.3 MB free, files may need 6.9 MB"),
+        (6 << 20, 0, "has 6.3 MB free, files may need 7.0 MB"),
         (9 << 20, 0, "No space left on device"),
         (9 << 20, 1 << 20, "No space left on device"),
     ],
