@@ -64,6 +64,13 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     return volume + paths + _PATCH_BYTES * patch * (patch + config.disparity.count) + _CORE_BYTES * size**2
 
 
+def waiting_bytes(config: Config) -> int:
+    """Bytes of images and products of a tile that is read or written while others are matched."""
+    size = config.tiles.size
+    side = size * tiles_together(config, size) + 2 * config.tiles.support
+    return _VIEW_BYTES * side * (side + config.disparity.count) + _CORE_BYTES * size**2
+
+
 def strip_bytes(rows: int, width: int, compression: str) -> int:
     """Bytes that finishing a strip of final rows needs on top of its process."""
     compressed = _BAND_BYTES if compression == "none" else _BAND_BYTES // 2

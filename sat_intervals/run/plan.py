@@ -8,7 +8,7 @@ from typing import Any
 
 from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes
+from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
 from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
@@ -18,7 +18,7 @@ from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
-from sat_intervals.run.workers import reason, tiles_at_once
+from sat_intervals.run.workers import readers, reason, tiles_at_once
 from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.
@@ -116,7 +116,7 @@ def plan(
         extra_work=extra,
         worker_bytes=PROCESS_BYTES + task,
         together=together,
-        together_bytes=PROCESS_BYTES + together * task,
+        together_bytes=PROCESS_BYTES + together * task + readers(config.cluster) * waiting_bytes(config),
         disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels)
         + part_bytes(files, region.height, region.width)
         + file_bytes(files, region.height, region.width)

@@ -31,7 +31,7 @@ from sat_intervals.raster import (
 )
 from sat_intervals.run.job import Job
 from sat_intervals.run.statistics import Tally
-from sat_intervals.run.workers import Task, Workers, check_not_full, reason
+from sat_intervals.run.workers import Task, Workers, check_not_full, computing, reason
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.parts import PartKey, Parts, parts_in
 from sat_intervals.store.tiles import DamagedTilesError, Records
@@ -171,7 +171,7 @@ def finish_strip(
 
     ``records`` are those of the tiles of its rows and their halo.
     """
-    with on_worker(job, codecs) as parts:
+    with on_worker(job, codecs) as parts, computing(job.config.cluster):
         (first, last), (top, bottom) = _rows(job, key[1]), _rows(job, key[1], halo(job.config))
         shape, search = (last - first, job.store.grid.region.width), job.config.disparity
         intervals, validity = np.empty((4, *shape), np.float32), np.empty((1, *shape), np.uint16)
