@@ -13,7 +13,8 @@ from hypothesis.extra import numpy as hnp
 
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.disparity import cross_check, median
-from sat_intervals.kernels.matching import Settings, match_costs
+from sat_intervals.kernels.matching import match_costs
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import (
     IMPOSSIBLE_COST,
     LEFT_WINDOW,

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from sat_intervals.config import load_config
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
-from sat_intervals.kernels.matching import Settings, match_costs
+from sat_intervals.kernels.matching import match_costs
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.in_memory import match_arrays
 from sat_intervals.match.patch import Frame, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between
-from sat_intervals.kernels.matching import Settings, cost_volume, match_costs
+from sat_intervals.kernels.matching import cost_volume, match_costs
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import IMPOSSIBLE_COST, MASKED, NO_DATA
 from sat_intervals.tiling import Window
 
