@@ -739,14 +739,14 @@ def killed(number, *arguments, **options):
         patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
         publishing.publish(*arguments)
 
-    def put_together(*arguments):
+    def assemble(*arguments):
         raise Killed
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
         patch.setattr("sat_intervals.raster.writer.publish", publish)
         if not number:
-            patch.setattr(OutputWriter, "put_together", put_together)
+            patch.setattr(OutputWriter, "assemble", assemble)
         with pytest.raises(Killed):
             match_pair(*arguments, **options)
 
