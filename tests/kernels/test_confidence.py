@@ -19,7 +19,7 @@ from sat_intervals.match.postprocess import confidence_scale
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
 
-bounded = settings(max_examples=50, derandomize=True, deadline=None)
+bounded = settings(max_examples=30, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 N = np.nan
