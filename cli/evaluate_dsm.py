@@ -9,6 +9,8 @@ from typing import Any
 
 import click
 
+from sat_intervals.cli.options import say_json
+
 _FILE = click.Path(path_type=Path)
 _SOFTWARE = "sat-intervals"
 # Beginnings of files of figures: those without one are not replaced.
@@ -43,7 +45,7 @@ class Surface:
             raise click.UsageError(f"--pictures {self.folder} is no folder: give an existing one.")
         report = evaluate_surface(self.dsm, self.reference, self.classes, registers=self.registers)
         if as_json:
-            click.echo(json.dumps(report, indent=1))
+            say_json(report)
         else:
             show_surface(str(self.dsm), report)
         if self.folder is not None:

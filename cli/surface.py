@@ -7,7 +7,7 @@ import click
 
 from sat_intervals.cli.dsm import cell_options, say_surface
 from sat_intervals.cli.matching import Pair, Run, Settings, pair_options, run_options, search_options
-from sat_intervals.cli.options import path, sensor_options
+from sat_intervals.cli.options import json_option, path, say_json, sensor_options
 
 
 @click.command(short_help="Match a pair, triangulate it and make a surface model.")
@@ -16,12 +16,14 @@ from sat_intervals.cli.options import path, sensor_options
 @click.argument("out", callback=path)
 @sensor_options
 @cell_options
+@json_option
 @run_options
 def surface(
     pair: Pair,
     out: Path,
     sensor_files: tuple[Path, Path, Path, Path],
     cells: dict[str, Any],
+    as_json: bool,
     settings: Settings,
     run: Run,
 ) -> None:
@@ -33,7 +35,7 @@ def surface(
     from sat_intervals.cli.console import Console
 
     config = settings.load()
-    with Console(run.quiet) as console:
+    with Console(run.quiet or as_json) as console:
         from sat_intervals.heights.dsm import make_surface
         from sat_intervals.heights.triangulate import triangulate
         from sat_intervals.run.before import report_before
@@ -43,8 +45,10 @@ def surface(
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
-        triangulate(out, *sensor_files, progress=console.progress)
+        points = triangulate(out, *sensor_files, progress=console.progress)
         made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
+    if as_json:
+        say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))

@@ -24,13 +24,11 @@ from sat_intervals.kernels.registration import LEAST, Blocks, Registration, regi
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     MARK,
-    Georeferencing,
     HeightRaster,
     OutputWriter,
     Projection,
     Vertical,
     check_marked,
-    open_image,
     read_tags,
     truth_file,
     utm_of,
@@ -126,13 +124,13 @@ def make_truth(
     if registers:
         triangulated([run.out])
     check_unchanged = watched([reference.path, run.out / "points.tif"])
-    work = _Work(run, Sensors.load(*files), reference)
+    work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))
     tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), **MARK}
     tags["SHIFT"] = " ".join(f"{part:.3f}" for part in shift) + " m"
     tally = _Tally(run)
-    with OutputWriter(path.parent, [truth_file(path.name)], *run.shape, _georeferencing(run), tags) as writer:
+    with OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer:
         for row, strip in work.strips(shift, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))
             tally.add(row, strip)
@@ -149,10 +147,6 @@ def _check_own(path: Path) -> None:
     check_marked(path)
     if path.is_file() and not path.is_symlink() and "REFERENCE" not in read_tags(path):
         raise SatIntervalsError(f"{path} exists and was not made by sat-intervals reference: move it away")
-
-
-def _georeferencing(run: Run) -> Georeferencing:
-    return open_image(run.out / "validity.tif").georeferencing
 
 
 class _Work:

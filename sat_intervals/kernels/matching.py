@@ -1,8 +1,4 @@
-"""SGM and the reading of every finished cost curve, in two sweeps over a patch.
-
-The sweep down stores the sum of its four paths. The sweep up adds its own four, and reads winner, refinement, interval,
-ambiguity and the right view's winner from the finished curve while it is in the cache. No other volume is stored, and
-each sweep ends at the last row of the wanted pixels.
+"""Matching of a patch: matching costs in, products of every pixel out (METHOD.md, sections 2 to 6).
 
 Letters: r row, c column, k disparity index (disparity = minimum + k).
 """
@@ -11,91 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.kernels.compiled import cached, part
-from sat_intervals.kernels.cost import (
-    Candidates,
-    Cells,
-    Costs,
-    Ranges,
-    cost_curve,
-    enter_cells,
-    one_cell,
-    padded_to_lanes,
-)
-from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
-from sat_intervals.kernels.reading import (
-    Rectangle,
-    RightPixels,
-    close_impossible,
-    columns_of,
-    contains,
-    read_curve,
-    rectangle_of,
-    search_flags,
-    update_right,
-)
-from sat_intervals.kernels.sgm import (
-    LAST_WAVE,
-    WALL,
-    WAVEFRONTS,
-    Borders,
-    Edge,
-    Paths,
-    Ring,
-    add_curve,
-    advance_pixel,
-    advance_wave,
-    copy_curve,
-    enter_row,
-    hand_on,
-    no_borders,
-    path_slots,
-    restart,
-    take_over,
-)
-from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY, NOT_REFINED
+from sat_intervals.kernels.cost import Cells, Costs, padded_to_lanes, volume_starts
+from sat_intervals.kernels.penalties import Gradients
+from sat_intervals.kernels.reading import RightPixels, rectangle_of
+from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Edge
+from sat_intervals.kernels.sweeps import Settings, Volume, prepare, sweep_down, sweep_up, trace_wave
+from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tiling import Window
-
-
-class Settings(NamedTuple):
-    """Settings in the form that the kernels take.
-
-    Attributes
-    ----------
-    minimum, count
-        First disparity of the search range and number of disparities.
-    impossible
-        Matching cost of an impossible candidate inside SGM, above all possible ones.
-    p1, p2, regularized
-        Constant SGM penalties, and whether SGM runs; without it the aggregated cost is the matching cost.
-    cut_level
-        ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
-    high, low, steps
-        Levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1: one level.
-        ``steps`` 0: bounds in whole pixels.
-    weights
-        uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
-    refine
-        Whether winners are refined, and bounds extended by one for it.
-    offset, total
-        First disparity, and number of disparities, of the whole search range that this one is a part of: ``minimum -
-        offset`` is the first. 0: this is the whole range.
-    """
-
-    minimum: int
-    count: int  # type: ignore[assignment]
-    impossible: int
-    p1: int
-    p2: int
-    regularized: bool
-    cut_level: int
-    weights: np.ndarray
-    refine: bool
-    high: float = -1.0
-    low: float = -1.0
-    steps: int = 0
-    offset: int = 0
-    total: int = 0
 
 
 class Raw(NamedTuple):
@@ -167,181 +85,15 @@ class Matched(NamedTuple):
     leaving: Edge
 
 
-class _Buffers(NamedTuple):
-    """Inputs of both sweeps, and buffers for the current row, paths and curve.
-
-    Attributes
-    ----------
-    ranges
-        Those of the pixels of the row.
-    usable
-        ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
-    possible
-        ``(columns,)`` int64: number of possible candidates of each pixel of the row.
-    curve
-        ``(size,)`` uint16: buffer of one curve.
-    inside
-        Pixels whose paths are computed; those of the pixels around them come from ``rings``.
-    rings
-        Rings of the two waves of the sweep.
-    leaving
-        States that leave the pixels ``inside``, to fill; empty if nobody takes them over.
-    down
-        Direction of the sweep. As a constant argument of `_enter_row` it would be compiled for each direction.
-    """
-
-    candidates: Candidates
-    cells: Cells
-    ranges: Ranges
-    usable: np.ndarray
-    possible: np.ndarray
-    penalties: Penalties
-    paths: Paths
-    curve: np.ndarray
-    inside: Rectangle
-    rings: tuple[Ring, ...]
-    leaving: Edge
-    down: bool
-
-
-def _prepare(
-    costs: Costs,
-    gradients: Gradients | None,
-    settings: Settings,
-    borders: Borders | None,
-    cells: Cells | None,
-    down: bool = True,
-) -> _Buffers:
-    (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
-    left, slots = borders.inside if borders else Window(0, 0, 0, 0), 1 + 3 * columns
-    inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
-    cells, k = cells or one_cell(rows, columns, settings.count), np.arange(size)
-    walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
-    return _Buffers(
-        Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
-        cells,
-        Ranges(np.zeros(columns, np.int64), np.zeros(columns, np.int64)),
-        np.zeros(columns + settings.count, np.int64),
-        np.zeros(columns, np.int64),
-        make_penalties(gradients, settings.p1, settings.p2, columns, size),
-        Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
-        np.zeros(size, np.uint16),
-        rectangle_of(inside),
-        rings[:2] if down else rings[2:],
-        Edge(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
-        down,
-    )
-
-
-@part
-def _enter_row(buffers, gradients, settings, r):
-    """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
-
-    Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
-    """
-    candidates, cells, ranges, usable, possible, penalties, paths, _, inside, rings, _, down = buffers
-    costs, barrier = candidates.costs, candidates.barrier
-    for x in range(costs.right_state.shape[1]):
-        barrier[x] = settings.impossible if costs.right_state[r, x] else 0
-        usable[x + 1] = usable[x] + (costs.right_state[r, x] == 0)
-    enter_cells(candidates, cells, ranges, r)
-    for c in range(possible.size):
-        inner = usable[c + ranges.last[c] + 1] - usable[c + ranges.first[c]]
-        possible[c] = inner if costs.left_state[r, c] == 0 else 0
-    falling, rising = -r % possible.size, r % possible.size
-    enter_row(paths, possible.size, falling, rising, down)
-    take_over(paths, rings, inside, r, falling, rising, down)
-    fill_row(gradients, r, down, penalties.row)
-    return falling, rising
-
-
-@cached
-def _trace(buffers, gradients, settings, wave):
-    """Advance the paths of one wave through a patch and copy the states that leave it."""
-    candidates, _, _, _, possible, penalties, paths, _, inside, _, leaving, down = buffers
-    rows = candidates.costs.left_state.shape[0]
-    for step in range(inside.row_stop if down else rows - inside.row):
-        r = step if down else rows - 1 - step
-        falling, rising = _enter_row(buffers, gradients, settings, r)
-        for c in columns_of(inside, r, down):
-            slots = path_slots(c, possible.size, falling, rising)
-            if possible[c] == 0:
-                restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
-            else:
-                advance_wave(candidates, penalties, paths, slots, wave, r, c)
-        if inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, wave, down, leaving)
-
-
-@cached
-def _sweep_down(buffers, gradients, settings, output, volume):
-    """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, _, _, _, possible, penalties, paths, curve, inside, _, _, _ = buffers
-    for r in range(output.row_stop):
-        falling, rising = _enter_row(buffers, gradients, settings, r)
-        for c in columns_of(inside, r, True):
-            slots = path_slots(c, possible.size, falling, rising)
-            if possible[c] == 0:
-                restart(paths, slots)
-            elif contains(output, r, c):
-                offset = ((r - output.row) * volume.shape[1] + c - output.column) * curve.size
-                advance_pixel(candidates, penalties, paths, slots, r, c, volume, offset)
-            else:
-                advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
-
-
-@cached
-def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
-    """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
-    candidates, _, ranges, _, possible, penalties, paths, curve, inside, _, leaving, _ = buffers
-    winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
-    costs = candidates.costs
-    for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
-        falling, rising = _enter_row(buffers, gradients, settings, r)
-        for c in columns_of(inside, r, False):
-            slots = path_slots(c, possible.size, falling, rising)
-            if possible[c] == 0:
-                restart(paths, slots)
-            elif settings.regularized:
-                advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
-            if not contains(output, r, c):
-                continue
-            i, j = r - output.row, c - output.column
-            least, most = ranges.first[c], ranges.last[c]
-            if possible[c] < most + 1 - least:
-                validity[i, j] = search_flags(costs, r, c, least, most, possible[c])
-            if possible[c] == 0:
-                if keep:
-                    volume[i, j] = IMPOSSIBLE_COST
-                continue
-            if settings.regularized:
-                add_curve(curve, volume, (i * volume.shape[1] + j) * curve.size)
-            else:
-                cost_curve(candidates, r, c, curve)
-            lowest = close_impossible(curve, candidates, c)
-            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, lowest, settings, least, most)
-            lower[i, j], upper[i, j] = high
-            if settings.low >= 0:
-                lower_low[i, j], upper_low[i, j] = low
-            disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
-            if not refined:
-                validity[i, j] |= NOT_REFINED
-            if contains(right.core, r, c):
-                update_right(curve, right, r, c)
-            if keep:
-                copy_curve(curve, volume[i, j])
-        if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, LAST_WAVE, False, leaving)
-
-
 def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    buffers = _prepare(costs, gradients, settings, borders, cells)
+    buffers = prepare(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
     of_low = shape if settings.low >= 0 else (0, 0)
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
-    volume = np.empty((*shape, size), np.uint16)
+    starts = volume_starts(buffers.cells, output)
+    volume = Volume(np.empty(starts[-1], np.uint16), starts, np.zeros(costs.left_state.shape[1], np.int64))
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -357,15 +109,15 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
-        _sweep_down(buffers, gradients, settings, wanted, volume)
-        buffers = _prepare(costs, gradients, settings, borders, cells, down=False)
-    _sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
+        sweep_down(buffers, gradients, settings, wanted, volume)
+        buffers = prepare(costs, gradients, settings, borders, cells, down=False)
+    sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
     if settings.steps:  # the sweep only carries them as int16: compiled once for both kinds
         raw = raw._replace(**{name: getattr(raw, name).view(np.uint16) for name in BOUNDS})
-    return Matched(raw, RightView(cost, winner), buffers.leaving), volume
+    return Matched(raw, RightView(cost, winner), buffers.leaving), volume.sums
 
 
 def trace(
@@ -381,8 +133,8 @@ def trace(
     Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
     """
     down, wave = WAVEFRONTS[wavefront]
-    buffers = _prepare(costs, gradients, settings, borders, cells, down)
-    _trace(buffers, gradients, settings, wave)
+    buffers = prepare(costs, gradients, settings, borders, cells, down)
+    trace_wave(buffers, gradients, settings, wave)
     return buffers.leaving
 
 
@@ -427,4 +179,5 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True, None, None)[1][:, :, : settings.count]
+    sums = _sweep(costs, gradients, settings, whole, whole, True, None, None)[1]
+    return sums.reshape(*costs.left_state.shape, -1)[:, :, : settings.count]

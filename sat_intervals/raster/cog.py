@@ -43,12 +43,14 @@ _PREDICTORS = {"NO": 1, "FLOATING_POINT": 3}
 _COLUMNS = 4 * BLOCK
 # Bytes around each block: its size before it, and the copy of its end.
 _AROUND = 8
+# Side of a block of the template, the smallest of GDAL's COG driver: larger ones take time and hold nothing.
+_SMALL = 128
 # Size from which a file is a BigTIFF.
 _CLASSIC = 1 << 32
 # Tags of a TIFF directory, its types, and their sizes in bytes.
-_WIDTH, _HEIGHT, _OFFSETS, _SIZES = 256, 257, 324, 325
-_LONG, _LONG8 = 4, 16
-_BYTES = {1: 1, 2: 1, 3: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
+_WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES = 256, 257, 322, 323, 324, 325
+_SHORT, _LONG, _LONG8 = 3, 4, 16
+_BYTES = {1: 1, 2: 1, _SHORT: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
 _CRC = 0xEDB88320  # polynomial of CRC-32, its highest power in the lowest bit
 
 Directory = dict[int, tuple[int, int, bytes]]
@@ -162,11 +164,10 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
     small = scratch.with_name(f"strips-{scratch.name}")
     predictor = {"PREDICTOR": file.predictor} if file.compression in ("deflate", "zstd") else {}
-    options = {"COMPRESS": file.compression.upper(), "OVERVIEW_RESAMPLING": "NEAREST", **predictor}
+    options = {"COMPRESS": file.compression.upper(), "OVERVIEW_RESAMPLING": "NEAREST", "BLOCKSIZE": _SMALL, **predictor}
+    kind |= _tiled(file) | {"blockxsize": _SMALL, "blockysize": _SMALL, "height": _SMALL + 1, "width": _SMALL + 1}
     with Env():
-        with gdal.create(
-            str(small), height=BLOCK + 1, width=BLOCK + 1, **kind, **_tiled(file), **place.creation_options()
-        ) as dataset:
+        with gdal.create(str(small), **kind, **place.creation_options()) as dataset:
             dataset.update_tags(**tags)
             file.describe(dataset)
         copy(str(small), str(scratch), driver="COG", SPARSE_OK="YES", **options)
@@ -240,6 +241,7 @@ def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) 
         numbers = {_WIDTH: width, _HEIGHT: height}
         changed = {tag: (_LONG, 1, struct.pack("<I", number)) for tag, number in numbers.items()}
         changed[_SIZES] = _LONG, len(of_level), np.array(of_level, "<u4").tobytes()
+        changed |= dict.fromkeys((_BLOCK_WIDTH, _BLOCK_HEIGHT), (_SHORT, 1, struct.pack("<H", BLOCK)))
         directories.append((whole if factor == 1 else overview) | changed)
     data = sum(size + _AROUND for of_level in sizes for size in of_level)
     is_big = data + len(_written(ghost, directories, sizes, 0, is_big=False)) >= _CLASSIC

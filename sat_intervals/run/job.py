@@ -63,6 +63,8 @@ class Job:
         Digest of the local search ranges, None without them.
     local
         The local search ranges; not on workers, which read them from the store.
+    has_looks
+        Whether tiles are looked at for the quality of the pair, which a report tells.
     """
 
     left: Image
@@ -76,6 +78,7 @@ class Job:
     found: Found | None = None
     grid: str | None = None
     local: LocalRanges | None = None
+    has_looks: bool = True
 
     @property
     def manifest(self) -> dict[str, Any]:

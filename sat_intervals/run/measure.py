@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -174,6 +174,7 @@ def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) ->
     """Prepare the job that matches a subject at two levels; open its store."""
     config = _at_levels(subject.config, float(levels[0]), float(levels[1]), None)
     job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name)
+    job = replace(job, has_looks=False)
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin()
     stack.callback(job.store.remove)

@@ -124,7 +124,8 @@ def _match_tile(
 def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
     """Look at the quality of the pair in some of the tiles, unless the search for its range did so."""
     grid, search = job.store.grid, job.config.disparity
-    if job.found or tile.grid_row % -(-grid.rows // _LOOKS) or tile.grid_column % -(-grid.columns // _LOOKS):
+    steps = -(-grid.rows // _LOOKS), -(-grid.columns // _LOOKS)
+    if job.found or not job.has_looks or tile.grid_row % steps[0] or tile.grid_column % steps[1]:
         return []
     return look_in_tile(views, tile.core, search.minimum, search.maximum)
 

@@ -160,11 +160,13 @@ class TileArrays:
         zarr itself takes some ms for each file, which is more than matching a small tile.
         """
         together = math.gcd(self.grid.size, _ROWS_TOGETHER)
-        chunks, index, place = [], [], 0
+        chunks: list[bytes] = []
+        index, place, height = [], 0, array.shape[-2]
         for row in range(0, self.grid.size, together):
             rows = array[..., row : row + together, :]
             more = [(0, 0)] * (array.ndim - 2) + [(0, together - rows.shape[-2]), (0, width - array.shape[-1])]
-            chunks.append(_compressed(np.pad(rows, more)))
+            is_again = row - together >= height  # rows beyond the image, as in the chunk before
+            chunks.append(chunks[-1] if is_again else _compressed(np.pad(rows, more)))
             index += [place, len(chunks[-1])]
             place += len(chunks[-1])
         table = struct.pack(f"<{len(index)}Q", *index)

@@ -3,6 +3,7 @@
 import shutil
 import signal
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,9 @@ HEIGHT, WIDTH, PARTS = 1600, 120, 7
 def tall(tmp_path_factory):
     """A pair and its settings; a run that kept its tiles."""
     folder = tmp_path_factory.mktemp("tall")
-    settings = write_pair(folder, make_scene(HEIGHT, WIDTH, seed=3), tiles={"size": 320}, cluster={"workers": 2})
+    part = make_scene(HEIGHT // 8, WIDTH, seed=3)
+    images = {name: np.tile(getattr(part, name), (8, 1)) for name in ("left", "right", "truth")}
+    settings = write_pair(folder, replace(part, **images), tiles={"size": 320}, cluster={"workers": 2})
     match_pair(folder / "left.tif", folder / "right.tif", folder / "kept", settings, keep_tiles=True)
     return folder, settings
 
