@@ -177,12 +177,15 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
 
 def _checked_folder(output: Path) -> Path:
     """Return the folder of a file, where tiles are kept meanwhile; raise if it cannot be written."""
-    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.errors import SatIntervalsError, check_regular
 
+    check_regular(output)
     folder = output.absolute().parent
     if output.is_dir() or not os.access(folder, os.W_OK):
         raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")
-    if output.exists() and not output.read_bytes().startswith(tuple(head[:15].encode() for head in _HEADS)):
+    if output.exists() and not output.read_bytes().startswith(
+        tuple(head.partition("\n")[0].encode() for head in _HEADS)
+    ):
         raise SatIntervalsError(f"{output} exists and was not made by sat-intervals calibrate: move it away")
     return folder
 

@@ -12,8 +12,9 @@ import click
 from sat_intervals.cli.options import say_json
 
 _FILE = click.Path(path_type=Path)
-# In the first line of files of figures: those without it are not replaced.
-_MARK = "sat-intervals"
+_SOFTWARE = "sat-intervals"
+# Beginnings of files of figures: those without one are not replaced.
+_MARKS = f'{{\n "software": "{_SOFTWARE}"', f"<!-- {_SOFTWARE} -->\n"
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,8 @@ def _drawn(given: Surface, folder: Path, report: dict[str, Any]) -> list[Path]:
     names = given.dsm.name, given.reference.name
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, given.line)
-    content = json.dumps({"software": _MARK} | report, indent=1), surface_markdown(str(given.dsm), report)
-    for path, text in zip(texts, (content[0], f"<!-- {_MARK} -->\n{content[1]}"), strict=True):
+    content = json.dumps({"software": _SOFTWARE} | report, indent=1), surface_markdown(str(given.dsm), report)
+    for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
         with whole_file(path) as new:
             new.write_text(text, encoding="utf-8")
     draw_reliability(report, paths[0], names[0])
@@ -127,9 +128,10 @@ def _drawn(given: Surface, folder: Path, report: dict[str, Any]) -> list[Path]:
 
 
 def _check_texts(paths: list[Path]) -> None:
-    """Raise if a file exists and does not begin with the mark of this tool."""
-    from sat_intervals.errors import SatIntervalsError
+    """Raise if a file exists and does not begin with a mark of this tool."""
+    from sat_intervals.errors import SatIntervalsError, check_regular
 
     for path in paths:
-        if path.exists() and _MARK.encode() not in path.read_bytes()[:40]:
+        check_regular(path)
+        if path.exists() and not path.read_bytes().startswith(tuple(mark.encode() for mark in _MARKS)):
             raise SatIntervalsError(f"{path} exists and was not made by sat-intervals: move it away")

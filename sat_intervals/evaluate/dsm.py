@@ -22,6 +22,7 @@ from sat_intervals.raster import (
     read_tags,
     resolution_of,
 )
+from sat_intervals.raster.identity import watched
 from sat_intervals.tiling import Grid, Window
 
 # Heights evaluated at a time, some hundred bytes each.
@@ -130,6 +131,7 @@ def evaluate_surface(
     SatIntervalsError
         A file cannot be read, or both do not overlap, or their heights differ by too much.
     """
+    check_unchanged = watched([surface, reference, classes])
     given = open_comparison(surface, reference)
     nominal = nominal_of(given.surface)
     if classes is not None:
@@ -149,6 +151,7 @@ def evaluate_surface(
             _add_classes(kinds, errors, _classes(given, Path(classes), window)[known], Path(classes), nominal)
         if moved is not given:
             before.add(_compared(given, window)[0])
+    check_unchanged()
     report = whole.report()
     _check_common(given, before.report() if moved is not given else report)
     return {

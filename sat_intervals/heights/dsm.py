@@ -102,10 +102,11 @@ def make_surface(
         A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
+    like = resolution if isinstance(resolution, Path) else None
     grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius)
     runs = triangulated([Path(out) for out in outs])
     for run in runs:
-        run.check_kept([path], [run.out / "points.tif", geoid])
+        run.check_kept([path], [run.out / "points.tif", geoid, like])
     choices = choices.for_runs(runs)
     clouds = _clouds(runs, projection := _projection(runs, crs, geoid), choices, progress)
     cells = _cells(clouds, resolution, radius, grid)

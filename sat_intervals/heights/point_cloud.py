@@ -27,6 +27,7 @@ from sat_intervals.kernels.splat import (
 )
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, POINTS
 from sat_intervals.raster import Projection, read_layers
+from sat_intervals.raster.identity import watched
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Window
 
@@ -117,6 +118,7 @@ class PointCloud:
     def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices | None = None) -> None:
         self.run = run
         self._path = run.out / "points.tif"
+        self._check_unchanged = watched([self._path])
         self._projection = projection
         self._choices = choices or SurfaceChoices().for_runs([run])
         self._extents: list[tuple[Window, Extent]] = []
@@ -127,6 +129,7 @@ class PointCloud:
     def _kept(self, window: Window) -> tuple[np.ndarray, np.ndarray, int, int]:
         """Return the bands of a window, the mask of the points that contribute, and the numbers left out."""
         bands, known = read_points(self._path, window)
+        self._check_unchanged()
         outlying = open_ended = np.zeros(known.shape, np.bool_)
         if self._choices.outliers is not None:
             outlying = known & self._outlying(window, self._choices.outliers)

@@ -29,9 +29,11 @@ from sat_intervals.raster import (
     Projection,
     Vertical,
     check_marked,
+    read_tags,
     truth_file,
     utm_of,
 )
+from sat_intervals.raster.identity import watched
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -117,10 +119,11 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    check_marked(path)
+    _check_own(path)
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     if registers:
         triangulated([run.out])
+    check_unchanged = watched([reference.path, run.out / "points.tif"])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))
@@ -131,11 +134,19 @@ def make_truth(
         for row, strip in work.strips(shift, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))
             tally.add(row, strip)
+        check_unchanged()
         tally.check(reference.path, work.place)
         progress("files", 0, 1)
         writer.publish()
         progress("files", 1, 1)
     return tally.report() | {"row_misfit": work.row_misfit, "registration": found and found.report()}
+
+
+def _check_own(path: Path) -> None:
+    """Raise if a file exists that `make_truth` did not write. Links are replaced, never followed: they pass."""
+    check_marked(path)
+    if path.is_file() and not path.is_symlink() and "REFERENCE" not in read_tags(path):
+        raise SatIntervalsError(f"{path} exists and was not made by sat-intervals reference: move it away")
 
 
 class _Work:

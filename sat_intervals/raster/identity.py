@@ -4,7 +4,7 @@ import hashlib
 import os
 import re
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -166,6 +166,21 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
                 f"{name} was replaced or changed during the run: restore it and rerun the same command: it resumes; or "
                 "start again with --overwrite"
             )
+
+
+def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
+    """Return a function that raises if a file was replaced or changed since; None and remote files are ignored.
+
+    Call it between reading several times from files and publishing what was made of them.
+    """
+    before = {str(file): stamp_of(str(file)) for file in files if file is not None}
+
+    def check() -> None:
+        for file, stamp in before.items():
+            if stamp is not None and stamp_of(file) != stamp:
+                raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
+
+    return check
 
 
 def check_not_replaced(

@@ -15,6 +15,8 @@ from sat_intervals.tiling import Window
 
 # Side of the cells that a raster of ranges is reduced to, in pixels.
 _CELL = 64
+# Minimum and maximum.
+_BANDS = 2
 # Rows written at a time.
 _STRIP = 256
 
@@ -59,6 +61,8 @@ def check_replaceable(path: Path, left: Image, right: Image) -> None:
     names = [name for image in (left, right) for name in (image.path, image.mask) if name]
     check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
     check_marked(path)
+    if path.is_file() and not path.is_symlink() and read_shape(path)[0] != _BANDS:
+        raise SatIntervalsError(f"{path} exists and has no local ranges: choose another --output")
 
 
 def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
@@ -67,7 +71,7 @@ def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
         np.stack(ranges.at(Window(row, 0, min(_STRIP, left.height - row), left.width)))
         for row in range(0, left.height, _STRIP)
     )
-    write_rows(path, rows, (2, left.height, left.width), left.georeferencing)
+    write_rows(path, rows, (_BANDS, left.height, left.width), left.georeferencing)
 
 
 def read_ranges(path: str, left: Image) -> LocalRanges:
@@ -82,7 +86,7 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
         The raster does not fit the image, or a minimum is above its maximum.
     """
     bands, height, width = read_shape(path)
-    if (bands, height, width) != (2, left.height, left.width):
+    if (bands, height, width) != (_BANDS, left.height, left.width):
         raise SatIntervalsError(
             f"{path} has {bands} bands of {height} x {width} pixels, {left.path} {left.height} x {left.width}: give "
             "minimum and maximum for each pixel of the left image"

@@ -30,6 +30,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, open_image
+from sat_intervals.raster.identity import watched
 from sat_intervals.results import Layer
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
@@ -122,6 +123,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
         Tiles failed.
     """
     found: list[Measured] = []
+    check_unchanged = watched(subject.truth.image.path for subject in subjects)
     levels = ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     scratch = Path(tempfile.mkdtemp(prefix=".calibrate-", dir=folder))
@@ -133,6 +135,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
                 found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    check_unchanged()
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found

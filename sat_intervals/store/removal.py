@@ -58,7 +58,8 @@ def check_not_foreign(folder: Folder) -> None:
             f"{folder}/{taken[0]} is a file or a symbolic link, but a folder of tiles is needed: move it away or "
             "choose another folder"
         )
-    names = {name for name, size in _names(folder).items() if size}
+    # unfinished files of a killed run have names that no run writes again
+    names = {name for name, size in _names(folder).items() if size and name == final_name(name)}
     if not names or is_of_run(folder):
         return
     if there := sorted(names & folder.sizes().keys()):  # otherwise another run has just removed its tiles
@@ -82,6 +83,11 @@ def _names(folder: Folder) -> dict[str, int]:
         return grid is None or (row < grid.rows and column < grid.columns)
 
     return {name: size for name, size in folder.sizes().items() if is_named(name)}
+
+
+def is_of_tile(name: str) -> bool:
+    """Return whether a name is that of a tile's file, finished or not."""
+    return _OF_TILE.fullmatch(final_name(name)) is not None
 
 
 def final_name(name: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.store.folder import Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, sealed, unsealed
-from sat_intervals.store.removal import BORDERS, COSTS
+from sat_intervals.store.removal import BORDERS, COSTS, is_of_tile
 
 # A file is the length of its header, the header, a sealed text, and the bytes of all arrays.
 _LENGTH = struct.Struct("<I")
@@ -61,7 +61,8 @@ class Steps:
 
     def drop_costs(self) -> None:
         """Delete precomputed costs, which nothing needs once all tiles are matched."""
-        self.folder.delete_all([f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes()], [COSTS])
+        names = (f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes())
+        self.folder.delete_all([name for name in names if is_of_tile(name)], [COSTS])
 
     def check_space(self, needed: int) -> None:
         """Raise if the disk has no room for the bytes that a run needs for its steps and does not have yet.

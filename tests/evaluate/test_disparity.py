@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from sat_intervals import match_pair
 from sat_intervals.config.pairs import find_pairs, group_beside
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.evaluate import disparity
 from sat_intervals.evaluate.disparity import evaluate, evaluate_run
 from sat_intervals.evaluate.metrics import Criteria
 from sat_intervals.evaluate.paper import SceneMetrics, table_1
@@ -259,6 +260,20 @@ def test_evaluate_run__of_a_region_takes_its_truth_or_the_whole(pair, tmp_path):
     write(tmp_path / "other.tif", part[1:], NAN)
     with pytest.raises(SatIntervalsError, match="39 x 50 pixels, the left image 70 x 90, the run 40 x 50"):
         evaluate_run(tmp_path / "out", tmp_path / "other.tif")
+
+
+def test_evaluate_run__ends_where_the_truth_is_replaced_meanwhile(pair, run, tmp_path, monkeypatch):
+    truth = shutil.copy(pair / "truth.tif", tmp_path)
+    median_bias = disparity._median_bias
+
+    def replaced_after(strips):
+        found = median_bias(strips)
+        shutil.copy(pair / "truth.tif", tmp_path)
+        return found
+
+    monkeypatch.setattr(disparity, "_median_bias", replaced_after)
+    with pytest.raises(RunError, match=r"truth.tif was replaced or changed while it was read: rerun the command"):
+        evaluate_run(run, truth, remove_bias=True)
 
 
 def test_evaluate_run__says_what_is_missing(run, pair, tmp_path):

@@ -1,6 +1,7 @@
 """Surface models against reference heights."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 
 from sat_intervals import SatIntervalsError
+from sat_intervals.errors import RunError
+from sat_intervals.evaluate import dsm
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.match.histogram import Histogram
 from sat_intervals.products import SURFACE
@@ -225,10 +228,31 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
         result = invoke(*words, "--pictures", tmp_path, "--line", *line)
         assert result.exit_code == (2 if message else 0)
         assert message in result.stderr
-    written[1].write_text("mine")
-    result = invoke(*words, "--pictures", tmp_path)
-    assert result.exit_code == 2
-    assert "dsm-accuracy.md exists and was not made by sat-intervals" in result.stderr
+    for file in written[:2]:
+        made = file.read_text()
+        file.write_text("# Notes on sat-intervals")
+        result = invoke(*words, "--pictures", tmp_path)
+        assert result.exit_code == 2
+        assert f"{file.name} exists and was not made by sat-intervals" in result.stderr
+        file.unlink()
+        os.mkfifo(file)
+        assert f"{file.name} is a named pipe" in invoke(*words, "--pictures", tmp_path).stderr
+        file.unlink()
+        file.write_text(made)
+
+
+def test_evaluate_surface__ends_where_a_file_is_replaced_meanwhile(tmp_path, monkeypatch):
+    model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
+    reference = write(tmp_path / "reference.tif", [[[1.5, 2]]])
+    compared = dsm._compared
+
+    def replaced_after(*arguments):
+        write(reference, [[[1.5, 9]]])
+        return compared(*arguments)
+
+    monkeypatch.setattr(dsm, "_compared", replaced_after)
+    with pytest.raises(RunError, match=r"reference.tif was replaced or changed while it was read: rerun"):
+        evaluate_surface(model, reference, registers=False)
 
 
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):

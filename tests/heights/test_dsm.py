@@ -1,6 +1,7 @@
 """Surface models from made-up points."""
 
 import json
+import shutil
 import threading
 
 import numpy as np
@@ -15,6 +16,8 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 
 from sat_intervals import SatIntervalsError
+from sat_intervals.errors import RunError
+from sat_intervals.heights import dsm
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
@@ -133,6 +136,29 @@ def test_make_surface__a_point_reaches_the_cell_it_falls_in_at_any_radius(tmp_pa
     assert_allclose(surface[0, row, column], [10, 20], atol=1e-4)
     assert np.isfinite(surface[0]).sum() == 2
     assert np.isnan(surface[BAND["confidence"]]).all()  # of a run without confidence
+
+
+def test_make_surface__ends_where_points_are_replaced_meanwhile(tmp_path, monkeypatch):
+    x, y = np.meshgrid(np.arange(20.0), -np.arange(60.0))
+    out = write_points(tmp_path / "a", x, y, 10 + 0 * x)
+    other = write_points(tmp_path / "b", x, y, 99 + 0 * x)
+    monkeypatch.setattr(dsm, "_TILE_ROWS", 16)
+
+    def replace(stage, done, total):
+        if stage == "cells" and done < total:
+            shutil.copy(other / "points.tif", out / "new.tif")
+            (out / "new.tif").replace(out / "points.tif")
+
+    with pytest.raises(RunError, match=r"points.tif was replaced or changed while it was read: rerun the command"):
+        surface_of([out], tmp_path, progress=replace)
+    assert not (tmp_path / "dsm.tif").exists()
+
+
+def test_make_surface__keeps_the_surface_whose_grid_it_takes(tmp_path):
+    out = write_points(tmp_path / "a", [0.5, 3.5], [-0.5, -0.9], [10, 14])
+    surface_of([out], tmp_path)
+    with pytest.raises(SatIntervalsError, match=r"dsm.tif is an input, and .*dsm.tif would be written"):
+        surface_of([out], tmp_path, resolution=tmp_path / "dsm.tif", crs=None)
 
 
 def test_make_surface__several_runs_are_intersected_where_they_meet(tmp_path):

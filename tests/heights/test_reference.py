@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from contextlib import suppress
 
 import numpy as np
@@ -14,8 +15,9 @@ from rasterio.transform import Affine
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.demo import DATUM, PIXEL, VIEWS
+from sat_intervals.errors import RunError
 from sat_intervals.products import OCCLUSION
-from sat_intervals.raster import Projection, Vertical
+from sat_intervals.raster import MARK, Georeferencing, Projection, Vertical, write_layer
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
@@ -369,6 +371,38 @@ def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
     result = invoke("reference", out, "--points", few, "--ellipsoid", "--no-register", *given(files))
     assert result.exit_code == 0, result.output
     assert "10 pixels with a true disparity" in result.output
+
+
+def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_path):
+    out, files, reference = relief
+    heights = tmp_path / "heights.tif"
+    shutil.copy(reference, heights)
+
+    def replace(stage, done, total):
+        if stage == "truth":
+            shutil.copy(reference, tmp_path / "new.tif")
+            (tmp_path / "new.tif").replace(heights)
+
+    given_heights = Reference(heights, False, Vertical(True, None))
+    with pytest.raises(RunError, match=r"heights.tif was replaced or changed while it was read: rerun the command"):
+        make_truth(out, SensorFiles(*files), given_heights, path=tmp_path / "truth.tif", progress=replace)
+    assert not (tmp_path / "truth.tif").exists()
+
+
+@pytest.mark.parametrize("name", ["intervals.tif", "truth.tif"])
+def test_reference_command__replaces_only_a_truth_of_its_own(relief, tmp_path, name):
+    out, files, reference = relief
+    mine = tmp_path / name
+    if name == "truth.tif":  # as that of the demo
+        write_layer(mine, np.zeros((9, 9), np.float32), np.nan, Georeferencing(), MARK)
+    else:
+        shutil.copy(out / name, mine)
+    before = mine.read_bytes()
+    words = "reference", out, "--heights", reference, "--ellipsoid", "--no-register", "--output", mine, *given(files)
+    assert f"{name} exists and was not made by sat-intervals" in invoke(*words).stderr
+    assert mine.read_bytes() == before
+    mine.unlink()
+    assert [invoke(*words).exit_code for _ in range(2)] == [0, 0]
 
 
 def test_reference_command__needs_points_of_the_run_to_register(relief, tmp_path):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import re
 import shutil
 
@@ -120,3 +121,6 @@ def test_stac__replaces_its_own_item_only(made, tmp_path):
     assert done.exit_code == 2
     assert done.stderr == f"sat-intervals: {out / 'stac.json'} exists and was not made by sat-intervals: move it away\n"
     assert (out / "stac.json").read_text() == '{"properties": {}}'
+    (out / "stac.json").unlink()
+    os.mkfifo(out / "stac.json")
+    assert f"{out / 'stac.json'} is a named pipe" in invoke("stac", out).stderr

@@ -1,6 +1,7 @@
 """Calibrations of demo scenes: through the engine, against runs with them, and from mistaken inputs."""
 
 import json
+import os
 from shutil import copytree
 
 import numpy as np
@@ -15,13 +16,14 @@ from sat_intervals.cli.matching import Settings
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
+from sat_intervals.errors import RunError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.match import measurement
 from sat_intervals.raster import write_layer
 from sat_intervals.run import tune
 from sat_intervals.run.calibrate import check_subjects
 from sat_intervals.run.job import prepare
-from sat_intervals.run.measure import Subject, truth_of
+from sat_intervals.run.measure import Subject, measure_subjects, truth_of
 from sat_intervals.run.tune import Tuned, best_of, candidates
 
 
@@ -137,10 +139,26 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     assert "existing folder" in one_line(invoke("calibrate", scene, "--output", tmp_path / "no" / "new.yaml"))
     assert "truth.tif" in one_line(invoke("calibrate", scene, "--output", scene / "truth.tif"))
     assert "is an input" in one_line(invoke("calibrate", scene, "--output", scene / "meta.json"))
-    (tmp_path / "other.yaml").write_text("tiles: {size: 512}\n")
-    assert "was not made by" in one_line(invoke("calibrate", scene, "--output", tmp_path / "other.yaml"))
-    assert (tmp_path / "other.yaml").read_text() == "tiles: {size: 512}\n"
+    for text in ("tiles: {size: 512}\n", "# Settings with tiles of my own\n"):
+        (tmp_path / "other.yaml").write_text(text)
+        assert "was not made by" in one_line(invoke("calibrate", scene, "--output", tmp_path / "other.yaml"))
+        assert (tmp_path / "other.yaml").read_text() == text
+    os.mkfifo(tmp_path / "pipe")
+    assert "is a named pipe" in one_line(invoke("calibrate", scene, "--output", tmp_path / "pipe"))
     assert not (tmp_path / "new.yaml").exists()
+
+
+def test_measure_subjects__ends_where_a_truth_is_replaced_meanwhile(scene, tmp_path):
+    for name in ("left.tif", "right.tif", "truth.tif", "meta.json"):
+        (tmp_path / name).write_bytes((scene / name).read_bytes())
+    subjects = _subjects((tmp_path,), (), _Judging(Settings(None, {}), 0.0, False, False))
+
+    def replace(stage, done, total):
+        if stage == "tiles":
+            (tmp_path / "truth.tif").write_bytes((scene / "truth.tif").read_bytes())
+
+    with pytest.raises(RunError, match=r"truth.tif was replaced or changed while it was read: rerun the command"):
+        measure_subjects(subjects, tmp_path, replace)
 
 
 def off(folder):

@@ -348,6 +348,9 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
         "store.json",
         "records/notes.json",
         "failures/all.json",
+        "borders/notes",
+        "costs/notes",
+        "parts/notes",
         "arrays.zarr/int16/table",
         "arrays.zarr/.zattrs",
     ]
@@ -445,6 +448,15 @@ def test_match__keeps_empty_files_in_a_folder_without_signs_of_a_run(scene, tmp_
     match(scene, tmp_path / "out")
     assert_same(scene, tmp_path / "out")
     assert [file.stat().st_size for file in mine] == [0, 0]
+
+
+def test_match__goes_on_after_a_kill_at_the_first_file_of_its_tiles(scene, tmp_path):
+    unfinished = tmp_path / "out" / "tiles" / "arrays.zarr" / f".zarr.json.{'0123456789abcdef' * 2}"
+    unfinished.parent.mkdir(parents=True)
+    unfinished.write_text((scene / "kept" / "tiles" / "arrays.zarr" / "zarr.json").read_text()[:40])
+    match(scene, tmp_path / "out")
+    assert_same(scene, tmp_path / "out")
+    assert not (tmp_path / "out" / "tiles").exists()
 
 
 @pytest.mark.parametrize("name", [SHARDS[0], "records/1_0.json"])

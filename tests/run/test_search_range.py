@@ -12,7 +12,7 @@ from matplotlib.image import imread
 
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
-from sat_intervals.raster import write_layer
+from sat_intervals.raster import MARK, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
 from sat_intervals.run import schedule
@@ -149,6 +149,12 @@ def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
     result = invoke("range", *images, "--output", tmp_path / "other.tif")
     assert result.exit_code == 2
     assert "was not made by sat-intervals" in result.stderr
+    write_layer(tmp_path / "truth.tif", np.zeros((9, 9), np.float32), np.nan, PLACE, MARK)
+    before = (tmp_path / "truth.tif").read_bytes()
+    result = invoke("range", *images, "--output", tmp_path / "truth.tif")
+    assert result.exit_code == 2
+    assert "truth.tif exists and has no local ranges" in result.stderr
+    assert (tmp_path / "truth.tif").read_bytes() == before
 
 
 def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
