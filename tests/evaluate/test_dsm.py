@@ -157,7 +157,7 @@ def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkey
     inside = ((height - 1 <= truth) & (truth <= height + 2))[known]
     assert whole["all"]["coverage"] == pytest.approx(inside.mean(), abs=2e-3)
     assert whole["all"]["median"] == pytest.approx(np.median((height - truth)[known]), abs=0.01)
-    monkeypatch.setattr("sat_intervals.evaluate.dsm._TILE", 14**2)
+    monkeypatch.setattr("sat_intervals.evaluate.comparison._TILE", 14**2)
     assert evaluate_surface(model, reference, registers=False) == whole
 
 
