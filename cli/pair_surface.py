@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.dsm import cell_options, say_surface
+from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
 from sat_intervals.cli.options import (
     check_strict,
     disparity_option,
@@ -22,6 +22,7 @@ from sat_intervals.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from sat_intervals.config import Interval
     from sat_intervals.raster import Image
     from sat_intervals.tiling import Window
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 @click.argument("out", callback=path)
 @sensor_options
 @cell_options
+@calibration_option("--height-calibration")
 @disparity_option
 @local_option
 @grid_option
@@ -71,7 +73,7 @@ def surface(
         from sat_intervals.run.before import report_before
         from sat_intervals.run.pair import match_pair
 
-        _check(out, cells, sensor_files, config_file)
+        _check(out, cells, sensor_files, config_file, config.interval)
         images = open_images(left, right)
         report = None if overwrite else report_before(*images, out, config, window)
         if report is None:
@@ -85,9 +87,15 @@ def surface(
     check_strict(strict, report["warnings"])
 
 
-def _check(out: Path, cells: dict[str, Any], sensor_files: tuple[Path, Path, Path, Path], config: Path | None) -> None:
+def _check(
+    out: Path,
+    cells: dict[str, Any],
+    sensor_files: tuple[Path, Path, Path, Path],
+    config: Path | None,
+    interval: "Interval | None",
+) -> None:
     """Raise for what the later steps cannot use, before hours of matching."""
-    from sat_intervals.heights.dsm import checked_cells
+    from sat_intervals.heights.dsm import checked_cells, surface_tags
     from sat_intervals.heights.sensors import Sensors
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS
@@ -95,5 +103,6 @@ def _check(out: Path, cells: dict[str, Any], sensor_files: tuple[Path, Path, Pat
     results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
     like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
     check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
-    checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
+    _, cell, _, radius = checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
+    surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
     Sensors.load(*sensor_files)

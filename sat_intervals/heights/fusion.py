@@ -1,10 +1,12 @@
-"""Fuse the cells of several runs: intersection of their intervals if they overlap, else their hull."""
+"""Make the intervals of cells: from sums over points, from those of several runs, by a calibration."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from sat_intervals.config import HeightCalibration
+from sat_intervals.kernels.conformal import widened
 from sat_intervals.kernels.splat import BOUNDED, CONFIDENCE, COUNT, HEIGHT, LEAST, LOWER, MOST, UPPER, WEIGHT
 from sat_intervals.products import SURFACE
 
@@ -57,6 +59,13 @@ def fused(runs: Sequence[RunCells]) -> np.ndarray:
         "agreement": np.where(several, overlapping, np.nan),
     }
     return np.stack([bands[band.name] for band in SURFACE]).astype(np.float32)
+
+
+def calibrate(bands: np.ndarray, calibration: HeightCalibration) -> None:
+    """Widen or narrow the intervals of cells by the margins of a calibration, in place."""
+    limits, margins = np.array(calibration.limits), np.array(calibration.margins)
+    lower, upper = widened(*bands[:3].astype(np.float64), limits, margins)
+    bands[1], bands[2] = _outwards(lower, -np.inf), _outwards(upper, np.inf)
 
 
 def without_poor_cells(bands: np.ndarray, max_width: float | None, min_confidence: float | None) -> int:

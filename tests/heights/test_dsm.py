@@ -160,8 +160,8 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     whole, place, _ = surface_of([out], tmp_path)
     monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 7)
-    monkeypatch.setattr("sat_intervals.heights.dsm._TILE_ROWS", 20)
-    monkeypatch.setattr("sat_intervals.heights.dsm._TILE_COLUMNS", 25)
+    monkeypatch.setattr("sat_intervals.heights.cells._TILE_ROWS", 20)
+    monkeypatch.setattr("sat_intervals.heights.cells._TILE_COLUMNS", 25)
     tiled, same_place, _ = surface_of([out], tmp_path)
     assert place == same_place
     assert_allclose(tiled, whole, atol=1e-4)
@@ -224,7 +224,7 @@ def test_make_surface__heights_do_not_depend_on_the_bounds(tmp_path, bounds, mon
     assert (narrow[1:3][[0, 1]] >= wide[[1, 1]])[0][np.isfinite(wide[0])].all()
     assert (narrow[1] <= narrow[0])[np.isfinite(wide[0])].all()
     assert (narrow[2] <= wide[2])[np.isfinite(wide[0])].all()
-    monkeypatch.setattr("sat_intervals.heights.dsm._LISTED_POINTS", 100)  # small tiles
+    monkeypatch.setattr("sat_intervals.heights.cells._LISTED_POINTS", 100)  # small tiles
     tiled, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds=bounds))
     assert_allclose(tiled, narrow, atol=1e-4)
 
