@@ -98,17 +98,11 @@ def calibrate(
         raise click.UsageError("--coverage and --calibration are options of match: leave them out.")
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
-    from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.calibrate import calibration_from, check_subjects
+    from sat_intervals.run.calibrate import calibration_from
     from sat_intervals.run.measure import measure_subjects
 
     settings = _Settings(config_file, given, tolerance, remove_bias, by_group)
-    subjects = _subjects(pairs, truth, settings)
-    inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
-    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
-    check_not_replaced([*inputs, *described, *truth, config_file], [output])
-    folder = _checked_folder(output)
-    check_subjects(subjects)
+    subjects, folder = _checked_subjects(pairs, truth, settings, output)
     with Console(quiet or as_json) as console:
         if tune:
             _tune(subjects, output, folder, name, console, as_json)
@@ -132,6 +126,22 @@ class _Settings:
     tolerance: float
     remove_bias: bool
     by_group: bool
+
+
+def _checked_subjects(
+    pairs: tuple[Path, ...], truth: tuple[Path, ...], settings: _Settings, output: Path
+) -> "tuple[list[Subject], Path]":
+    """Return the pairs to calibrate, and the folder of the file to write; raise if they cannot be used."""
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.run.calibrate import check_subjects
+
+    subjects = _subjects(pairs, truth, settings)
+    inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
+    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
+    check_not_replaced([*inputs, *described, *truth, settings.config_file], [output])
+    folder = _checked_folder(output)
+    check_subjects(subjects)
+    return subjects, folder
 
 
 def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Settings) -> "list[Subject]":

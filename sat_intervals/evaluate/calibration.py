@@ -28,8 +28,8 @@ from sat_intervals.raster import read_tags
 
 # Heights that are used: a sample, if there are more.
 _MOST = 1 << 20
-# Classes with the same number of cells, and blocks along each side of the ground.
-_CLASSES, _BLOCKS = 8, 4
+# Classes with the same number of cells, fewer with few cells; blocks along each side of the ground.
+_CLASSES, _BLOCKS = (8, 4, 2, 1), 4
 # Metres: a larger median difference is another datum, not an error.
 _DATUM = 10.0
 
@@ -161,12 +161,13 @@ def _check_datum(given: Comparison, sample: _Sample, up: float) -> None:
 
 
 def _fit(sample: _Sample, cells_of_height: float, coverage: float) -> _Margins | None:
-    """Return margins by classes of width, of one class with fewer cells; None with too few for that."""
+    """Return margins by classes of width, of one class with few cells; None with too few for that."""
     scores = np.maximum(sample.lower - sample.reference, sample.reference - sample.upper)
     width = sample.width
-    for count in (_CLASSES, 1) if width.size else ():
-        limits = np.unique(np.round(np.quantile(width, np.arange(1, count) / count), 2))
-        limits = limits[limits > 0]
+    for count in _CLASSES if width.size else ():
+        # between centimetres, so that rounding does not part intervals of one width
+        limits = np.unique(np.round(np.quantile(width, np.arange(1, count) / count), 2)) + 0.005
+        limits = limits[limits < width.max()]
         kinds = np.searchsorted(limits, width, side="right")
         cells = cells_of_height * np.bincount(kinds, minlength=limits.size + 1)
         if cells.min() >= least_number(coverage):

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from pyproj import Transformer
-from rasterio.transform import Affine
+from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
@@ -369,14 +369,6 @@ def test_make_surface__file_says_what_it_is(tmp_path):
         tags = dataset.tags()
     assert (tags["INTERVAL"], tags["RADIUS"]) == ("envelope", "1 m")
     assert tags["HEIGHTS"] == "above the WGS 84 ellipsoid"
-
-
-def write_geoid(path, height):
-    """A geoid at one height over the whole area."""
-    kind = {"height": 4, "width": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(path, "w", driver="GTiff", transform=Affine(1, 0, 0, 0, -1, 46), **kind) as grid:
-        grid.write(np.full((1, 4, 4), height, np.float32))
-    return path
 
 
 def test_make_surface__heights_count_from_a_geoid(tmp_path):

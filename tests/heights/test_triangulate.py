@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import rasterio
-from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid
+from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid, sensor_words
 from finished import MAXIMUM, MINIMUM, write_run
 from helpers import invoke, write_pair
 from rasterio.transform import Affine
@@ -196,18 +196,13 @@ def test_lattice__equals_shareloc(shared_data):
 
 
 FILES = ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif")
-OPTIONS = ("--left-model", "--right-model", "--left-grid", "--right-grid")
-
-
-def given(files):
-    return [word for pair in zip(OPTIONS, files, strict=True) for word in pair]
 
 
 def test_commands__a_real_pair_to_a_surface_like_that_of_a_peer(shared_data, tmp_path):
     folder, out = shared_data / "dsm_picanteo", tmp_path / "out"
     steps = [
         ("match", folder / "left.tif", folder / "right.tif", out, "--disparity", -35, 18, "--quiet"),
-        ("triangulate", out, *given(folder / name for name in FILES)),
+        ("triangulate", out, *sensor_words(folder / name for name in FILES)),
         ("dsm", out, "--resolution", 1),
     ]
     for step in steps:
@@ -276,7 +271,7 @@ def test_triangulate_command__what_it_cannot_use_gets_one_line(level_run, tmp_pa
         ({3: descending}, "rows of {descending} are in descending order: give a grid in ascending order"),
     ]
     for changed, message in cases:
-        result = invoke("triangulate", out, *given(changed.get(place, file) for place, file in enumerate(files)))
+        result = invoke("triangulate", out, *sensor_words(changed.get(place, file) for place, file in enumerate(files)))
         assert result.exit_code == 2, result.output
         assert message.format(descending=descending) in result.output
         assert result.output.count("\n") == 1
@@ -292,11 +287,11 @@ def upside_down(file):
 def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_path):
     out, files = level_run
     shifted = grid(tmp_path / "shifted.tif", 40, 50, offset=1.5)
-    result = invoke("triangulate", out, *given([*files[:3], shifted]), "--quiet")
+    result = invoke("triangulate", out, *sensor_words([*files[:3], shifted]), "--quiet")
     assert result.exit_code == 0, result.output
     assert "warning: lines of sight miss each other by 0." in result.stderr
     assert result.stdout == ""
-    assert invoke("triangulate", out, *given(files)).stderr == ""
+    assert invoke("triangulate", out, *sensor_words(files)).stderr == ""
 
 
 def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path):
@@ -306,7 +301,7 @@ def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_
         positions = file.read()
         positions[:, 2, 2] = np.nan  # of epipolar row and column 0, a node of the lattice
         file.write(positions)
-    result = invoke("triangulate", out, *given(files))
+    result = invoke("triangulate", out, *sensor_words(files))
     assert result.exit_code == 0, result.output
     points = read(out / "points.tif")[BAND["height"]]
     lost = np.isnan(points)
@@ -357,7 +352,7 @@ def test_triangulate__keeps_foreign_points(level_run):
 
 def test_triangulate_command__needs_a_run(tmp_path):
     files = cameras(tmp_path, 40, 50)
-    result = invoke("triangulate", tmp_path, *given(files))
+    result = invoke("triangulate", tmp_path, *sensor_words(files))
     assert result.exit_code == 2
     assert "give the folder of a finished run" in result.output
 
@@ -366,8 +361,7 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     scene = make_scene(120, 150, seed=4)
     write_pair(tmp_path, scene)
     files = cameras(tmp_path, *scene.truth.shape)
-    options = ["--left-model", "--right-model", "--left-grid", "--right-grid"]
-    sensors = [str(word) for pair in zip(options, files, strict=True) for word in pair]
+    sensors = list(map(str, sensor_words(files)))
     images = [str(tmp_path / name) for name in ("left.tif", "right.tif")]
     search = ["--disparity", str(scene.minimum), str(scene.maximum)]
     out, steps = tmp_path / "one", tmp_path / "steps"
