@@ -15,6 +15,7 @@ from pyproj import Transformer
 from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
+from sat_intervals.config import load_height_calibration
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
@@ -263,6 +264,44 @@ def test_make_surface__poor_cells_are_no_data(tmp_path):
     assert_array_equal(np.isfinite(surface[0, i, [j, j + 5, j + 9]]), [True, False, False])
     assert report["poor_cells"] == 2
     assert np.isfinite(surface[3]).sum() == 1
+
+
+CALIBRATION = """\
+name: city
+coverage: 0.8
+surface: {CELL: 1 m, PAIRS: '1', INTERVAL: median, RADIUS: 0.6 m, COVERAGE: '0.9', OPEN_POINTS: left out}
+classes:
+- {below: 5.0, margin: 0.75, cells: 100}
+- {below: null, margin: -4.0, cells: 100}
+"""
+
+
+def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tmp_path):
+    # Heights 10, bounds 1 below and 2, 9 above: 8.25 to 12.75; 10 (not past the height) to 15.
+    out = write_points(tmp_path / "a", [0.5, 4.5], [-0.5] * 2, [10.0] * 2, upper=[[2, 9]])
+    file = tmp_path / "heights.yaml"
+    file.write_text(CALIBRATION)
+    words = ["dsm", str(with_coverage(out)), "--resolution", "1", "--radius", "0.6", "--calibration", str(file)]
+    result = invoke(*words, "--max-width", "6")
+    assert result.exit_code == 0, result.stderr
+    assert "by --bounds median, calibration city" in result.stdout
+    with rasterio.open(out / "dsm.tif") as dataset:
+        (surface, place), tags = (dataset.read(), dataset.transform), dataset.tags()
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(surface[:3, i, [j, j + 4]].T, [(10, 8.25, 12.75), (10, 10, 15)], atol=1e-5)
+    assert (tags["COVERAGE"], tags["HEIGHTS"]) == ("0.8", "above the WGS 84 ellipsoid")
+    assert tags["CALIBRATION"] == f"city {load_height_calibration(file).sha256}"
+    for changes, message in (
+        (["--resolution", "2"], "belongs to other surfaces, CELL is 1 m there and 2 m here: make one with"),
+        (["--bounds", "mean"], "INTERVAL is median there and mean here"),
+        (["--radius", "1"], "RADIUS is 0.6 m there and 1 m here"),
+        (["--outliers", "9"], "OUTLIERS is null there and 9 m here"),
+        (["--calibration", str(tmp_path / "none.yaml")], "No such file or directory: make one with"),
+    ):
+        result = invoke(*words, *changes)
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+        assert result.stderr.count("\n") == 1
 
 
 def test_make_surface__takes_the_grid_of_a_raster(tmp_path):
