@@ -4,24 +4,15 @@ from pathlib import Path
 
 import click
 
+from sat_intervals.cli.judging import Judging, judging_options, say_json
 from sat_intervals.cli.options import cost_option
-from sat_intervals.cli.pairs import judging_options, overrides, say_json
 
 
 @click.command(short_help="Compare parts of the method on pairs with known truth.")
 @click.argument("pairs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @cost_option
 @judging_options
-def ablate(
-    pairs: tuple[Path, ...],
-    cost: str | None,
-    preset: str | None,
-    config_file: Path | None,
-    accurate: bool,
-    tolerance: float,
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def ablate(pairs: tuple[Path, ...], cost: str | None, judging: Judging) -> None:
     """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS (the paper's table 2).
 
     Every pair is matched once, in memory. The table shows the accuracy (share of valid pixels whose interval contains
@@ -32,21 +23,18 @@ def ablate(
     group. Paths in the file are relative to it.
     """
     from sat_intervals.cli.tables import show_groups
-    from sat_intervals.config import load_config
     from sat_intervals.config.pairs import find_pairs
     from sat_intervals.evaluate.ablation import ablate_pair
     from sat_intervals.evaluate.paper import SceneMetrics, table_2
 
     found = find_pairs(pairs)
-    configs = [
-        load_config(config_file, overrides(pair.minimum, pair.maximum, accurate, preset, cost)) for pair in found
-    ]
+    configs = [judging.load(pair, cost) for pair in found]
     scenes = []
     for pair, config in zip(found, configs, strict=True):
-        if not quiet:
+        if not judging.quiet:
             click.echo(f"matching {pair.name}", err=True)
-        scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, config, tolerance=tolerance)))
-    if as_json:
+        scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, config, tolerance=judging.tolerance)))
+    if judging.as_json:
         say_json(scenes)
     else:
         show_groups(table_2(scenes), "accuracy, means over scenes, valid pixels")

@@ -17,13 +17,13 @@ import click
 from sat_intervals.cli.ablate import ablate
 from sat_intervals.cli.batch import batch
 from sat_intervals.cli.calibrate import calibrate
+from sat_intervals.cli.config import config
 from sat_intervals.cli.demo import demo
 from sat_intervals.cli.dsm import dsm
 from sat_intervals.cli.evaluate import evaluate
 from sat_intervals.cli.export import export
 from sat_intervals.cli.logs import printable
 from sat_intervals.cli.match import match
-from sat_intervals.cli.pair_surface import surface
 from sat_intervals.cli.plan import plan
 from sat_intervals.cli.plot import plot
 from sat_intervals.cli.process import check_process
@@ -31,10 +31,10 @@ from sat_intervals.cli.project import project
 from sat_intervals.cli.range import search_range
 from sat_intervals.cli.reference import reference
 from sat_intervals.cli.report import report
-from sat_intervals.cli.settings import config
 from sat_intervals.cli.signals import Ended, armed
 from sat_intervals.cli.stac import stac
 from sat_intervals.cli.status import status
+from sat_intervals.cli.surface import surface
 from sat_intervals.cli.triangulate import triangulate
 
 FAILED, USER_ERROR = 1, 2

@@ -1,11 +1,11 @@
 """``sat-intervals batch``: match many pairs on one cluster."""
 
 from pathlib import Path
-from typing import Any
 
 import click
 
-from sat_intervals.cli.options import check_strict, json_option, path, run_options, say_json, settings_options
+from sat_intervals.cli.matching import Run, Settings, run_options, settings_options
+from sat_intervals.cli.options import json_option, path, say_json
 
 
 @click.command(short_help="Match many pairs; a rerun does what is missing.")
@@ -14,17 +14,7 @@ from sat_intervals.cli.options import check_strict, json_option, path, run_optio
 @json_option
 @settings_options
 @run_options
-def batch(
-    pairs: Path,
-    out: Path,
-    config_file: Path | None,
-    as_json: bool,
-    given: dict[str, Any],
-    keep_tiles: bool,
-    overwrite: bool,
-    strict: bool,
-    quiet: bool,
-) -> None:
+def batch(pairs: Path, out: Path, as_json: bool, settings: Settings, run: Run) -> None:
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
@@ -36,16 +26,16 @@ def batch(
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.batch import match_batch
 
-    check_not_replaced([pairs, config_file], [out / REPORT])
+    check_not_replaced([pairs, settings.file], [out / REPORT])
     rows = read_batch(pairs)
-    with Console(quiet or as_json) as console:
+    with Console(run.quiet or as_json) as console:
         report = match_batch(
             rows,
             out,
-            config_file,
-            overrides=given,
-            overwrite=overwrite,
-            keep_tiles=keep_tiles,
+            settings.file,
+            overrides=settings.sections,
+            overwrite=run.overwrite,
+            keep_tiles=run.keep_tiles,
             progress=console.progress,
         )
     if as_json:
@@ -60,4 +50,4 @@ def batch(
         raise RunError(
             f"{len(failed)} of {len(report)} pairs failed; rerun the same command: it does what is missing:\n{lines}"
         )
-    check_strict(strict, [line for end in report.values() for line in end.get("warnings", ())])
+    run.check_strict([line for end in report.values() for line in end.get("warnings", ())])

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.heights import Heights, height_options, show_heights
-from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, settings_options
-from sat_intervals.cli.pairs import finite
+from sat_intervals.cli.calibrate_dsm import Heights, height_options, show_heights
+from sat_intervals.cli.judging import tolerance_option
+from sat_intervals.cli.matching import Settings, settings_options
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -39,10 +40,7 @@ _HEADS = _CALIBRATION, _SETTINGS, _HEIGHTS
 @click.argument("pairs", nargs=-1, type=_FILE)
 @click.option("--output", callback=path, required=True, metavar="FILE", help="Calibration to write (YAML).")
 @click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order.")
-@click.option(
-    "--tolerance", type=click.FloatRange(min=0), default=0.0, callback=finite, metavar="PX",
-    help="Truth up to PX outside an interval counts as inside; for quantised truth, give half a step.",
-)  # fmt: skip
+@tolerance_option
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth of each pair to its truth.")
 @click.option(
     "--by-group", is_flag=True, help="Leave out all pairs of a group together (meta.json, CSV), not each pair."
@@ -59,17 +57,14 @@ _HEADS = _CALIBRATION, _SETTINGS, _HEIGHTS
 def calibrate(
     pairs: tuple[Path, ...],
     output: Path,
-    heights: Heights | None,
     truth: tuple[Path, ...],
-    tolerance: float,
-    remove_bias: bool,
-    by_group: bool,
     name: str | None,
     tune: bool,
+    heights: Heights | None,
+    settings: Settings,
     as_json: bool,
-    config_file: Path | None,
-    given: dict[str, Any],
     quiet: bool,
+    **judging: Any,
 ) -> None:
     """Find the levels of the cost curve whose intervals reach coverages of .5 to .99 on PAIRS, and write them to FILE.
 
@@ -84,25 +79,29 @@ def calibrate(
     The table shows what to expect: figures of each pair with the levels found on the others, means over pairs. A single
     pair is judged in 16 blocks.
 
-    With --dsm: find the metres that intervals of a surface model need to contain its coverage, or --coverage, of the
-    heights of --reference. Use them with: dsm --calibration FILE.
+    With --dsm: find the metres that the intervals of a surface model need to contain its coverage, or --coverage, of
+    the heights of --reference. Use them with: dsm --calibration FILE.
     """
     if heights is not None:
-        options = {"--truth": truth, "--tolerance": tolerance, "--remove-bias": remove_bias, "--by-group": by_group}
-        coverage = heights.coverage(pairs, given, options | {"--tune": tune, "--config": config_file})
-        _calibrate_heights(heights, output, name or output.stem, coverage, as_json, quiet)
+        heights.check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
+        _calibrate_heights(heights, output, name, settings, as_json, quiet)
         return
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
-    if "interval" in given:
+    if "interval" in settings.sections:
         raise click.UsageError("--coverage and --calibration are options of match: leave them out.")
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
-    from sat_intervals.run.calibrate import calibration_from
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.run.calibrate import calibration_from, check_subjects
     from sat_intervals.run.measure import measure_subjects
 
-    settings = _Settings(config_file, given, tolerance, remove_bias, by_group)
-    subjects, folder = _checked_subjects(pairs, truth, settings, output)
+    subjects = _subjects(pairs, truth, _Judging(settings, **judging))
+    inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
+    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
+    check_not_replaced([*inputs, *described, *truth, settings.file], [output])
+    folder = _checked_folder(output)
+    check_subjects(subjects)
     with Console(quiet or as_json) as console:
         if tune:
             _tune(subjects, output, folder, name, console, as_json)
@@ -118,33 +117,16 @@ def calibrate(
 
 
 @dataclass(frozen=True)
-class _Settings:
+class _Judging:
     """Options that decide how pairs are matched and compared with their truth."""
 
-    config_file: Path | None
-    given: dict[str, Any]
+    settings: Settings
     tolerance: float
     remove_bias: bool
     by_group: bool
 
 
-def _checked_subjects(
-    pairs: tuple[Path, ...], truth: tuple[Path, ...], settings: _Settings, output: Path
-) -> "tuple[list[Subject], Path]":
-    """Return the pairs to calibrate, and the folder of the file to write; raise if they cannot be used."""
-    from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.calibrate import check_subjects
-
-    subjects = _subjects(pairs, truth, settings)
-    inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
-    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
-    check_not_replaced([*inputs, *described, *truth, settings.config_file], [output])
-    folder = _checked_folder(output)
-    check_subjects(subjects)
-    return subjects, folder
-
-
-def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Settings) -> "list[Subject]":
+def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judging) -> "list[Subject]":
     """Open the pairs and runs named by the arguments, in their order."""
     from sat_intervals.config.pairs import check_names, find_pairs, is_pair
     from sat_intervals.errors import SatIntervalsError
@@ -162,34 +144,32 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], settings: _Sett
     if len(truths) not in (0, len(found)):
         raise SatIntervalsError(f"--truth is given {len(truths)} times for {len(found)} PAIRS: give it once for each")
     subjects = [
-        _of_pair(pair, truth, settings) if pair else _of_run(source, truth, settings)
+        _of_pair(pair, truth, judging) if pair else _of_run(source, truth, judging)
         for (source, pair), truth in zip(found, truths or (None,) * len(found), strict=True)
     ]
     check_names(subject.name for subject in subjects)
     return subjects
 
 
-def _of_pair(pair: "Pair", truth: Path | None, settings: _Settings) -> "Subject":
-    from sat_intervals.config import load_config
+def _of_pair(pair: "Pair", truth: Path | None, judging: _Judging) -> "Subject":
     from sat_intervals.raster import open_image
     from sat_intervals.run.measure import Subject, truth_of
 
-    search = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
-    config = load_config(settings.config_file, settings.given | search)
+    config = judging.settings.load(disparity={"minimum": pair.minimum, "maximum": pair.maximum})
     left = open_image(pair.left)
     return Subject(
         pair.name,
-        pair.group if settings.by_group else pair.name,
+        pair.group if judging.by_group else pair.name,
         left,
         open_image(pair.right),
         truth_of(left, truth or pair.truth),
         config,
-        tolerance=settings.tolerance if pair.tolerance is None else pair.tolerance,
-        remove_bias=settings.remove_bias if pair.remove_bias is None else pair.remove_bias,
+        tolerance=judging.tolerance if pair.tolerance is None else pair.tolerance,
+        remove_bias=judging.remove_bias if pair.remove_bias is None else pair.remove_bias,
     )
 
 
-def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
+def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
     """Open a finished run, with its own settings unless the options choose others."""
     from sat_intervals.config import Cluster, load_config
     from sat_intervals.config.pairs import group_beside
@@ -200,15 +180,15 @@ def _of_run(out: Path, truth: Path | None, settings: _Settings) -> "Subject":
     run = open_results(out, truth)
     if run.truth is None:
         raise SatIntervalsError(f"{out}: there is no truth.tif beside its left image {run.left.path}: give --truth")
-    if settings.config_file or settings.given.keys() & {"preset", "cost"}:
-        search = {"disparity": run.config.disparity.model_dump()}
-        config = load_config(settings.config_file, settings.given | search)
+    settings = judging.settings
+    if settings.file or settings.sections.keys() & {"preset", "cost"}:
+        config = settings.load(disparity=run.config.disparity.model_dump())
     else:
         here = run.config.model_copy(update={"cluster": Cluster()})  # the run's may be jobs of a batch system
-        config = load_config(here, settings.given)
-    group = group_beside(run.left.path) if settings.by_group else str(out)
+        config = load_config(here, settings.sections)
+    group = group_beside(run.left.path) if judging.by_group else str(out)
     return Subject(
-        str(out), group, run.left, run.right, run.truth, config, run.region, settings.tolerance, settings.remove_bias
+        str(out), group, run.left, run.right, run.truth, config, run.region, judging.tolerance, judging.remove_bias
     )
 
 
@@ -239,17 +219,17 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
 
 
 def _calibrate_heights(
-    heights: Heights, output: Path, name: str, coverage: float | None, as_json: bool, quiet: bool
+    heights: Heights, output: Path, name: str | None, settings: Settings, as_json: bool, quiet: bool
 ) -> None:
-    """Calibrate the intervals of a surface model."""
+    """Calibrate the intervals of a surface model, and write and print their margins."""
     from sat_intervals.evaluate.calibration import calibrate_surface
     from sat_intervals.raster.identity import check_not_replaced
 
     check_not_replaced([heights.dsm, heights.reference], [output])
     _checked_folder(output)
-    calibration = calibrate_surface(
-        heights.dsm, heights.reference, name, coverage=coverage, registers=heights.registers
-    )
+    coverage = settings.sections.get("interval", {}).get("coverage")
+    files = heights.dsm, heights.reference
+    calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=heights.registers)
     _write(output, _HEIGHTS, calibration.model_dump(mode="json"))
     if as_json:
         say_json(calibration.model_dump(mode="json"))

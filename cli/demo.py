@@ -6,16 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import (
-    check_strict,
-    json_option,
-    local_option,
-    path,
-    run_options,
-    say_json,
-    settings_options,
-    with_range,
-)
+from sat_intervals.cli.matching import Run, Settings, local_option, run_options, settings_options
+from sat_intervals.cli.options import json_option, path, say_json
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -47,11 +39,8 @@ def demo(
     relief: float,
     local_range: bool,
     as_json: bool,
-    config_file: Path | None,
-    given: dict[str, Any],
-    strict: bool,
-    quiet: bool,
-    **run: Any,
+    settings: Settings,
+    run: Run,
 ) -> None:
     """Make a procedural satellite scene, match it and print how often the interval contains the truth.
 
@@ -61,35 +50,34 @@ def demo(
     and the files of `match`.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.cli.console import Console
-    from sat_intervals.config import load_config
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up, put_back, write_once
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS, check_output
-    from sat_intervals.run.pair import match_pair
     from sat_intervals.run.status import is_replacing
 
-    check_output(out, run["overwrite"])
+    check_output(out, run.overwrite)
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
-    overwrite = run["overwrite"] or is_replacing(out / "tiles")
+    overwrite = run.overwrite or is_replacing(out / "tiles")
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
-    with Console(quiet or as_json) as console, put_back(layers if overwrite else (), out / "run.json"):
+    with Console(run.quiet or as_json) as console, put_back(layers if overwrite else (), out / "run.json"):
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
-        config = load_config(config_file, with_range(given, (scene.minimum, scene.maximum), local_range))
-        check_not_replaced([config_file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
+        search = {"minimum": scene.minimum, "maximum": scene.maximum} | ({"local": True} if local_range else {})
+        config = settings.load(disparity=search)
+        check_not_replaced([settings.file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
             write_once(path, pixels, value, somewhere, overwrite=overwrite)
         console.progress("scene", 1, 1)
-        report = match_pair(out / "left.tif", out / "right.tif", out, config, progress=console.progress, **run)
+        report = run.match(out / "left.tif", out / "right.tif", out, config, progress=console.progress)
     figures = evaluate_run(out, out / "truth.tif")["all"]
     if as_json:
         say_json({"run": report, "truth": figures})
     else:
         console.summary(report, out)
-        _judge(config, out, figures, console, quiet)
-    check_strict(strict, report["warnings"])
+        _judge(config, out, figures, console, run.quiet)
+    run.check_strict(report["warnings"])
 
 
 def _judge(config: "Config", out: Path, figures: dict[str, Any], console: "Console", quiet: bool) -> None:

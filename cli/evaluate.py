@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.evaluate_dsm import Surface, surface_options
+from sat_intervals.cli.judging import Judging, judging_options, say_json
 from sat_intervals.cli.options import COSTS
-from sat_intervals.cli.pairs import judging_options, overrides, say_json
-from sat_intervals.cli.surface import Surface, surface_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -52,12 +52,7 @@ def evaluate(
     group: str | None,
     surface: Surface | None,
     cost: tuple[str, ...],
-    config_file: Path | None,
-    preset: str | None,
-    accurate: bool,
-    tolerance: float,
-    as_json: bool,
-    quiet: bool,
+    judging: Judging,
 ) -> None:
     """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
 
@@ -80,25 +75,26 @@ def evaluate(
     if surface:
         others = {
             "--truth": truth, "--mask": mask, "--remove-bias": remove_bias, "--group": group, "--cost": cost,
-            "--config": config_file, "--preset": preset, "--accurate": accurate, "--tolerance": tolerance,
+            "--config": judging.config_file, "--preset": judging.preset, "--accurate": judging.accurate,
+            "--tolerance": judging.tolerance,
         }  # fmt: skip
         surface.check_alone(folders, others)
-        surface.evaluate(as_json)
+        surface.evaluate(judging.as_json)
         return
     from sat_intervals.cli.tables import show_scene, show_scenes
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.evaluate.paper import SceneMetrics
 
     sources = _sources(folders, truth, mask, cost)
-    configs = _configs(sources, config_file, preset, accurate, cost)
-    judge = partial(evaluate_run, tolerance=tolerance, remove_bias=remove_bias)
+    configs = _configs(sources, judging, cost)
+    judge = partial(evaluate_run, tolerance=judging.tolerance, remove_bias=remove_bias)
     scenes = [
-        SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config, quiet))
+        SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config, judging.quiet))
         for source, config in zip(sources, configs, strict=True)
     ]
-    if not quiet:
-        _warn_of_whole_truth(scenes, tolerance)
-    if as_json:
+    if not judging.quiet:
+        _warn_of_whole_truth(scenes, judging.tolerance)
+    if judging.as_json:
         say_json(scenes)
     elif len(scenes) == 1:
         show_scene(scenes[0])
@@ -148,17 +144,14 @@ def _sources(
     ]
 
 
-def _configs(
-    sources: list[_Source], config_file: Path | None, preset: str | None, accurate: bool, costs: tuple[str, ...]
-) -> "list[Config | None]":
+def _configs(sources: list[_Source], judging: Judging, costs: tuple[str, ...]) -> "list[Config | None]":
     """Return the settings to match each pair with; None for a run."""
-    from sat_intervals.config import load_config
     from sat_intervals.errors import SatIntervalsError
 
     given = {
-        "--accurate": accurate,
-        f"--config {config_file}": config_file,
-        f"--preset {preset}": preset,
+        "--accurate": judging.accurate,
+        f"--config {judging.config_file}": judging.config_file,
+        f"--preset {judging.preset}": judging.preset,
         f"--cost {' '.join(costs)}": costs,
     }
     option = next((name for name, value in given.items() if value), None)
@@ -168,10 +161,11 @@ def _configs(
     for source in sources:
         config = None
         if source.pair:
-            more = overrides(source.pair.minimum, source.pair.maximum, accurate, preset, source.cost)
-            config = load_config(config_file, more | {"products": {"keep_rejected": True}})
+            config = judging.load(source.pair, source.cost, products={"keep_rejected": True})
             if config.interval is None:
-                raise SatIntervalsError(f"{config_file}: interval is null, but evaluate needs intervals: leave it on")
+                raise SatIntervalsError(
+                    f"{judging.config_file}: interval is null, but evaluate needs intervals: leave it on"
+                )
         configs.append(config)
     return configs
 

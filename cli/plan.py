@@ -1,71 +1,39 @@
 """``sat-intervals plan``: estimate tiles, memory, disk and time of a run."""
 
-from collections.abc import Callable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from sat_intervals.cli.options import (
-    disparity_option,
-    grid_option,
-    image_options,
-    json_option,
-    local_option,
-    log_options,
-    named,
-    say_json,
-    settings_options,
-    with_range,
-)
+from sat_intervals.cli.matching import Pair, Settings, pair_options, search_options
+from sat_intervals.cli.options import json_option, log_options, say_json
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from sat_intervals.raster import Image
     from sat_intervals.run.plan import Plan
-    from sat_intervals.tiling import Window
 
 
 @click.command(short_help="Estimate tiles, memory, disk and time of a run.")
-@click.argument("left", callback=named)
-@click.argument("right", callback=named)
-@disparity_option
-@local_option
-@grid_option
-@image_options
+@search_options
+@pair_options
 @click.option(
     "--memory", metavar="SIZE", help="Memory of a worker, such as 4GB: tiles are made smaller until one fits."
 )
 @json_option
-@settings_options
 @log_options
-def plan(
-    left: str,
-    right: str,
-    disparity: tuple[int, int] | None,
-    local_range: bool,
-    range_grid: str | None,
-    open_images: "Callable[[str, str], tuple[Image, Image]]",
-    window: "Window | None",
-    memory: str | None,
-    as_json: bool,
-    config_file: "Path | None",
-    given: dict[str, Any],
-) -> None:
+def plan(pair: Pair, settings: Settings, memory: str | None, as_json: bool) -> None:
     """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, from a small window matched at the centre.
 
     Options and settings are those of match.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.config import load_config
     from sat_intervals.run.plan import plan as make_plan
     from sat_intervals.run.workers import parse_memory
 
-    config = load_config(config_file, with_range(given, disparity, local_range, range_grid))
+    config = settings.load()
     limit = parse_memory(memory) if memory else None
     with Console(quiet=as_json) as console:
-        made = make_plan(*open_images(left, right), config, window=window, memory=limit, progress=console.progress)
+        left, right = pair.open()
+        made = make_plan(left, right, config, window=pair.window, memory=limit, progress=console.progress)
     if as_json:
         say_json(asdict(made))
         return

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.judging import finite
 from sat_intervals.cli.options import log_options
-from sat_intervals.cli.pairs import finite
 
 if TYPE_CHECKING:
     from sat_intervals.results import Results

@@ -1,39 +1,24 @@
 """``sat-intervals range``: find the search range of a pair, with its evidence."""
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import click
 
-from sat_intervals.cli.options import image_options, json_option, log_options, named, path, quiet_option, say_json
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from sat_intervals.raster import Image
-    from sat_intervals.tiling import Window
+from sat_intervals.cli.matching import Pair, pair_options
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
 
 # Bars of the histogram that are printed, each of several bins.
 _BARS = 8
 
 
 @click.command("range", short_help="Find the search range of a pair.")
-@click.argument("left", callback=named)
-@click.argument("right", callback=named)
-@image_options
+@pair_options
 @click.option("--output", callback=path, metavar="FILE", help="Write the local ranges, for --range-grid of match.")
 @json_option
 @quiet_option
 @log_options
-def search_range(
-    left: str,
-    right: str,
-    open_images: "Callable[[str, str], tuple[Image, Image]]",
-    window: "Window | None",
-    output: "Path | None",
-    as_json: bool,
-    quiet: bool,
-) -> None:
+def search_range(pair: Pair, output: Path | None, as_json: bool, quiet: bool) -> None:
     """Find the search range of the epipolar images LEFT and RIGHT, as match does without --disparity.
 
     Prints the range and its evidence; --output keeps the ranges of the cells. --window has no effect: a range is always
@@ -45,18 +30,18 @@ def search_range(
     from sat_intervals.run.search_range import find_here
 
     with Console(quiet or as_json) as console:
-        images = open_images(left, right)
+        left, right = pair.open()
         if output:
-            check_replaceable(output, *images)
-        found = find_here(*images, console.progress)
+            check_replaceable(output, left, right)
+        found = find_here(left, right, console.progress)
         if output:
-            write_ranges(output, found.local, images[0])
+            write_ranges(output, found.local, left)
     if as_json:
         say_json(found.report())
         return
     for name, value in _rows(found):
         click.echo(f"{name:<36}{value}")
-    for line in doubts(found.quality, {"left": left, "right": right}):
+    for line in doubts(found.quality, {"left": pair.left, "right": pair.right}):
         click.echo(line)
 
 

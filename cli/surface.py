@@ -1,134 +1,76 @@
-"""Evaluate a surface model: the options of ``sat-intervals evaluate --dsm``, and what they print and write."""
+"""``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-_FILE = click.Path(path_type=Path)
-# In the first line of files of figures: those without it are not replaced.
-_MARK = "sat-intervals"
+from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
+from sat_intervals.cli.matching import Pair, Run, Settings, pair_options, run_options, search_options
+from sat_intervals.cli.options import path, sensor_options
+
+if TYPE_CHECKING:
+    from sat_intervals.config import Interval
 
 
-@dataclass(frozen=True)
-class Surface:
-    """A surface model to evaluate, and how."""
+@click.command(short_help="Match a pair, triangulate it and make a surface model.")
+@search_options
+@pair_options
+@click.argument("out", callback=path)
+@sensor_options
+@cell_options
+@calibration_option("--height-calibration")
+@run_options
+def surface(
+    pair: Pair,
+    out: Path,
+    sensor_files: tuple[Path, Path, Path, Path],
+    cells: dict[str, Any],
+    settings: Settings,
+    run: Run,
+) -> None:
+    """Match the epipolar images LEFT and RIGHT, triangulate the run, and write its surface model to OUT/dsm.tif.
 
-    dsm: Path
-    reference: Path
-    classes: Path | None
-    registers: bool
-    folder: Path | None
-    line: tuple[float, float, float, float] | None
+    The same as `match`, `triangulate` and `dsm`, with their options and files. To resume, rerun the same command: a
+    finished match with these images and settings is kept, points and surface are made again.
+    """
+    from sat_intervals.cli.console import Console
 
-    def check_alone(self, folders: Sequence[Path], options: Mapping[str, Any]) -> None:
-        """Raise if there are runs to evaluate too, or options for them."""
-        for name, value in options.items():
-            if value:
-                raise click.UsageError(f"{name} applies to runs and pairs, not to --dsm: leave it out.")
-        if folders:
-            raise click.UsageError(f"{folders[0]} is a run and --dsm a surface model: evaluate one of them at a time.")
+    config = settings.load()
+    with Console(run.quiet) as console:
+        from sat_intervals.heights.dsm import make_surface
+        from sat_intervals.heights.triangulate import triangulate
+        from sat_intervals.run.before import report_before
 
-    def evaluate(self, as_json: bool) -> None:
-        """Print figures, and write them with pictures to the folder."""
-        from sat_intervals.cli.tables import show_surface
-        from sat_intervals.evaluate.dsm import evaluate_surface
-
-        if self.folder is not None and not self.folder.is_dir():
-            raise click.UsageError(f"--pictures {self.folder} is no folder: give an existing one.")
-        report = evaluate_surface(self.dsm, self.reference, self.classes, registers=self.registers)
-        if as_json:
-            click.echo(json.dumps(report, indent=1))
-        else:
-            show_surface(str(self.dsm), report)
-        if self.folder is not None:
-            for path in _drawn(self, self.folder, report):
-                click.echo(path, err=as_json)
-
-
-_OPTIONS = (
-    click.option("--dsm", type=_FILE, help="Evaluate this surface model against --reference, instead of runs."),
-    click.option("--reference", type=_FILE, help="Reference heights above the same datum, in any CRS."),
-    click.option("--classes", type=_FILE, help="With --dsm: raster of whole numbers, such as land cover, in any CRS."),
-    click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
-    click.option(
-        "--pictures",
-        type=_FILE,
-        metavar="FOLDER",
-        help="With --dsm: write figures (JSON, Markdown) and pictures there.",
-    ),
-    click.option(
-        "--line",
-        type=float,
-        nargs=4,
-        metavar="X Y X Y",
-        help="Ends of the profile of --pictures; default the middle row.",
-    ),
-)
+        _check(out, cells, sensor_files, settings.file, config.interval)
+        left, right = pair.open()
+        report = None if run.overwrite else report_before(left, right, out, config, pair.window)
+        if report is None:
+            report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
+        triangulate(out, *sensor_files, progress=console.progress)
+        made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
+    console.summary(report, out)
+    say_surface(console, made)
+    console.say(str(out / "dsm.tif"))
+    run.check_strict(report["warnings"])
 
 
-def surface_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add options for a surface model; the command gets ``surface``, None without one."""
+def _check(
+    out: Path,
+    cells: dict[str, Any],
+    sensor_files: tuple[Path, Path, Path, Path],
+    config: Path | None,
+    interval: "Interval | None",
+) -> None:
+    """Raise for what the later steps cannot use, before hours of matching."""
+    from sat_intervals.heights.dsm import checked_cells, surface_tags
+    from sat_intervals.heights.sensors import Sensors
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.run.output import OUTPUTS
 
-    @wraps(command)
-    def with_surface(
-        *,
-        dsm: Path | None,
-        reference: Path | None,
-        classes: Path | None,
-        no_register: bool,
-        pictures: Path | None,
-        line: tuple[float, float, float, float] | None,
-        **others: Any,
-    ) -> Any:
-        given = {"--classes": classes, "--no-register": no_register, "--pictures": pictures, "--line": line}
-        extra = next((name for name, value in given.items() if value), None)
-        if bool(dsm) != bool(reference):
-            raise click.UsageError("--dsm and --reference go together: give both.")
-        if extra and not dsm:
-            raise click.UsageError(f"{extra} goes with --dsm: leave it out.")
-        surface = Surface(dsm, reference, classes, not no_register, pictures, line) if dsm and reference else None
-        return command(surface=surface, **others)
-
-    for option in reversed(_OPTIONS):
-        with_surface = option(with_surface)
-    return with_surface
-
-
-def _drawn(given: Surface, folder: Path, report: dict[str, Any]) -> list[Path]:
-    """Write figures and pictures of a surface model to a folder; return their paths."""
-    from sat_intervals.cli.tables import surface_markdown
-    from sat_intervals.evaluate.comparison import moved_by, open_comparison
-    from sat_intervals.evaluate.dsm import read_profile
-    from sat_intervals.raster import whole_file
-    from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
-    from sat_intervals.show.marks import check_made_here
-
-    paths = [folder / f"dsm-{name}" for name in ("reliability.png", "errors.png", "profile.png")]
-    texts = [folder / f"dsm-accuracy.{ending}" for ending in ("json", "md")]
-    check_made_here(paths)
-    _check_texts(texts)
-    names = given.dsm.name, given.reference.name
-    compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
-    profile = read_profile(compared, given.line)
-    content = json.dumps({"software": _MARK} | report, indent=1), surface_markdown(str(given.dsm), report)
-    for path, text in zip(texts, (content[0], f"<!-- {_MARK} -->\n{content[1]}"), strict=True):
-        with whole_file(path) as new:
-            new.write_text(text, encoding="utf-8")
-    draw_reliability(report, paths[0], names[0])
-    draw_error_map(compared, report["all"]["nmad"], paths[1])
-    draw_height_profile(profile, paths[2], names)
-    return [*texts, *paths]
-
-
-def _check_texts(paths: list[Path]) -> None:
-    """Raise if a file exists and does not begin with the mark of this tool."""
-    from sat_intervals.errors import SatIntervalsError
-
-    for path in paths:
-        if path.exists() and _MARK.encode() not in path.read_bytes()[:40]:
-            raise SatIntervalsError(f"{path} exists and was not made by sat-intervals: move it away")
+    results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
+    like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
+    check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
+    _, cell, _, radius = checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
+    surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
+    Sensors.load(*sensor_files)

@@ -19,7 +19,7 @@ from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.memory import PROCESS_BYTES, check_memory, volume_bytes
 from sat_intervals.match.normalization import PairStatistics, blocks, moments, statistics_of
-from sat_intervals.match.patch import kernel_settings, match_right, patch_areas
+from sat_intervals.match.patch import Frame, kernel_settings, match_right, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, cut_rows, postprocess_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY, Bands
 from sat_intervals.raster import Image, check_pair, open_image, read_views, read_window
@@ -71,7 +71,7 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
         )
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
-    areas = patch_areas(whole, whole, whole, config)
+    areas = patch_areas(Frame.of_whole(whole), config)
     views = read_views((left, right), view_windows(areas, config))
     methods, scale = _all_methods(views, areas, whole, config, _statistics((left, right), config))
     report: dict[str, Any] = {"cost": config.cost.method}

@@ -1,7 +1,7 @@
 """Raw products of one patch: the windows that it needs, its costs, its match, its right view."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -38,6 +38,11 @@ class Frame(NamedTuple):
     region: Window
     whole: Window
     mirrored: bool = False
+
+    @classmethod
+    def of_whole(cls, whole: Window) -> Self:
+        """Frame of an image that is matched as one core."""
+        return cls(whole, whole, whole)
 
 
 class Patch(NamedTuple):
@@ -104,9 +109,8 @@ def _of_whole_range(view: RightView, core: Window, settings: Settings) -> RightV
     return RightView(cost, winner)
 
 
-def frames_of(core: Window, region: Window, whole: Window, config: Config) -> list[Frame]:
+def frames_of(left: Frame, config: Config) -> list[Frame]:
     """Frames of the views that matching a core with exact seams needs: left and, for accurate cross-checking, right."""
-    left = Frame(core, region, whole)
     return [left, mirrored_frame(left, config)] if config.matches_right_view else [left]
 
 
@@ -141,43 +145,37 @@ def _supported(frame: Frame, config: Config) -> Window:
     return frame.region.grown(config.tiles.support, config.tiles.support).clipped(frame.whole)
 
 
-def patch_areas(
-    core: Window, region: Window, whole: Window, config: Config, ranges: LocalRanges | None = None
-) -> list[Area]:
+def patch_areas(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> list[Area]:
     """Area of a core with what it reads around it and, for accurate cross-checking, that of the right view.
 
-    ``whole`` is the window of all left pixels. The area may leave the region, but not the image.
+    The area may leave the region, but not the image.
     """
     overlap = config.tiles.overlap
     if overlap == "exact":
-        return [frame_area(frame, config, ranges) for frame in frames_of(core, region, whole, config)]
-    base = core.grown(overlap, overlap).clipped(whole)
+        return [frame_area(view, config, ranges) for view in frames_of(frame, config)]
+    base = frame.core.grown(overlap, overlap).clipped(frame.whole)
     areas = [Area.of(base, narrowed(ranges, base, config))]
     if config.matches_right_view:
-        areas.append(_right_area(core, whole, overlap, config))
+        areas.append(_right_area(frame, overlap, config))
     return areas
 
 
-def _right_area(core: Window, whole: Window, overlap: int, config: Config) -> Area:
+def _right_area(frame: Frame, overlap: int, config: Config) -> Area:
     """Area of the right pixels that face a core, with their overlap; they may be outside the right image."""
-    search = config.disparity
-    reach = facing(core, search.minimum, search.maximum)
+    search, whole = config.disparity, frame.whole
+    reach = facing(frame.core, search.minimum, search.maximum)
     rows = Window(whole.row, reach.column - overlap, whole.height, reach.width + 2 * overlap)
     return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
 
 
-def patch_windows(
-    core: Window, region: Window, whole: Window, config: Config, ranges: LocalRanges | None = None
-) -> tuple[Window, Window]:
+def patch_windows(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> tuple[Window, Window]:
     """Windows of both images that matching a core needs; see `patch_areas`."""
-    return view_windows(patch_areas(core, region, whole, config, ranges), config)
+    return view_windows(patch_areas(frame, config, ranges), config)
 
 
 def match_patch(
     views: Views,
-    core: Window,
-    region: Window,
-    whole: Window,
+    frame: Frame,
     config: Config,
     statistics: PairStatistics | None = None,
     ranges: LocalRanges | None = None,
@@ -188,12 +186,8 @@ def match_patch(
     ----------
     views
         Both images in the `patch_windows` of the core.
-    core
-        Left pixels whose products are kept.
-    region
-        Left pixels of the whole run.
-    whole
-        All pixels of the left image.
+    frame
+        Of the core in the left view.
     config
         Settings.
     statistics
@@ -201,8 +195,8 @@ def match_patch(
     ranges
         Local search ranges; by default all pixels search the whole range.
     """
-    costs = cost_areas(views, patch_areas(core, region, whole, config, ranges), config, statistics)
-    return match_costed(views, Frame(core, region, whole), costs, config, ranges=ranges)
+    costs = cost_areas(views, patch_areas(frame, config, ranges), config, statistics)
+    return match_costed(views, frame, costs, config, ranges=ranges)
 
 
 def match_costed(
@@ -232,7 +226,7 @@ def match_costed(
     """
     is_exact, core = config.tiles.overlap == "exact", frame.core
     output = core if is_exact else core.grown(1, 1).clipped(frame.region)
-    areas = patch_areas(core, frame.region, frame.whole, config, ranges)
+    areas = patch_areas(frame, config, ranges)
     area, cost = areas[0], costs[0]
     settings, cells = patch_settings(area.base, config, ranges)
     wants_fast = config.cross_check is not None and not config.matches_right_view

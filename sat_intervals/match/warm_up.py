@@ -15,17 +15,16 @@ from sat_intervals.tiling import View, Window
 def compile_kernels(config: Config) -> None:
     """Compile every kernel that the settings need, by matching a few random pixels."""
     random = np.random.default_rng(0)
-    spot = Window(0, 0, 4, 4)
-    windows = patch_windows(spot, spot, spot, config)
+    frame = Frame.of_whole(Window(0, 0, 4, 4))
+    windows = patch_windows(frame, config)
     images = (random.random((window.height, window.width), np.float32) for window in windows)
     left, right = (
         View(window, pixels, np.zeros(pixels.shape, np.uint8)) for window, pixels in zip(windows, images, strict=True)
     )
     statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
     views = left, right
-    patch = match_patch(views, spot, spot, spot, config, statistics)
+    patch = match_patch(views, frame, config, statistics)
     if config.hands_states_on:
-        frame = Frame(spot, spot, spot)
         (cost,) = cost_areas(views, [frame_area(frame, config)], config, statistics)
         trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config)
     list(postprocess_strips([RawRows.of(patch.raw, patch.right)], ConfidenceScale(0.0, 1.0), config))

@@ -6,7 +6,7 @@ from sat_intervals.config import Config
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.patch import match_patch, patch_windows
+from sat_intervals.match.patch import Frame, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import NO_DATA, NO_DISPARITY, Bands
 from sat_intervals.tiling import View, Window
@@ -24,15 +24,15 @@ def match_whole(
     ``statistics`` are those of the images; None if the matching cost needs none. ``ranges`` are local search ranges;
     None: all pixels search the whole range.
     """
-    whole = Window(0, 0, *left.shape)
-    windows = patch_windows(whole, whole, whole, config, ranges)
+    frame = Frame.of_whole(Window(0, 0, *left.shape))
+    windows = patch_windows(frame, config, ranges)
     views = _view(left, windows[0]), _view(right, windows[1])
-    patch = match_patch(views, whole, whole, whole, config, statistics, ranges=ranges)
+    patch = match_patch(views, frame, config, statistics, ranges)
     raw, scale = patch.raw, ConfidenceScale(np.nan, np.nan)
     if config.ambiguity:
         histogram = ambiguity_histogram(raw.ambiguity, raw.winner != NO_DISPARITY, config.largest_ambiguity)
         scale = confidence_scale(config.ambiguity, histogram)
-    return postprocess_rows(RawRows.of(raw, patch.right), 0, whole.height, scale, config)
+    return postprocess_rows(RawRows.of(raw, patch.right), 0, frame.whole.height, scale, config)
 
 
 def _view(image: np.ma.MaskedArray, window: Window) -> View:

@@ -72,20 +72,14 @@ def match_batch(
     common = load_config(config, overrides)
     read = [config if isinstance(config, (str, Path)) else None, common.disparity.grid]
     _check_not_replaced(pairs, read, out, overwrite)
-    ended, cluster = dict[str, dict[str, Any]](), common.cluster
+    cluster, report = common.cluster, _Report(LocalFolder(out))
+    note = report.note
     _raise_file_limit()
     with ExitStack() as stack:
         stack.enter_context(LocalFolder(out).locked())
         read_report(out)  # raises if it is not ours
         connection = stack.enter_context(Connection(cluster, out))
         find = partial(find_on, connection, {}, progress)
-
-        def note(states: Mapping[str, dict[str, Any]]) -> None:
-            for name, how in states.items():
-                _LOG.info("pair %s: %s", name, how.get("error", how["state"]))
-            ended.update(states)
-            LocalFolder(out).write(REPORT, json.dumps(ended, indent=1) + "\n")
-
         note({pair.name: {"state": "waiting"} for pair in pairs})
         jobs: dict[str, Job] = {}
         for number, pair in enumerate(pairs):
@@ -103,7 +97,25 @@ def match_batch(
                 note({pair.name: _failed(error)})
         for name, how in _matched(jobs, connection, keep_tiles, progress):
             note({name: how})
-    return ended
+    return report.states
+
+
+class _Report:
+    """The states of the pairs, here and in ``batch.json``."""
+
+    def __init__(self, folder: LocalFolder) -> None:
+        self.states: dict[str, dict[str, Any]] = {}
+        self._folder, self._written = folder, ""
+
+    def note(self, states: Mapping[str, dict[str, Any]]) -> None:
+        """Add states and write the file; raise if it is no longer the one written before."""
+        for name, how in states.items():
+            _LOG.info("pair %s: %s", name, how.get("error", how["state"]))
+        self.states.update(states)
+        if self._written and self._folder.read(REPORT) not in (None, self._written):
+            raise RunError(f"{self._folder}/{REPORT} was replaced during the batch: move it away and rerun the batch")
+        self._written = json.dumps(self.states, indent=1) + "\n"
+        self._folder.write(REPORT, self._written)
 
 
 def _check_not_replaced(

@@ -156,7 +156,7 @@ def _frame(job: Job, tile: Tile) -> Frame:
 
 
 def _frames(job: Job, tile: Tile) -> list[Frame]:
-    return frames_of(*_frame(job, tile)[:3], job.config)
+    return frames_of(_frame(job, tile), job.config)
 
 
 # ---- Pixels and costs --------------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ class _Source(NamedTuple):
 
 
 def _areas(job: Job, tile: Tile, ranges: LocalRanges | None) -> list[Area]:
-    return patch_areas(*_frame(job, tile)[:3], job.config, ranges)
+    return patch_areas(_frame(job, tile), job.config, ranges)
 
 
 def _read(job: Job, tiles: Sequence[Tile], ranges: LocalRanges | None, seconds: dict[str, float]) -> _Source:

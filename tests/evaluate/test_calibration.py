@@ -142,7 +142,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
         ([tmp_path, *given], "calibrate one of them at a time"),
         ([tmp_path, "--no-register"], "--no-register goes with --dsm"),
         ([*given, "--tolerance", 1], "--tolerance applies to pairs, not to --dsm"),
-        ([*given, "--preset", "satellite"], "preset applies to pairs, not to --dsm"),
+        ([*given, "--preset", "satellite"], "--preset applies to pairs, not to --dsm"),
         ([*given, "--calibration", "x.yaml"], "--calibration applies to pairs, not to --dsm"),
         ([*given, "--coverage", 2], "coverage is 2, allowed: 0.5 to 0.99"),
         ([*given, "--coverage", 0.99, "--output", reference], "would replace"),

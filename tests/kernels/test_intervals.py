@@ -16,7 +16,7 @@ from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Settings, match_costs
 from sat_intervals.match.in_memory import match_arrays
-from sat_intervals.match.patch import match_patch, patch_windows
+from sat_intervals.match.patch import Frame, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import View, Window
@@ -414,16 +414,16 @@ def check(bands, validity, expected, config):
 @given(seed=st.integers(0, 2**32 - 1), config=configs(), holes=st.integers(0, 3))
 def test_postprocess_rows__of_a_patch_equals_reference(seed, config, holes):
     left, right, left_state, right_state = image_pair(seed, config.disparity, holes)
-    whole = Window(0, 0, *left.shape)
-    windows = patch_windows(whole, whole, whole, config)
+    frame = Frame.of_whole(Window(0, 0, *left.shape))
+    windows = patch_windows(frame, config)
     views = view(left, left_state, windows[0]), view(right, right_state, windows[1])
-    patch = match_patch(views, whole, whole, whole, config)
+    patch = match_patch(views, frame, config)
     raw, rows = patch.raw, RawRows.of(patch.raw, patch.right)
     scale = ConfidenceScale(np.nan, np.nan)
     if config.ambiguity is not None:
         histogram = np.bincount(raw.ambiguity[raw.winner != N], minlength=config.largest_ambiguity + 1)
         scale = confidence_scale(config.ambiguity, histogram)
-    final = postprocess_rows(rows, 0, whole.height, scale, config)
+    final = postprocess_rows(rows, 0, len(left), scale, config)
     expected = reference.match_arrays(left, right, left_state, right_state, config)
     check(final[:4], final.validity, expected, config)
 

@@ -140,6 +140,20 @@ def test_match_batch__takes_no_result_of_another_image_for_that_of_a_pair(images
     assert {end["state"] for end in again.values()} == {"done"}
 
 
+def test_match_batch__keeps_a_file_that_takes_the_place_of_its_report(images, tmp_path):
+    pairs, report = read_batch(rows(images)), tmp_path / "batch.json"
+
+    def replace(stage, done, total):
+        if stage == "tiles":
+            report.write_text("a user's")
+
+    with pytest.raises(RunError, match=r"batch\.json was replaced during the batch: move it away"):
+        match_batch(pairs, tmp_path, progress=replace)
+    assert report.read_text() == "a user's"
+    report.unlink()
+    assert {end["state"] for end in match_batch(pairs, tmp_path).values()} <= {"done", "done before"}
+
+
 def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(images, tmp_path):
     memory = {"kind": "threads", "memory": "520MB"}  # of which a job may take 468
     config = {"cluster": memory, "tiles": {"size": 1024}}

@@ -10,7 +10,8 @@ import yaml
 from helpers import PLACE, invoke, write_pair
 
 from sat_intervals import SatIntervalsError, match_pair, open_image
-from sat_intervals.cli.calibrate import _Settings, _subjects
+from sat_intervals.cli.calibrate import _Judging, _subjects
+from sat_intervals.cli.matching import Settings
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
@@ -212,7 +213,7 @@ def test_calibrate__a_run_is_matched_again_on_this_machine(scene, tmp_path):
     settings = settings_with(scene) | {"cluster": {"workers": 2, "store": str(tmp_path / "store")}}
     match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     for given in ({}, {"cluster": {"workers": 1}}):
-        (subject,) = _subjects((tmp_path / "out",), (), _Settings(None, given, 0.0, False, False))
+        (subject,) = _subjects((tmp_path / "out",), (), _Judging(Settings(None, given), 0.0, False, False))
         assert subject.config.cluster == Cluster(**given.get("cluster", {}))
 
 

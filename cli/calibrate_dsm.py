@@ -8,7 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.options import with_options
+from sat_intervals.cli.tables import show
+
 if TYPE_CHECKING:
+    from sat_intervals.cli.matching import Settings
     from sat_intervals.config import HeightCalibration
 
 _FILE = click.Path(path_type=Path)
@@ -22,17 +26,17 @@ class Heights:
     reference: Path
     registers: bool
 
-    def coverage(self, pairs: Sequence[Path], given: Mapping[str, Any], options: Mapping[str, Any]) -> float | None:
-        """Return the coverage of the command line; raise if there are pairs to calibrate too, or options for them."""
+    def check_alone(self, pairs: Sequence[Path], settings: "Settings", options: Mapping[str, Any]) -> None:
+        """Raise if there are pairs to calibrate too, or options for them."""
         if pairs:
             raise click.UsageError(f"{pairs[0]} is a pair and --dsm a surface model: calibrate one of them at a time.")
-        interval = given.get("interval", {})
-        others = options | {f"settings of {name}": value for name, value in given.items() if name != "interval"}
-        others |= {"--calibration": interval.get("calibration")}
-        for name, value in others.items():
+        sections = settings.sections
+        given = {name: value for name, value in sections.items() if name != "interval"} | {"config": settings.file}
+        given |= {"calibration": sections.get("interval", {}).get("calibration"), **options}
+        for name, value in given.items():
             if value:
-                raise click.UsageError(f"{name} applies to pairs, not to --dsm: leave it out.")
-        return interval.get("coverage")
+                option = {"tiles": "tile-size", "cluster": "workers"}.get(name, name.replace("_", "-"))
+                raise click.UsageError(f"--{option} applies to pairs, not to --dsm: leave it out.")
 
 
 _OPTIONS = (
@@ -53,15 +57,11 @@ def height_options(command: Callable[..., Any]) -> Callable[..., Any]:
             raise click.UsageError("--no-register goes with --dsm: leave it out.")
         return command(heights=Heights(dsm, reference, not no_register) if dsm and reference else None, **others)
 
-    for option in reversed(_OPTIONS):
-        with_heights = option(with_heights)
-    return with_heights
+    return with_options(with_heights, *_OPTIONS)
 
 
 def show_heights(calibration: "HeightCalibration") -> None:
     """Print the margins of each class, and what to expect."""
-    from sat_intervals.cli.tables import show
-
     start, rows = 0.0, []
     for kind in calibration.classes:
         ends = f"from {start:g}" if kind.below is None else f"{start:g} to {kind.below:g}"

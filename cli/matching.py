@@ -1,0 +1,254 @@
+"""Options shared by the commands that match: the pair, its settings, the run."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sat_intervals.cli.options import (
+    Command,
+    cost_option,
+    log_options,
+    named,
+    path,
+    preset_option,
+    quiet_option,
+    store_option,
+    with_options,
+)
+
+if TYPE_CHECKING:
+    from sat_intervals.config import Config
+    from sat_intervals.raster import Image
+    from sat_intervals.tiling import Window
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two epipolar images, the options that say how to read them, and the region of the left one to match."""
+
+    left: str
+    right: str
+    options: Mapping[str, Any]
+    window: "Window | None"
+
+    def open(self) -> "tuple[Image, Image]":
+        """Open both images; options of one side win over those of both."""
+        return self._opened(self.left, "left"), self._opened(self.right, "right")
+
+    def _opened(self, file: str, side: str) -> "Image":
+        from sat_intervals.raster import open_image
+
+        own = {name: self.options[f"{side}_{name}"] for name in ("band", "nodata")}
+        both = {name: self.options[name] if value is None else value for name, value in own.items()}
+        return open_image(file, **both, mask=self.options[f"{side}_mask"])
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A file of settings, and the sections of the command line, which win over it."""
+
+    file: Path | None
+    sections: dict[str, Any]
+
+    def load(self, **sections: Any) -> "Config":
+        """Load the settings; the sections given here win."""
+        from sat_intervals.config import load_config
+
+        return load_config(self.file, self.sections | sections)
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a run treats the tiles and files of its folder, and what it prints."""
+
+    keep_tiles: bool
+    overwrite: bool
+    strict: bool
+    quiet: bool
+
+    def match(
+        self, left: "Image | Path", right: "Image | Path", out: Path, config: "Config", **more: Any
+    ) -> dict[str, Any]:
+        """Match a pair to the folder ``out``; ``more`` are arguments of `match_pair`."""
+        from sat_intervals.run.pair import match_pair
+
+        return match_pair(left, right, out, config, keep_tiles=self.keep_tiles, overwrite=self.overwrite, **more)
+
+    def check_strict(self, warnings: Sequence[str]) -> None:
+        """Raise if the run has warned and must not.
+
+        Raises
+        ------
+        RunError
+            With the number of warnings; their lines have been printed.
+        """
+        if self.strict and warnings:
+            from sat_intervals.errors import RunError
+
+            count = "1 warning" if len(warnings) == 1 else f"{len(warnings)} warnings"
+            raise RunError(f"{count}, see above, and --strict is given; the files are written")
+
+
+_IMAGE_OPTIONS = (
+    click.option("--left-mask", callback=named, metavar="FILE", help="Mask of the left image: non-zero = masked."),
+    click.option("--right-mask", callback=named, metavar="FILE", help="Mask of the right image."),
+    click.option("--nodata", type=float, metavar="V", help="No-data value of both images, replaces that of the files."),
+    click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image."),
+    click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image."),
+    click.option("--band", type=int, metavar="N", help="Band to match in both images, required if they have several."),
+    click.option("--left-band", type=int, metavar="N", help="Band of the left image."),
+    click.option("--right-band", type=int, metavar="N", help="Band of the right image."),
+)
+_OF_IMAGES = ("left_mask", "right_mask", "nodata", "left_nodata", "right_nodata", "band", "left_band", "right_band")
+
+
+def pair_options(command: Command) -> Command:
+    """Add the arguments LEFT and RIGHT, and options to read them; the command gets ``pair``, a `Pair`."""
+
+    @wraps(command)
+    def with_pair(*, left: str, right: str, window: tuple[int, int, int, int] | None, **others: Any) -> Any:
+        from sat_intervals.tiling import Window
+
+        of_images = {name: others.pop(name) for name in _OF_IMAGES}
+        return command(pair=Pair(left, right, of_images, Window(*window) if window else None), **others)
+
+    return with_options(
+        with_pair,
+        click.argument("left", callback=named),
+        click.argument("right", callback=named),
+        *_IMAGE_OPTIONS,
+        click.option(
+            "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
+        ),
+    )
+
+
+class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """``exact`` or a number of pixels."""
+
+    name = "exact|PIXELS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        try:
+            return "exact" if value == "exact" else int(value)
+        except ValueError:
+            self.fail(f"{value!r} is neither exact nor a number of pixels: give exact, or 100", param, ctx)
+
+
+local_option = click.option(
+    "--local-range", is_flag=True, help="Search a range of its own in each cell of the image, found from the images."
+)
+_SEARCH_OPTIONS = (
+    click.option(
+        "--disparity",
+        type=int,
+        nargs=2,
+        metavar="MIN MAX",
+        help="Search range in pixels, both ends searched; default: found from the images.",
+    ),
+    local_option,
+    click.option(
+        "--range-grid", callback=named, metavar="FILE", help="Raster of two bands, minimum and maximum of each pixel."
+    ),
+)
+_SETTINGS_OPTIONS = (
+    click.option(
+        "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
+    ),
+    preset_option,
+    cost_option,
+    click.option(
+        "--coverage",
+        type=float,
+        metavar="C",
+        help="Share of true disparities to be inside, .5 to .99, instead of alpha.",
+    ),
+    click.option(
+        "--calibration", callback=named, metavar="FILE", help="Calibration for --coverage; default the built-in one."
+    ),
+    click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
+    click.option(
+        "--overlap", type=_Overlap(), help="exact (default): no result depends on the tiles; or pixels around a core."
+    ),
+    click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
+    click.option(
+        "--cluster",
+        metavar="SPEC",
+        help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
+    ),
+    store_option,
+)
+
+
+# Section and key of the options that are settings as they stand.
+_PLACES = {
+    "cost": ("cost", "method"),
+    "coverage": ("interval", "coverage"),
+    "calibration": ("interval", "calibration"),
+    "tile_size": ("tiles", "size"),
+    "overlap": ("tiles", "overlap"),
+    "workers": ("cluster", "workers"),
+    "store": ("cluster", "store"),
+}
+
+
+def settings_options(command: Command) -> Command:
+    """Add options for settings; the command gets ``settings``, a `Settings`."""
+
+    @wraps(command)
+    def with_settings(*, config_file: Path | None, preset: str | None, cluster: str | None, **others: Any) -> Any:
+        sections: dict[str, Any] = {"preset": preset} if preset else {}
+        for option, (section, key) in _PLACES.items():
+            if (value := others.pop(option)) is not None:
+                sections.setdefault(section, {})[key] = value
+        if cluster:
+            is_address = "://" in cluster
+            chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
+            sections["cluster"] = sections.get("cluster", {}) | chosen
+        return command(settings=Settings(config_file, sections), **others)
+
+    return with_options(with_settings, *_SETTINGS_OPTIONS)
+
+
+def search_options(command: Command) -> Command:
+    """Add options for the search range and for settings; the command gets ``settings``, which has both."""
+
+    @wraps(command)
+    def with_search(
+        *,
+        settings: Settings,
+        disparity: tuple[int, int] | None,
+        local_range: bool,
+        range_grid: str | None,
+        **others: Any,
+    ) -> Any:
+        search: dict[str, Any] = dict(zip(("minimum", "maximum"), disparity or (), strict=False))
+        if local_range:
+            search["local"] = True
+        if range_grid is not None:
+            search["grid"] = range_grid
+        sections = settings.sections | ({"disparity": search} if search else {})
+        return command(settings=Settings(settings.file, sections), **others)
+
+    return with_options(settings_options(with_search), *_SEARCH_OPTIONS)
+
+
+def run_options(command: Command) -> Command:
+    """Add options of commands that match pairs; the command gets ``run``, a `Run`."""
+
+    @wraps(command)
+    def with_run(*, keep_tiles: bool, overwrite: bool, strict: bool, quiet: bool, **others: Any) -> Any:
+        return command(run=Run(keep_tiles, overwrite, strict, quiet), **others)
+
+    return with_options(
+        with_run,
+        click.option("--strict", is_flag=True, help="End with status 1 if the run warns, as of a narrow search range."),
+        click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
+        click.option("--overwrite", is_flag=True, help="Replace the run in OUT and delete its tiles."),
+        quiet_option,
+        log_options,
+    )
