@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.options import with_options
-from sat_intervals.cli.tables import show
 
 if TYPE_CHECKING:
     from sat_intervals.cli.matching import Settings
@@ -62,6 +61,8 @@ def height_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def show_heights(calibration: "HeightCalibration") -> None:
     """Print the margins of each class, and what to expect."""
+    from sat_intervals.cli.tables import show
+
     start, rows = 0.0, []
     for kind in calibration.classes:
         ends = f"from {start:g}" if kind.below is None else f"{start:g} to {kind.below:g}"
@@ -83,5 +84,7 @@ def show_heights(calibration: "HeightCalibration") -> None:
         "mean_width": "mean width (m)",
     }
     figures = {"before": found["before"], "calibrated on the other blocks": found["expected"] or {}}
-    rows = [[name, *(f"{one[key]:.3f}" if key in one else "-" for key in keys)] for name, one in figures.items()]
+    rows = [
+        [name, *("-" if one.get(key) is None else f"{one[key]:.3f}" for key in keys)] for name, one in figures.items()
+    ]
     show(["", *keys.values()], rows, "expected: figures of blocks of ground that were held out")

@@ -75,7 +75,7 @@ def calibrate_surface(
     -------
     Its provenance has the files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks
     of ground with the margins of the other blocks (None with too few cells): coverage, median and mean width in metres;
-    ``lowest``, the smallest coverage of a block.
+    ``lowest``, the smallest coverage of a block (None with too few cells in each).
 
     Raises
     ------
@@ -176,7 +176,7 @@ def _fit(sample: _Sample, cells_of_height: float, coverage: float) -> _Margins |
     return None
 
 
-def _held_out(sample: _Sample, cells_of_height: float, coverage: float) -> dict[str, float] | None:
+def _held_out(sample: _Sample, cells_of_height: float, coverage: float) -> dict[str, float | None] | None:
     """Return figures of blocks of ground with the margins of the other blocks."""
     lower, upper = np.full((2, sample.height.size), np.nan)
     lowest = []
@@ -189,7 +189,7 @@ def _held_out(sample: _Sample, cells_of_height: float, coverage: float) -> dict[
         lower[own], upper[own] = widened(here.height, here.lower, here.upper, fit.limits, fit.margins)
         if here.height.size * cells_of_height >= least_number(coverage):
             lowest.append(_figures(here, lower[own], upper[own])["coverage"])
-    return _figures(sample, lower, upper) | {"lowest": min(lowest)} if lowest else None
+    return _figures(sample, lower, upper) | {"lowest": min(lowest, default=None)}
 
 
 def _figures(sample: _Sample, lower: np.ndarray, upper: np.ndarray) -> dict[str, float]:

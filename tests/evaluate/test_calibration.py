@@ -110,7 +110,7 @@ def test_calibrate_command__writes_a_file_that_says_what_to_expect(tmp_path):
     result = invoke(*words, tmp_path / "heights.yaml", "--name", "city")
     assert result.exit_code == 0, result.stderr
     assert result.stdout.splitlines()[-1] == str(tmp_path / "heights.yaml")
-    assert "calibrated on the other blocks  0.9" in result.stdout
+    assert "calibrated on the other blocks" in result.stdout
     loaded = load_height_calibration(tmp_path / "heights.yaml")
     assert loaded == calibrate_surface(model, reference, "city", registers=False)
     as_json = invoke(*words, tmp_path / "heights.yaml", "--coverage", 0.5, "--json")  # its own file is replaced
@@ -145,7 +145,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
         ([*given, "--preset", "satellite"], "--preset applies to pairs, not to --dsm"),
         ([*given, "--calibration", "x.yaml"], "--calibration applies to pairs, not to --dsm"),
         ([*given, "--coverage", 2], "coverage is 2, allowed: 0.5 to 0.99"),
-        ([*given, "--coverage", 0.99, "--output", reference], "would replace"),
+        ([*given, "--coverage", 0.99, "--output", reference], "would be written: choose another output"),
         ([*given, "--output", tmp_path / "mine.yaml"], "exists and was not made by sat-intervals calibrate"),
         (["--dsm", reference, "--reference", model], "is not a surface model of sat-intervals dsm"),
         (["--dsm", calibrated, "--reference", flat], "was made with --calibration: make it without"),
