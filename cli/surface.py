@@ -1,5 +1,6 @@
 """``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,10 @@ from sat_intervals.cli.matching import Pair, Run, Settings, pair_options, run_op
 from sat_intervals.cli.options import path, sensor_options
 
 if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
     from sat_intervals.config import Interval
+    from sat_intervals.config.pairs import PairOfBatch
+    from sat_intervals.run.batch import Finish
 
 
 @click.command(short_help="Match a pair, triangulate it and make a surface model.")
@@ -58,7 +62,7 @@ def surface(
 def _check(
     out: Path,
     cells: dict[str, Any],
-    sensor_files: tuple[Path, Path, Path, Path],
+    sensor_files: Sequence[str | Path],
     config: Path | None,
     interval: "Interval | None",
 ) -> None:
@@ -73,4 +77,43 @@ def _check(
     check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
     _, cell, _, radius = checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
-    Sensors.load(*sensor_files)
+    Sensors.load(*map(Path, sensor_files))
+
+
+def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish | None":
+    """Return a function that makes the surface model of a pair of a batch, unless its folder has that of its run.
+
+    Models and grids are read now, before hours of matching. None if no row has any.
+    """
+    if not any(pair.sensors for pair in pairs):
+        return None
+    from sat_intervals.heights.choices import SurfaceChoices
+    from sat_intervals.heights.dsm import make_surface
+    from sat_intervals.heights.triangulate import triangulate
+
+    cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
+    wanted = {pair.name: (pair.sensors, {"resolution": pair.resolution, **cells}) for pair in pairs if pair.sensors}
+    for name, (sensors, of_pair) in wanted.items():
+        _check(out / name, of_pair, sensors, None, None)
+
+    def surface_of(pair: "PairOfBatch") -> dict[str, Any]:
+        folder = out / pair.name
+        if pair.name not in wanted or _has_surface(folder, pair.resolution):
+            return {}
+        sensors, of_pair = wanted[pair.name]
+        triangulate(folder, *sensors, progress=console.progress)
+        return {"surface": make_surface([folder], folder / "dsm.tif", **of_pair, progress=console.progress)}
+
+    return surface_of
+
+
+def _has_surface(out: Path, resolution: float | None) -> bool:
+    """Return whether a folder has the surface model of its run."""
+    from sat_intervals.raster import is_surface, read_place, read_tags
+    from sat_intervals.results import open_run
+
+    file = out / "dsm.tif"
+    if not is_surface(file) or read_tags(file).get("RUNS") != open_run(out).report["finished"]:
+        return False
+    size = read_place(file)[1].pixel_size
+    return size is not None and size[0] == resolution

@@ -383,3 +383,46 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert np.array_equal(read(out / "dsm.tif"), read(steps / "dsm.tif"), equal_nan=True)
     other = invoke(*command, "--preset", "satellite")
     assert (other.exit_code, "already holds another run" in other.stderr) == (2, True)
+
+
+def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
+    scene = make_scene(120, 150, seed=4)
+    write_pair(tmp_path, scene)
+    files = cameras(tmp_path, *scene.truth.shape)
+    columns = "name,left,right,minimum,maximum,left_model,right_model,left_grid,right_grid,resolution"
+    images = f"left.tif,right.tif,{scene.minimum},{scene.maximum}"
+    sensors = ",".join(file.name for file in files)
+    pairs, out = tmp_path / "pairs.csv", tmp_path / "out"
+
+    def batch(*rows):
+        pairs.write_text("\n".join([columns, *rows]) + "\n")
+        return invoke("batch", pairs, out, "--quiet")
+
+    for row, message in (
+        (f"a,{images},{sensors},", "row 1 lacks resolution: a surface needs left_model"),
+        (f"a,{images},,,,,1", "row 1 lacks left_model and right_model and left_grid and right_grid: a surface needs"),
+        (f"a,{images},{sensors},wide", "resolution is 'wide', needed: a number"),
+        (f"a,{images},{sensors},-1", "resolution is -1 m: give one above 0"),
+        (f"a,{images},no.tif,{sensors.partition(',')[2]},1", "no.tif"),
+    ):
+        result = batch(row)
+        assert (result.exit_code, result.stderr.count("\n"), out.exists()) == (2, 1, False), result.output
+        assert message in result.stderr
+    both = f"a,{images},{sensors},1", f"b,{images},,,,,"
+    assert batch(*both).exit_code == 0
+    report = json.loads((out / "batch.json").read_text())
+    assert report["a"]["surface"]["crs"] == "EPSG:32631"
+    assert "surface" not in report["b"]
+    made = (out / "a" / "dsm.tif").stat().st_mtime_ns
+    assert not (out / "b" / "dsm.tif").exists()
+    assert batch(*both).exit_code == 0
+    assert (out / "a" / "dsm.tif").stat().st_mtime_ns == made  # kept
+    assert batch(f"a,{images},{sensors},2").exit_code == 0
+    assert read(out / "a" / "dsm.tif").shape[1] < 60  # made again
+    (out / "a" / "points.tif").write_bytes(b"mine")
+    (out / "a" / "points.json").unlink()
+    result = batch(f"a,{images},{sensors},1", f"b,{images},{sensors},1")
+    assert result.exit_code == 1
+    assert "a: " in result.stderr
+    assert "points.tif exists and was not made by triangulate" in result.stderr
+    assert (out / "b" / "dsm.tif").exists()
