@@ -1,6 +1,7 @@
 """Points and heights: cameras of known geometry, shareloc's own points, and a real pair with the surface of a peer."""
 
 import csv
+import json
 from contextlib import suppress
 
 import numpy as np
