@@ -1,6 +1,6 @@
 """Calibrate the intervals of a surface model: the options of ``sat-intervals calibrate --dsm``, and what it prints."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import with_options
+from sat_intervals.cli.options import Command, with_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.matching import Settings
@@ -45,7 +45,7 @@ _OPTIONS = (
 )
 
 
-def height_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def height_options(command: Command) -> Command:
     """Add options for a surface model; the command gets ``heights``, None without one."""
 
     @wraps(command)

@@ -80,34 +80,33 @@ def _check(
     Sensors.load(*map(Path, sensor_files))
 
 
-def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish | None":
-    """Return a function that makes the surface model of a pair of a batch, unless its folder has that of its run.
+def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish":
+    """Return a function that makes the surface model of a pair of a batch, if its row asks for one.
 
-    Models and grids are read now, before hours of matching. None if no row has any.
+    Models and grids are read now, before hours of matching. A surface of the pair's run is kept.
     """
-    if not any(pair.sensors for pair in pairs):
-        return None
     from sat_intervals.heights.choices import SurfaceChoices
-    from sat_intervals.heights.dsm import make_surface
-    from sat_intervals.heights.triangulate import triangulate
 
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
-    wanted = {pair.name: (pair.sensors, {"resolution": pair.resolution, **cells}) for pair in pairs if pair.sensors}
-    for name, (sensors, of_pair) in wanted.items():
-        _check(out / name, of_pair, sensors, None, None)
+    for pair in pairs:
+        if pair.sensors:
+            _check(out / pair.name, {"resolution": pair.resolution, **cells}, pair.sensors, None, None)
 
     def surface_of(pair: "PairOfBatch") -> dict[str, Any]:
+        from sat_intervals.heights.dsm import make_surface
+        from sat_intervals.heights.triangulate import triangulate
+
         folder = out / pair.name
-        if pair.name not in wanted or _has_surface(folder, pair.resolution):
+        if not pair.sensors or not pair.resolution or _has_surface(folder, pair.resolution):
             return {}
-        sensors, of_pair = wanted[pair.name]
-        triangulate(folder, *sensors, progress=console.progress)
-        return {"surface": make_surface([folder], folder / "dsm.tif", **of_pair, progress=console.progress)}
+        triangulate(folder, *pair.sensors, console.progress)
+        made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
+        return {"surface": made}
 
     return surface_of
 
 
-def _has_surface(out: Path, resolution: float | None) -> bool:
+def _has_surface(out: Path, resolution: float) -> bool:
     """Return whether a folder has the surface model of its run."""
     from sat_intervals.raster import is_surface, read_place, read_tags
     from sat_intervals.results import open_run

@@ -67,7 +67,7 @@ class PairOfBatch:
     settings: Mapping[str, Any] = field(default_factory=dict)
     reading: Mapping[str, Any] = field(default_factory=dict)
     window: tuple[int, int, int, int] | None = None
-    sensors: tuple[str, ...] | None = None
+    sensors: tuple[str, str, str, str] | None = None
     resolution: float | None = None
 
 
@@ -200,7 +200,7 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
         raise SatIntervalsError(
             f"{place}: name {name!r} cannot be a folder's name: choose another of at most {_LONGEST_NAME} bytes"
         )
-    images = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
+    images: dict[str, Any] = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
     reading = {key: _number(place, key, row.pop(key)) for key in _READING if key in row}
     window = _window(place, row.pop("window")) if "window" in row else None
     surface = _surface(place, row, file)

@@ -34,7 +34,7 @@ _CLASSES, _BLOCKS = (8, 4, 2, 1), 4
 _DATUM = 10.0
 
 
-class _Sample(NamedTuple):
+class Sample(NamedTuple):
     """Cells with a height, perhaps an interval, and a reference: ``(n,)`` metres, and the block of ground of each."""
 
     height: np.ndarray
@@ -45,13 +45,17 @@ class _Sample(NamedTuple):
 
     @property
     def width(self) -> np.ndarray:
+        """Return the widths of the intervals."""
         return np.asarray(self.upper - self.lower)
 
-    def of(self, chosen: np.ndarray) -> "_Sample":
-        return _Sample(*(values[chosen] for values in self))
+    def of(self, chosen: np.ndarray) -> "Sample":
+        """Return a part."""
+        return Sample(*(values[chosen] for values in self))
 
 
-class _Margins(NamedTuple):
+class Margins(NamedTuple):
+    """Widths between classes, margins of classes, and their numbers of cells."""
+
     limits: np.ndarray
     margins: np.ndarray
     cells: np.ndarray
@@ -90,7 +94,7 @@ def calibrate_surface(
     sample, cells_of_height = _sample(moved)
     _check_datum(given, sample, moved.shift[2])
     sample = sample.of(np.isfinite(sample.width))
-    fit = _fit(sample, cells_of_height, coverage)
+    fit = fitted(sample, cells_of_height, coverage)
     if fit is None:
         raise SatIntervalsError(
             f"{round(sample.height.size * cells_of_height)} cells of {given.surface} have an interval and a height in "
@@ -107,7 +111,7 @@ def calibrate_surface(
         "reference": str(given.reference),
         "shift": None if found is None else [round(float(value), 3) for value in moved.shift],
         "before": _figures(sample, sample.lower, sample.upper),
-        "expected": _held_out(sample, cells_of_height, coverage),
+        "expected": _expected(sample, cells_of_height, coverage),
     }
     key = surface_key(tags, given.cell)
     return HeightCalibration(name=name, coverage=coverage, surface=key, classes=classes, provenance=provenance)
@@ -126,7 +130,7 @@ def _checked_coverage(surface: Path, tags: Mapping[str, str], coverage: float | 
     return coverage
 
 
-def _sample(given: Comparison) -> tuple[_Sample, float]:
+def _sample(given: Comparison) -> tuple[Sample, float]:
     """Return heights spread over both, at most some `_MOST`, and the number of cells that one stands for."""
     heights = given.finer**2
     stride = -(-given.shape[0] * given.shape[1] * heights // _MOST)
@@ -137,8 +141,8 @@ def _sample(given: Comparison) -> tuple[_Sample, float]:
         parts.append([values[::stride] for values in cells[:4]])
         places.append([row + window.row, column + window.column])
     row, column = (_part(np.concatenate(values)) for values in zip(*places, strict=True))
-    columns = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return _Sample(*columns, _BLOCKS * row + column), min(1.0, stride / heights)
+    height, lower, upper, truth = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return Sample(height, lower, upper, truth, _BLOCKS * row + column), min(1.0, stride / heights)
 
 
 def _part(place: np.ndarray) -> np.ndarray:
@@ -149,7 +153,7 @@ def _part(place: np.ndarray) -> np.ndarray:
     return np.asarray(_BLOCKS * (place - first) // count)
 
 
-def _check_datum(given: Comparison, sample: _Sample, up: float) -> None:
+def _check_datum(given: Comparison, sample: Sample, up: float) -> None:
     """Raise without a common height, or if the heights differ by as much as two datums do."""
     median = float(np.median(sample.height - sample.reference)) + up if sample.height.size else None
     check_common(given, sample.height.size, median)
@@ -160,7 +164,7 @@ def _check_datum(given: Comparison, sample: _Sample, up: float) -> None:
         )
 
 
-def _fit(sample: _Sample, cells_of_height: float, coverage: float) -> _Margins | None:
+def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins | None:
     """Return margins by classes of width, of one class with few cells; None with too few for that."""
     scores = np.maximum(sample.lower - sample.reference, sample.reference - sample.upper)
     width = sample.width
@@ -172,27 +176,35 @@ def _fit(sample: _Sample, cells_of_height: float, coverage: float) -> _Margins |
         cells = cells_of_height * np.bincount(kinds, minlength=limits.size + 1)
         if cells.min() >= least_number(coverage):
             found = margins(scores, kinds, cells.size, coverage)
-            return _Margins(limits, np.ceil(1000 * found) / 1000, cells)  # millimetres
+            return Margins(limits, np.ceil(1000 * found) / 1000, cells)  # millimetres
     return None
 
 
-def _held_out(sample: _Sample, cells_of_height: float, coverage: float) -> dict[str, float | None] | None:
-    """Return figures of blocks of ground with the margins of the other blocks."""
+def held_out(sample: Sample, cells_of_height: float, coverage: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return bounds with the margins of the other blocks of ground; None if those of a block have too few cells."""
     lower, upper = np.full((2, sample.height.size), np.nan)
-    lowest = []
     for block in np.unique(sample.block):
         own = sample.block == block
-        fit = _fit(sample.of(~own), cells_of_height, coverage)
+        fit = fitted(sample.of(~own), cells_of_height, coverage)
         if fit is None:
             return None
         here = sample.of(own)
         lower[own], upper[own] = widened(here.height, here.lower, here.upper, fit.limits, fit.margins)
-        if here.height.size * cells_of_height >= least_number(coverage):
-            lowest.append(_figures(here, lower[own], upper[own])["coverage"])
-    return _figures(sample, lower, upper) | {"lowest": min(lowest, default=None)}
+    return lower, upper
 
 
-def _figures(sample: _Sample, lower: np.ndarray, upper: np.ndarray) -> dict[str, float]:
+def _expected(sample: Sample, cells_of_height: float, coverage: float) -> dict[str, float | None] | None:
+    """Return figures of bounds that were held out, and the smallest coverage of a block with enough cells."""
+    bounds = held_out(sample, cells_of_height, coverage)
+    if bounds is None:
+        return None
+    inside = (bounds[0] <= sample.reference) & (sample.reference <= bounds[1])
+    blocks = [inside[sample.block == block] for block in np.unique(sample.block)]
+    of_blocks = [float(one.mean()) for one in blocks if one.size * cells_of_height >= least_number(coverage)]
+    return _figures(sample, *bounds) | {"lowest": round(min(of_blocks), 4) if of_blocks else None}
+
+
+def _figures(sample: Sample, lower: np.ndarray, upper: np.ndarray) -> dict[str, float]:
     """Return coverage, median and mean width of intervals."""
     inside, width = (lower <= sample.reference) & (sample.reference <= upper), upper - lower
     figures = {"coverage": inside.mean(), "median_width": np.median(width), "mean_width": width.mean()}

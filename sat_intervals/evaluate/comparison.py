@@ -135,7 +135,7 @@ def compared(given: Comparison, window: Window) -> ComparedCells:
     )
     reference = given.heights(window, finer)
     known = np.isfinite(reference) & np.isfinite(height)
-    return ComparedCells(*(values[known] for values in (height, lower, upper, reference)), known)
+    return ComparedCells(height[known], lower[known], upper[known], reference[known], known)
 
 
 def registered(given: Comparison) -> Registration | None:

@@ -64,7 +64,8 @@ def fused(runs: Sequence[RunCells]) -> np.ndarray:
 def calibrate(bands: np.ndarray, calibration: HeightCalibration) -> None:
     """Widen or narrow the intervals of cells by the margins of a calibration, in place."""
     limits, margins = np.array(calibration.limits), np.array(calibration.margins)
-    lower, upper = widened(*bands[:3].astype(np.float64), limits, margins)
+    height, lower, upper = bands[:3].astype(np.float64)
+    lower, upper = widened(height, lower, upper, limits, margins)
     bands[1], bands[2] = _outwards(lower, -np.inf), _outwards(upper, np.inf)
 
 

@@ -44,7 +44,7 @@ def match_batch(
     overwrite: bool = False,
     keep_tiles: bool = False,
     progress: Progress = lambda stage, done, total: None,
-    finish: Finish | None = None,
+    finish: Finish = lambda pair: {},
 ) -> dict[str, dict[str, Any]]:
     """Match many pairs; a failed pair does not stop the others.
 
@@ -101,9 +101,9 @@ def match_batch(
                 note({pair.name: _failed(error)})
         for name, how in _matched(jobs, connection, keep_tiles, progress):
             note({name: how})
-        for pair in pairs if finish is not None else ():
-            if (how := report.states[pair.name])["state"] != "failed":
-                note({pair.name: _finished(pair, how, finish)})
+        for pair in pairs:
+            if (how := _finished(pair, report.states[pair.name], finish)) is not report.states[pair.name]:
+                note({pair.name: how})
     return report.states
 
 
@@ -189,8 +189,12 @@ def _failed(error: Exception) -> dict[str, Any]:
 
 
 def _finished(pair: PairOfBatch, how: dict[str, Any], finish: Finish) -> dict[str, Any]:
+    """Return the state of a pair after its last step."""
+    if how["state"] == "failed":
+        return how
     try:
-        return {**how, **finish(pair)}
+        more = finish(pair)
+        return {**how, **more} if more else how
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
 
