@@ -4,11 +4,10 @@ Towns, slopes and rough ground, at three base-to-height ratios, are matched with
 which see the ground from other sides. Points come from the analytic cameras of the scenes. The envelope keeps open
 intervals, as without a coverage; the others leave them out. The truth of a cell is the height of the surface, seen from
 above, at its centre. Cells near a wall are apart: heights within one cell of the centre differ by more than 2.2 px of
-disparity, and more than the side of the cell.
+disparity, and more than the side of the cell. Matched pairs are kept in `build/surfaces`.
 """
 
 import sys
-import tempfile
 from pathlib import Path
 from unittest import mock
 
@@ -27,6 +26,7 @@ from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, nort
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
+BUILD = Path("build/surfaces")
 SIZE, SEED = int(sys.argv[1]) if len(sys.argv) > 1 else 300, 5
 VIEWS = {0.3: (-0.2, 0.4), 0.5: (-0.4, 0.6), 0.8: (-0.6, 1.0)}
 # Left views of the further pairs, as shares of the distance between both views.
@@ -50,7 +50,7 @@ def views_of(ratio):
 
 
 def make_pair(folder, kind, views, number):
-    """Write, match and triangulate a pair, with noise of its own; return its profiles, one for each row."""
+    """Write, match and triangulate a pair with noise of its own, unless done before; return profiles of its rows."""
 
     def random(seed):
         return RANDOM([*seed, number] if number and seed[1] == 1 else seed)
@@ -58,16 +58,17 @@ def make_pair(folder, kind, views, number):
     demo.VIEWS = views
     demo.OBJECTS = OBJECTS if kind == "town" else ()
     demo._terrain = rough if kind == "rough" else TERRAIN
-    with mock.patch.object(np.random, "default_rng", random):
-        scene = demo.make_scene(SIZE, SIZE, SEED, relief=KINDS[kind])
-    place = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
-    folder.mkdir()
-    for name, image in (("left", scene.left), ("right", scene.right)):
-        write_layer(folder / f"{name}.tif", image, 0, place)
-    search = {"minimum": scene.minimum, "maximum": scene.maximum}
-    settings = {"preset": "satellite", "disparity": search, "interval": {"coverage": 0.9}}
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
-    write_points(folder / "out", views)
+    if not (folder / "out" / "points.tif").exists():
+        with mock.patch.object(np.random, "default_rng", random):
+            scene = demo.make_scene(SIZE, SIZE, SEED, relief=KINDS[kind])
+        place = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, image in (("left", scene.left), ("right", scene.right)):
+            write_layer(folder / f"{name}.tif", image, 0, place)
+        search = {"minimum": scene.minimum, "maximum": scene.maximum}
+        settings = {"preset": "satellite", "disparity": search, "interval": {"coverage": 0.9}}
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+        write_points(folder / "out", views)
     return list(demo.profiles(SIZE, SIZE, SEED, 0, 64, KINDS[kind]))
 
 
@@ -107,16 +108,19 @@ def truth_of(place, shape, profiles):
     return at(0, 0), np.ptp([at(down, across) for down in steps for across in steps], axis=0)
 
 
-def surface_of(outs, path, cell, choices, profiles, pixel):
-    """Cells of a surface with an interval and a truth, as a sample for a calibration, and the mask of those at walls."""
-    make_surface(outs, path, resolution=cell * PIXEL, crs=CRS, choices=choices)
-    with rasterio.open(path) as dataset:
+def surface_of(outs, path, cell, bounds, profiles, pixel, like=None):
+    """Cells of a surface with interval and truth, as a sample of a calibration, and which of them are near walls.
+
+    With ``like``, another surface, on its grid: cells with an interval there.
+    """
+    choices = SurfaceChoices(bounds, keeps_open=bounds == "envelope")
+    make_surface(outs, path, resolution=like or cell * PIXEL, crs=None if like else CRS, choices=choices)
+    with rasterio.open(path) as dataset, rasterio.open(like or path) as first:
         height, lower, upper = dataset.read((1, 2, 3)).astype(np.float64)
         truth, range_ = truth_of(dataset.transform, dataset.shape, profiles)
-    known = np.isfinite(truth) & np.isfinite(lower)
-    row, column = np.nonzero(known)
-    block = 4 * (4 * row // known.shape[0]) + 4 * column // known.shape[1]
-    sample = Sample(*(values[known] for values in (height, lower, upper, truth)), block)
+        known = np.isfinite(truth) & np.isfinite(first.read(2))
+    row, column = (4 * places // size for places, size in zip(np.nonzero(known), known.shape, strict=True))
+    sample = Sample(*(values[known] for values in (height, lower, upper, truth)), 4 * row + column)
     return sample, range_[known] > max(2.2 * pixel, cell * PIXEL)
 
 
@@ -138,20 +142,21 @@ def calibrated(sample, others):
 class Table:
     """Lines as they come, and their means at the end."""
 
-    def __init__(self, title, *columns):
+    def __init__(self, *columns):
         self._means = {}
-        print(f"\n{title}\n\n| scene | base-to-height | cell | {' | '.join(columns)} | coverage | without walls | walls |"
-              " median width | mean width |")  # fmt: skip
+        head = ["scene", "base-to-height", "cell", *columns, "coverage", "without walls", "walls"]
+        head += ["median width", "mean width"]
+        print(f"\n| {' | '.join(head)} |\n|{'---|' * len(head)}")
 
-    def add(self, kind, ratio, cell, labels, row):
-        self._means.setdefault((cell, *labels), []).append(row)
-        print(f"| {kind} | {ratio} | {cell} px | {' | '.join(labels)} | {written(row)} |", flush=True)
+    def add(self, kind, ratio, cell, label, row):
+        self._means.setdefault((cell, label), []).append(row)
+        print(f"| {kind} | {ratio} | {cell} px | {label} | {written(row)} |", flush=True)
 
     def end(self):
-        for (cell, *labels), rows in self._means.items():
-            lowest, highest = (f"{end(row[0] for row in rows):.3f}" for end in (min, max))
-            print(f"| mean | {lowest} to {highest} | {cell} px | {' | '.join(labels)} | "
-                  f"{written(np.nanmean(rows, axis=0))} |")  # fmt: skip
+        for (cell, label), rows in self._means.items():
+            lowest, highest = (end(row[0] for row in rows) for end in (min, max))
+            ends = f"{lowest:.3f} to {highest:.3f}"
+            print(f"| mean | coverage {ends} | {cell} px | {label} | {written(np.nanmean(rows, axis=0))} |")
 
 
 def written(row):
@@ -160,25 +165,43 @@ def written(row):
 
 
 def main():
-    with tempfile.TemporaryDirectory() as name:
-        folder, profiles = Path(name), {}
-        for kind in KINDS:
-            for ratio in VIEWS:
-                for number, views in enumerate(views_of(ratio)):
-                    profiles[kind] = make_pair(folder / f"{kind}{ratio}{number}", kind, views, number)
-        scenes = [(kind, ratio, [folder / f"{kind}{ratio}{number}" / "out" for number in range(4)])
-                  for kind in KINDS for ratio in VIEWS]  # fmt: skip
-        path = folder / "dsm.tif"
-        table = Table("Bounds", "bounds")
-        samples = {}
-        for kind, ratio, outs in scenes:
-            pixel = 1 / (2 * ratio)
-            for cell in (1, 2, 4):
-                for bounds in BOUNDS:
-                    choices = SurfaceChoices(bounds, keeps_open=bounds == "envelope")
-                    cells = surface_of(outs[:1], path, cell, choices, profiles[kind], pixel)
-                    table.add(kind, ratio, cell, [bounds], figures(*cells, pixel))
-                    samples[kind, ratio, cell] = cells
-                    if bounds == "median":
-                        samples[kind, ratio, cell] = cells
-        table.end()
+    first, path, profiles = BUILD / "first.tif", BUILD / "dsm.tif", {}
+    for kind in KINDS:
+        for ratio in VIEWS:
+            for number, views in enumerate(views_of(ratio)):
+                profiles[kind] = make_pair(BUILD / f"{kind}_{ratio}_{number}", kind, views, number)
+    scenes = [(kind, ratio, cell) for kind in KINDS for ratio in VIEWS for cell in (1, 2, 4)]
+
+    def cells_of(kind, ratio, cell, pairs, bounds):
+        outs = [BUILD / f"{kind}_{ratio}_{number}" / "out" for number in range(pairs)]
+        files = (path, first) if pairs > 1 else (first, None)
+        return surface_of(outs, files[0], cell, bounds, profiles[kind], 0.5 / ratio, files[1])
+
+    table, samples = Table("bounds"), {}
+    for kind, ratio, cell in scenes:
+        for bounds in BOUNDS:
+            samples[kind, ratio, cell, bounds] = cells_of(kind, ratio, cell, 1, bounds)
+            table.add(kind, ratio, cell, bounds, figures(*samples[kind, ratio, cell, bounds], 0.5 / ratio))
+    table.end()
+    table = Table("median, calibrated on")
+    for kind, ratio, cell in scenes:
+        sample, walls = samples[kind, ratio, cell, "median"]
+        others = [samples[other, ratio, cell, "median"][0] for other in KINDS if other != kind]
+        for label, bounds in (
+            ("nothing", None),
+            ("other blocks", held_out(sample, 1.0, 0.9)),
+            ("other scenes", calibrated(sample, others)),
+        ):
+            table.add(kind, ratio, cell, label, figures(sample, walls, 0.5 / ratio, bounds))
+    table.end()
+    table = Table("pairs")
+    for kind, ratio, cell in scenes:
+        for pairs in (1, 2, 4):
+            sample, walls = cells_of(kind, ratio, cell, pairs, "median")
+            table.add(kind, ratio, cell, str(pairs), figures(sample, walls, 0.5 / ratio))
+            bounds = held_out(sample, 1.0, 0.9)
+            table.add(kind, ratio, cell, f"{pairs}, calibrated", figures(sample, walls, 0.5 / ratio, bounds))
+    table.end()
+
+
+main()
