@@ -134,8 +134,8 @@ def dsm(outs: tuple[Path, ...], cells: dict[str, Any], output: Path | None, as_j
     unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells
     are no data.
 
-    Where several OUT overlap, the intervals are intersected if they overlap. Else their hull is written and agreement
-    is 0.
+    Where several OUT overlap, their intervals are averaged, narrow ones with the most weight. Where they do not meet,
+    their hull is written and agreement is 0.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.dsm import make_surface

@@ -57,8 +57,8 @@ def make_surface(
     geoid
         Grid of geoid heights; heights then refer to the geoid, by default to the WGS 84 ellipsoid.
     choices
-        The cell's interval, and what is left out. The intervals of several runs are intersected if they overlap; else
-        their hull is taken.
+        The cell's interval, and what is left out. The intervals of several runs are averaged where they meet, see
+        `fused`; else their hull is taken.
     progress
         Callback, see `Progress`.
 

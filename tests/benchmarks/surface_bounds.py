@@ -8,6 +8,7 @@ disparity, and more than the side of the cell. Matched pairs are kept in `build/
 """
 
 import sys
+from functools import cache
 from pathlib import Path
 from unittest import mock
 
@@ -27,7 +28,7 @@ from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
 BUILD = Path("build/surfaces")
-SIZE, SEED = int(sys.argv[1]) if len(sys.argv) > 1 else 300, 5
+SIZE, SEED = 300, 5
 VIEWS = {0.3: (-0.2, 0.4), 0.5: (-0.4, 0.6), 0.8: (-0.6, 1.0)}
 # Left views of the further pairs, as shares of the distance between both views.
 FURTHER = (-0.6, -0.1, -0.85)
@@ -90,7 +91,8 @@ def write_points(out, views):
         writer.publish()
 
 
-def truth_of(place, shape, profiles):
+@cache
+def truth_of(place, shape, kind):
     """Height at the centres of cells, and the range of heights within one cell of them; NaN outside the scene."""
     back = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True)
 
@@ -101,14 +103,14 @@ def truth_of(place, shape, profiles):
         height = np.full(shape, np.nan)
         for row in range(SIZE):
             here = (v == row) & (u >= 0) & (u < SIZE)
-            height[here] = np.interp(u[here], *profiles[row][1:3])
+            height[here] = np.interp(u[here], *PROFILES[kind][row][1:3])
         return height
 
     steps = np.linspace(-1, 1, 5)
     return at(0, 0), np.ptp([at(down, across) for down in steps for across in steps], axis=0)
 
 
-def surface_of(outs, path, cell, bounds, profiles, pixel, like=None):
+def surface_of(outs, path, cell, bounds, kind, pixel, like=None):
     """Cells of a surface with interval and truth, as a sample of a calibration, and which of them are near walls.
 
     With ``like``, another surface, on its grid: cells with an interval there.
@@ -117,7 +119,7 @@ def surface_of(outs, path, cell, bounds, profiles, pixel, like=None):
     make_surface(outs, path, resolution=like or cell * PIXEL, crs=None if like else CRS, choices=choices)
     with rasterio.open(path) as dataset, rasterio.open(like or path) as first:
         height, lower, upper = dataset.read((1, 2, 3)).astype(np.float64)
-        truth, range_ = truth_of(dataset.transform, dataset.shape, profiles)
+        truth, range_ = truth_of(dataset.transform, dataset.shape, kind)
         known = np.isfinite(truth) & np.isfinite(first.read(2))
     row, column = (4 * places // size for places, size in zip(np.nonzero(known), known.shape, strict=True))
     sample = Sample(*(values[known] for values in (height, lower, upper, truth)), 4 * row + column)
@@ -164,44 +166,47 @@ def written(row):
     return " | ".join([*(f"{share:.3f}" for share in row[:3]), *(f"{width:.2f}" for width in row[3:5])])
 
 
-def main():
-    first, path, profiles = BUILD / "first.tif", BUILD / "dsm.tif", {}
-    for kind in KINDS:
-        for ratio in VIEWS:
-            for number, views in enumerate(views_of(ratio)):
-                profiles[kind] = make_pair(BUILD / f"{kind}_{ratio}_{number}", kind, views, number)
-    scenes = [(kind, ratio, cell) for kind in KINDS for ratio in VIEWS for cell in (1, 2, 4)]
+def cells_of(kind, ratio, cell, pairs, bounds):
+    """Cells of a scene, from some of its pairs, on the grid of the first one."""
+    outs = [BUILD / f"{kind}_{ratio}_{number}" / "out" for number in range(pairs)]
+    path, like = (BUILD / "several.tif", BUILD / "one.tif") if pairs > 1 else (BUILD / "one.tif", None)
+    return surface_of(outs, path, cell, bounds, kind, 0.5 / ratio, like)
 
-    def cells_of(kind, ratio, cell, pairs, bounds):
-        outs = [BUILD / f"{kind}_{ratio}_{number}" / "out" for number in range(pairs)]
-        files = (path, first) if pairs > 1 else (first, None)
-        return surface_of(outs, files[0], cell, bounds, profiles[kind], 0.5 / ratio, files[1])
 
-    table, samples = Table("bounds"), {}
+def compare_bounds(scenes):
+    table = Table("bounds")
     for kind, ratio, cell in scenes:
         for bounds in BOUNDS:
-            samples[kind, ratio, cell, bounds] = cells_of(kind, ratio, cell, 1, bounds)
-            table.add(kind, ratio, cell, bounds, figures(*samples[kind, ratio, cell, bounds], 0.5 / ratio))
+            table.add(kind, ratio, cell, bounds, figures(*cells_of(kind, ratio, cell, 1, bounds), 0.5 / ratio))
     table.end()
-    table = Table("median, calibrated on")
-    for kind, ratio, cell in scenes:
-        sample, walls = samples[kind, ratio, cell, "median"]
-        others = [samples[other, ratio, cell, "median"][0] for other in KINDS if other != kind]
-        for label, bounds in (
-            ("nothing", None),
-            ("other blocks", held_out(sample, 1.0, 0.9)),
-            ("other scenes", calibrated(sample, others)),
-        ):
+
+
+def compare_calibrations(scenes):
+    table = Table("calibrated on")
+    samples = {scene: cells_of(*scene, 1, "median") for scene in scenes}
+    for (kind, ratio, cell), (sample, walls) in samples.items():
+        others = [samples[other, ratio, cell][0] for other in KINDS if other != kind]
+        ways = {"nothing": None, "other blocks": held_out(sample, 1.0, 0.9), "other scenes": calibrated(sample, others)}
+        for label, bounds in ways.items():
             table.add(kind, ratio, cell, label, figures(sample, walls, 0.5 / ratio, bounds))
     table.end()
+
+
+def compare_pairs(scenes):
     table = Table("pairs")
     for kind, ratio, cell in scenes:
         for pairs in (1, 2, 4):
             sample, walls = cells_of(kind, ratio, cell, pairs, "median")
-            table.add(kind, ratio, cell, str(pairs), figures(sample, walls, 0.5 / ratio))
-            bounds = held_out(sample, 1.0, 0.9)
-            table.add(kind, ratio, cell, f"{pairs}, calibrated", figures(sample, walls, 0.5 / ratio, bounds))
+            for label, bounds in ((f"{pairs}", None), (f"{pairs}, calibrated", held_out(sample, 1.0, 0.9))):
+                table.add(kind, ratio, cell, label, figures(sample, walls, 0.5 / ratio, bounds))
     table.end()
 
 
-main()
+TABLES = {"bounds": compare_bounds, "calibrations": compare_calibrations, "pairs": compare_pairs}
+PROFILES = {}
+for kind in KINDS:
+    for ratio in VIEWS:
+        for number, views in enumerate(views_of(ratio)):
+            PROFILES[kind] = make_pair(BUILD / f"{kind}_{ratio}_{number}", kind, views, number)
+for name in sys.argv[1:] or TABLES:
+    TABLES[name]([(kind, ratio, cell) for kind in KINDS for ratio in VIEWS for cell in (1, 2, 4)])

@@ -138,7 +138,7 @@ def test_make_surface__a_point_reaches_the_cell_it_falls_in_at_any_radius(tmp_pa
     assert np.isnan(surface[BAND["confidence"]]).all()  # of a run without confidence
 
 
-def test_make_surface__several_runs_are_intersected_where_they_meet(tmp_path):
+def test_make_surface__of_several_runs_is_their_mean_where_they_meet(tmp_path):
     # Three cells 10 m apart. One run says 9 to 12 in each, the other 10 to 13, 29 to 32, and nothing.
     one = write_points(tmp_path / "a", [0.5, 10.5, 20.5], [-0.5] * 3, [10.0] * 3, confidence=1.0)
     two = write_points(tmp_path / "b", [0.5, 10.5, 20.5], [-0.5] * 3, [11.0, 30.0, np.nan], confidence=0.0)
@@ -146,13 +146,23 @@ def test_make_surface__several_runs_are_intersected_where_they_meet(tmp_path):
         surface, place, report = surface_of(outs, tmp_path, radius=0.6)
         i, j = cell_of(place, LEFT, TOP)
         cells = surface[:, i, [j, j + 10, j + 20]]
-        assert_allclose(cells[BAND["height_lower"]], [10, 9, 9], atol=1e-4)
-        assert_allclose(cells[BAND["height_upper"]], [12, 32, 12], atol=1e-4)
+        assert_allclose(cells[BAND["height_lower"]], [9.5, 9, 9], atol=1e-4)
+        assert_allclose(cells[BAND["height_upper"]], [12.5, 32, 12], atol=1e-4)
         assert_allclose(cells[BAND["height"]], [10.5, 20, 10], atol=1e-4)
         assert_allclose(cells[BAND["confidence"]], [0.5, 0.5, 1.0], atol=1e-4)
         assert_array_equal(cells[BAND["count"]], [2, 2, 1])
         assert_array_equal(cells[BAND["agreement"]], [1, 0, np.nan])
         assert report["disagreeing"] == 0.5
+
+
+def test_make_surface__of_several_runs_follows_the_narrow_intervals(tmp_path):
+    # 9 to 12 around 10, weight 1 / 9; 10.5 to 11.5 around 11, weight 1. Middle (10.5 / 9 + 11) / (10 / 9) = 10.95;
+    # width sqrt(2 / (10 / 9)) = 1.3416; height (10 / 9 + 11) / (10 / 9) = 10.9.
+    one = write_points(tmp_path / "a", [0.5], [-0.5], [10.0])
+    two = write_points(tmp_path / "b", [0.5], [-0.5], [11.0], lower=0.5, upper=0.5)
+    surface, place, _ = surface_of([one, two], tmp_path, radius=0.6)
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(surface[:3, i, j], [10.9, 10.95 - 1.3416 / 2, 10.95 + 1.3416 / 2], atol=1e-4)
 
 
 def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
@@ -330,7 +340,7 @@ def test_make_surface__of_a_run_without_intervals_has_heights_alone(tmp_path, bo
     assert report["without_intervals"] == [str(plain)]
     other = write_points(tmp_path / "b", [0.5], [-0.5], [11.0])
     surface, place, _ = surface_of([plain, other], tmp_path, radius=0.6, choices=SurfaceChoices(bounds=bounds))
-    assert_allclose(surface[:4, i, j], [10.5, 10, 13, 2])
+    assert_allclose(surface[:4, i, j], [11, 10, 13, 2])
     assert np.isnan(surface[1:3, i, j + 4]).all()
     assert np.isnan(surface[BAND["agreement"]]).all()
 
