@@ -45,7 +45,7 @@ bench-seams: $(VENV)/.has-bench
 
 # The tables of docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; about ten minutes.
 tune: $(VENV)/.has-mccnn
-	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/tune.py
+	$(BIN)/python -W ignore tests/benchmarks/tune.py
 
 # The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; about half an hour.
 calibration: $(VENV)/.has-mccnn
@@ -57,7 +57,7 @@ surface-bounds: $(VENV)/.has-dsm
 
 # The tables of docs/coverage.md, on the same pairs; about five minutes after `make calibration`, else half an hour more.
 coverage: $(VENV)/.has-mccnn
-	$(BIN)/python -W ignore::rasterio.errors.NotGeoreferencedWarning tests/benchmarks/coverage_tables.py
+	$(BIN)/python -W ignore tests/benchmarks/coverage_tables.py
 
 # The pictures of README.md and docs; 256 colours keep them small.
 pictures: $(VENV)/.has-dsm,plot

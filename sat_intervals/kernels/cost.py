@@ -9,6 +9,7 @@ import numpy as np
 
 from sat_intervals.kernels.compiled import cached, inlined, part
 from sat_intervals.kernels.vector import LANES, add, hamming, larger, load, load_bytes, store
+from sat_intervals.tiling import Window
 
 
 class Codes(NamedTuple):
@@ -199,10 +200,52 @@ def one_cell(rows: int, columns: int, count: int) -> Cells:
 
 
 class Ranges(NamedTuple):
-    """Search range of each pixel of a row: first and last candidate, ``(columns,)`` int64."""
+    """Search range of each pixel of a row, all ``(columns,)`` int64.
+
+    Attributes
+    ----------
+    first, last
+        First and last candidate.
+    start, stop
+        The whole vectors ``[start, stop)`` that contain them; others are walls and never computed.
+    """
 
     first: np.ndarray
     last: np.ndarray
+    start: np.ndarray
+    stop: np.ndarray
+
+
+class Span(NamedTuple):
+    """Search range of a pixel: candidates ``first .. last``, in the whole vectors ``[start, stop)``."""
+
+    first: int
+    last: int
+    start: int
+    stop: int
+
+
+@inlined
+def span_at(ranges, c):
+    """Search range of the pixel in column ``c``."""
+    return Span(ranges.first[c], ranges.last[c], ranges.start[c], ranges.stop[c])
+
+
+def new_ranges(columns: int) -> Ranges:
+    """Allocate the ranges of a row."""
+    return Ranges(*(np.zeros(columns, np.int64) for _ in Ranges._fields))
+
+
+def volume_starts(cells: Cells, output: Window) -> np.ndarray:
+    """Where each row of pixels begins in a volume that holds the vectors ``[start, stop)`` of every pixel.
+
+    Returns ``(rows + 1,)`` int64; the last is the size of the volume.
+    """
+    row, column = cells.row + output.row, cells.column + output.column
+    vectors = cells.last // LANES + 1 - cells.first // LANES
+    of_rows = vectors[:, np.arange(column, column + output.width) // cells.width].sum(axis=1)
+    sizes = LANES * of_rows[np.arange(row, row + output.height) // cells.height]
+    return np.concatenate([[0], np.cumsum(sizes)])
 
 
 @part
@@ -210,10 +253,13 @@ def enter_cells(candidates, cells, ranges, r):
     """Set the search ranges of the pixels of a row, and where their walls are."""
     i, number = (r + cells.row) // cells.height, cells.first.shape[1]
     for j in range(number):
-        start, stop = max(0, j * cells.width - cells.column), (j + 1) * cells.width - cells.column
-        ranges.first[start:stop] = cells.first[i, j]
-        ranges.last[start:stop] = cells.last[i, j]
-        candidates.walls[start:stop] = (i * number + j) * candidates.beyond.shape[1]
+        first, last = cells.first[i, j], cells.last[i, j]
+        for c in range(
+            max(0, j * cells.width - cells.column), min(ranges.first.size, (j + 1) * cells.width - cells.column)
+        ):
+            ranges.first[c], ranges.last[c] = first, last
+            ranges.start[c], ranges.stop[c] = first // LANES * LANES, (last // LANES + 1) * LANES
+            candidates.walls[c] = (i * number + j) * candidates.beyond.shape[1]
 
 
 @inlined
@@ -224,9 +270,9 @@ def candidate_costs(candidates, r, c, k):
 
 
 @inlined
-def cost_curve(candidates, r, c, curve):
-    """Write the costs of all candidates of a pixel to ``curve``."""
-    for k in range(0, curve.size, LANES):
+def cost_curve(candidates, span, r, c, curve):
+    """Write the costs of the candidates of a pixel to ``curve``."""
+    for k in range(span.start, span.stop, LANES):
         store(curve, k, candidate_costs(candidates, r, c, k))
 
 

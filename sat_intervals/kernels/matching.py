@@ -19,8 +19,11 @@ from sat_intervals.kernels.cost import (
     Ranges,
     cost_curve,
     enter_cells,
+    new_ranges,
     one_cell,
     padded_to_lanes,
+    span_at,
+    volume_starts,
 )
 from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
 from sat_intervals.kernels.reading import (
@@ -29,6 +32,7 @@ from sat_intervals.kernels.reading import (
     close_impossible,
     columns_of,
     contains,
+    open_curve,
     read_curve,
     rectangle_of,
     search_flags,
@@ -45,9 +49,10 @@ from sat_intervals.kernels.sgm import (
     add_curve,
     advance_pixel,
     advance_wave,
-    copy_curve,
     enter_row,
     hand_on,
+    keep_curve,
+    new_paths,
     no_borders,
     path_slots,
     restart,
@@ -167,6 +172,24 @@ class Matched(NamedTuple):
     leaving: Edge
 
 
+class _Volume(NamedTuple):
+    """Sums of L of the wanted pixels, each with the vectors that it searches.
+
+    Attributes
+    ----------
+    sums
+        uint16, one after another by row, column and candidate.
+    rows
+        ``(rows + 1,)`` int64: where each row begins.
+    places
+        ``(columns,)`` int64: where the candidate 0 of each pixel of the row is, or would be if it were searched.
+    """
+
+    sums: np.ndarray
+    rows: np.ndarray
+    places: np.ndarray
+
+
 class _Buffers(NamedTuple):
     """Inputs of both sweeps, and buffers for the current row, paths and curve.
 
@@ -178,8 +201,8 @@ class _Buffers(NamedTuple):
         ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
     possible
         ``(columns,)`` int64: number of possible candidates of each pixel of the row.
-    curve
-        ``(size,)`` uint16: buffer of one curve.
+    curve, opened
+        ``(size,)`` uint16: buffer of one curve; ``(2,)`` int64: its vectors that are in use.
     inside
         Pixels whose paths are computed; those of the pixels around them come from ``rings``.
     rings
@@ -198,6 +221,7 @@ class _Buffers(NamedTuple):
     penalties: Penalties
     paths: Paths
     curve: np.ndarray
+    opened: np.ndarray
     inside: Rectangle
     rings: tuple[Ring, ...]
     leaving: Edge
@@ -213,19 +237,20 @@ def _prepare(
     down: bool = True,
 ) -> _Buffers:
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
-    left, slots = borders.inside if borders else Window(0, 0, 0, 0), 1 + 3 * columns
+    left = borders.inside if borders else Window(0, 0, 0, 0)
     inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
     cells, k = cells or one_cell(rows, columns, settings.count), np.arange(size)
     walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
     return _Buffers(
         Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
         cells,
-        Ranges(np.zeros(columns, np.int64), np.zeros(columns, np.int64)),
+        new_ranges(columns),
         np.zeros(columns + settings.count, np.int64),
         np.zeros(columns, np.int64),
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
-        Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16)),
+        new_paths(columns, size),
         np.zeros(size, np.uint16),
+        np.array([0, size]),
         rectangle_of(inside),
         rings[:2] if down else rings[2:],
         Edge(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
@@ -239,7 +264,7 @@ def _enter_row(buffers, gradients, settings, r):
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    candidates, cells, ranges, usable, possible, penalties, paths, _, inside, rings, _, down = buffers
+    candidates, cells, ranges, usable, possible, penalties, paths, _, _, inside, rings, _, down = buffers
     costs, barrier = candidates.costs, candidates.barrier
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
@@ -258,7 +283,7 @@ def _enter_row(buffers, gradients, settings, r):
 @cached
 def _trace(buffers, gradients, settings, wave):
     """Advance the paths of one wave through a patch and copy the states that leave it."""
-    candidates, _, _, _, possible, penalties, paths, _, inside, _, leaving, down = buffers
+    candidates, _, ranges, _, possible, penalties, paths, _, _, inside, _, leaving, down = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
@@ -268,58 +293,71 @@ def _trace(buffers, gradients, settings, wave):
             if possible[c] == 0:
                 restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
             else:
-                advance_wave(candidates, penalties, paths, slots, wave, r, c)
+                advance_wave(candidates, span_at(ranges, c), penalties, paths, slots, wave, r, c)
         if inside.row <= r < inside.row_stop:
             hand_on(paths, inside, r, falling, rising, wave, down, leaving)
+
+
+@part
+def _enter_output(volume, ranges, output, r):
+    """Set the places of the pixels of a row in the volume."""
+    begin = volume.rows[r - output.row]
+    for c in range(output.column, output.column_stop):
+        volume.places[c] = begin - ranges.start[c]
+        begin += ranges.stop[c] - ranges.start[c]
 
 
 @cached
 def _sweep_down(buffers, gradients, settings, output, volume):
     """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, _, _, _, possible, penalties, paths, curve, inside, _, _, _ = buffers
+    candidates, _, ranges, _, possible, penalties, paths, curve, _, inside, _, _, _ = buffers
     for r in range(output.row_stop):
         falling, rising = _enter_row(buffers, gradients, settings, r)
+        if r >= output.row:
+            _enter_output(volume, ranges, output, r)
         for c in columns_of(inside, r, True):
             slots = path_slots(c, possible.size, falling, rising)
             if possible[c] == 0:
                 restart(paths, slots)
             elif contains(output, r, c):
-                offset = ((r - output.row) * volume.shape[1] + c - output.column) * curve.size
-                advance_pixel(candidates, penalties, paths, slots, r, c, volume, offset)
+                span, place = span_at(ranges, c), volume.places[c]
+                advance_pixel(candidates, span, penalties, paths, slots, r, c, volume.sums, place)
             else:
-                advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
+                advance_pixel(candidates, span_at(ranges, c), penalties, paths, slots, r, c, curve, 0)
 
 
 @cached
 def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
     """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
-    candidates, _, ranges, _, possible, penalties, paths, curve, inside, _, leaving, _ = buffers
+    candidates, _, ranges, _, possible, penalties, paths, curve, opened, inside, _, leaving, _ = buffers
     winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
     costs = candidates.costs
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
         falling, rising = _enter_row(buffers, gradients, settings, r)
+        if r < output.row_stop:
+            _enter_output(volume, ranges, output, r)
         for c in columns_of(inside, r, False):
-            slots = path_slots(c, possible.size, falling, rising)
+            slots, span = path_slots(c, possible.size, falling, rising), span_at(ranges, c)
+            open_curve(curve, opened, span)
             if possible[c] == 0:
                 restart(paths, slots)
             elif settings.regularized:
-                advance_pixel(candidates, penalties, paths, slots, r, c, curve, 0)
+                advance_pixel(candidates, span, penalties, paths, slots, r, c, curve, 0)
             if not contains(output, r, c):
                 continue
-            i, j = r - output.row, c - output.column
-            least, most = ranges.first[c], ranges.last[c]
-            if possible[c] < most + 1 - least:
-                validity[i, j] = search_flags(costs, r, c, least, most, possible[c])
+            i, j, place = r - output.row, c - output.column, volume.places[c]
+            if possible[c] < span.last + 1 - span.first:
+                validity[i, j] = search_flags(costs, r, c, span.first, span.last, possible[c])
             if possible[c] == 0:
                 if keep:
-                    volume[i, j] = IMPOSSIBLE_COST
+                    volume.sums[place + span.start : place + span.stop] = IMPOSSIBLE_COST
                 continue
             if settings.regularized:
-                add_curve(curve, volume, (i * volume.shape[1] + j) * curve.size)
+                add_curve(curve, span, volume.sums, place)
             else:
-                cost_curve(candidates, r, c, curve)
-            lowest = close_impossible(curve, candidates, c)
-            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, lowest, settings, least, most)
+                cost_curve(candidates, span, r, c, curve)
+            lowest = close_impossible(curve, candidates, span, c)
+            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, span, lowest, settings)
             lower[i, j], upper[i, j] = high
             if settings.low >= 0:
                 lower_low[i, j], upper_low[i, j] = low
@@ -327,9 +365,9 @@ def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             if not refined:
                 validity[i, j] |= NOT_REFINED
             if contains(right.core, r, c):
-                update_right(curve, right, r, c)
+                update_right(curve, span, right, r, c)
             if keep:
-                copy_curve(curve, volume[i, j])
+                keep_curve(curve, span, volume.sums, place)
         if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
             hand_on(paths, inside, r, falling, rising, LAST_WAVE, False, leaving)
 
@@ -341,7 +379,8 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     shape = output.height, output.width
     of_low = shape if settings.low >= 0 else (0, 0)
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
-    volume = np.empty((*shape, size), np.uint16)
+    starts = volume_starts(buffers.cells, output)
+    volume = _Volume(np.empty(starts[-1], np.uint16), starts, np.zeros(costs.left_state.shape[1], np.int64))
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -365,7 +404,7 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
     if settings.steps:  # the sweep only carries them as int16: compiled once for both kinds
         raw = raw._replace(**{name: getattr(raw, name).view(np.uint16) for name in BOUNDS})
-    return Matched(raw, RightView(cost, winner), buffers.leaving), volume
+    return Matched(raw, RightView(cost, winner), buffers.leaving), volume.sums
 
 
 def trace(
@@ -427,4 +466,5 @@ def cost_volume(costs: Costs, settings: Settings, gradients: Gradients | None = 
     Parameters as in `match_costs`. Returns ``(rows, columns, count)`` uint16, IMPOSSIBLE_COST at impossible candidates.
     """
     whole = Window(0, 0, *costs.left_state.shape)
-    return _sweep(costs, gradients, settings, whole, whole, True, None, None)[1][:, :, : settings.count]
+    sums = _sweep(costs, gradients, settings, whole, whole, True, None, None)[1]
+    return sums.reshape(*costs.left_state.shape, -1)[:, :, : settings.count]

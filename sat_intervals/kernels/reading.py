@@ -65,10 +65,19 @@ def columns_of(inside, r, down):
 
 
 @inlined
-def close_impossible(curve, candidates, c):
+def open_curve(curve, opened, span):
+    """Prepare a curve for a pixel: IMPOSSIBLE_COST outside its vectors. ``opened`` are those of the pixel before."""
+    if opened[0] != span.start or opened[1] != span.stop:
+        for k in range(0, curve.size, LANES):
+            store(curve, k, splat(np.uint16(IMPOSSIBLE_COST)))
+        opened[0], opened[1] = span.start, span.stop
+
+
+@inlined
+def close_impossible(curve, candidates, span, c):
     """Set impossible candidates and those that are not searched to IMPOSSIBLE_COST; return the lowest cost."""
     lowest = splat(np.uint16(IMPOSSIBLE_COST))
-    for k in range(0, curve.size, LANES):
+    for k in range(span.start, span.stop, LANES):
         wall = load(candidates.beyond, candidates.walls[c] + k)
         closed = fill_where_nonzero(larger(load(candidates.barrier, c + k), wall))
         costs = larger(load(curve, k), closed)
@@ -78,9 +87,9 @@ def close_impossible(curve, candidates, c):
 
 
 @inlined
-def _winner(curve, lowest):
+def _winner(curve, span, lowest):
     """First index with the lowest cost: 14 ns for 64 disparities by vectors, 36 ns by single costs."""
-    k = 0
+    k = span.start
     mask = lanes_at_most(load(curve, k), lowest)
     while mask == 0:
         k += LANES
@@ -89,11 +98,11 @@ def _winner(curve, lowest):
 
 
 @inlined
-def _interval(curve, lowest, least, most, cut_level, refine):
+def _interval(curve, span, lowest, cut_level, refine):
     """First and last index of the alpha-cut, extended by one where refinement may move a winner at a bound outside."""
-    first, last = alpha_cut(curve, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
-    first -= refine & (first > least) & (curve[first] == lowest)
-    last += refine & (last < most) & (curve[last] == lowest)
+    first, last = alpha_cut(curve, span, np.uint16(min(lowest + cut_level, IMPOSSIBLE_COST - 1)))
+    first -= refine & (first > span.first) & (curve[first] == lowest)
+    last += refine & (last < span.last) & (curve[last] == lowest)
     return first, last
 
 
@@ -115,14 +124,14 @@ class RightPixels(NamedTuple):
 
 
 @inlined
-def update_right(curve, right, r, c):
+def update_right(curve, span, right, r, c):
     """Update the right pixels that a left pixel faces with its candidates.
 
     The sweep up visits the left pixels of a row from right to left, so ``k`` ascends at each right pixel and ties go to
     the largest.
     """
     start = (r - right.core.row) * right.cost.shape[1] + c - right.core.column
-    for k in range(0, curve.size, LANES):
+    for k in range(span.start, span.stop, LANES):
         candidate, known = load(curve, k), load(right.cost, start + k)
         best = choose_smaller(candidate, known, load(right.indices, k), load(right.best, start + k))
         store(right.best, start + k, best)
@@ -147,19 +156,19 @@ def search_flags(costs, r, c, first, last, possible):
 
 
 @inlined
-def read_curve(curve, lowest, settings, least, most):
+def read_curve(curve, span, lowest, settings):
     """Winner, sub-pixel shift, whether it was refined, the bounds of both levels and ambiguity of a finished curve.
 
-    ``least`` and ``most`` are the first and the last candidate searched. Bounds are disparities, or steps with
-    sub-pixel cuts; NO_DISPARITY for a level that is off.
+    Bounds are disparities, or steps with sub-pixel cuts; NO_DISPARITY for a level that is off.
     """
-    k = _winner(curve, lowest)
+    least, most = span.first, span.last
+    k = _winner(curve, span, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
     high = low = NO_DISPARITY, NO_DISPARITY
     if settings.steps > 0:
-        high, low = subpixel_cuts(curve, lowest, k + shift, settings)
+        high, low = subpixel_cuts(curve, span, lowest, k + shift, settings)
     elif settings.cut_level >= 0:
-        first, last = _interval(curve, lowest, least, most, settings.cut_level, settings.refine)
+        first, last = _interval(curve, span, lowest, settings.cut_level, settings.refine)
         high = settings.minimum + first, settings.minimum + last
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
     stop = most + 1 if settings.weights.size else least

@@ -43,18 +43,45 @@ class Paths(NamedTuple):
         ``(slots, size)`` uint16: L at the last pixel of each path.
     lowest
         ``(slots,)`` uint16: its minimum.
+    spans
+        ``(slots, 2)`` int64: the whole vectors ``[start, stop)`` of the curve that are not all walls.
     """
 
     curves: np.ndarray
     lowest: np.ndarray
+    spans: np.ndarray
+
+
+def new_paths(columns: int, size: int) -> Paths:
+    """Allocate the paths of a sweep, which all start at their next pixels."""
+    slots = 1 + 3 * columns
+    spans = np.tile(np.array([0, size]), (slots, 1))
+    return Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16), spans)
 
 
 @inlined
-def _begin(paths, slot):
-    """State of a path at a pixel: start of its curve, ``min L(q)``, L(q) of two blocks, and the least L so far."""
+def _begin(paths, slot, first):
+    """State of a path before the candidate ``first`` of a pixel.
+
+    Returns the start of its curve, ``min L(q)``, L(q) of two blocks, and the least L so far.
+    """
     start = slot * paths.curves.shape[1]
-    wall, nothing_yet = splat(np.uint16(WALL)), splat(np.uint16(65535))
-    return start, splat(paths.lowest[slot]), wall, load(paths.curves, start), nothing_yet
+    before = load(paths.curves, start + first - LANES) if first > 0 else splat(np.uint16(WALL))
+    return start, splat(paths.lowest[slot]), before, load(paths.curves, start + first), splat(np.uint16(65535))
+
+
+@inlined
+def _close(candidates, span, paths, slots):
+    """Wall up what earlier pixels of the paths searched and this one does not."""
+    if candidates.beyond.shape[0] == 1:  # all pixels have one range
+        return
+    wall, size = splat(np.uint16(WALL)), paths.curves.shape[1]
+    for slot in slots:
+        for k in range(paths.spans[slot, 0], span.start, LANES):
+            store(paths.curves, slot * size + k, wall)
+        for k in range(span.stop, paths.spans[slot, 1], LANES):
+            store(paths.curves, slot * size + k, wall)
+        paths.spans[slot, 0], paths.spans[slot, 1] = span.start, span.stop
 
 
 @inlined
@@ -69,20 +96,21 @@ def _advance(path, curves, k, costs, penalties):
 
 
 @inlined
-def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
+def advance_pixel(candidates, span, penalties, paths, slots, r, c, target, offset):
     """Advance the four paths in ``slots`` by the pixel ``(r, c)``; write their sum of L to ``target`` from ``offset``.
 
-    The four paths have names because numba does not unroll a loop over a tuple.
+    The sum of candidate k goes to ``offset + k``. The four paths have names because numba does not unroll a loop over a
+    tuple.
     """
-    curves, lowest = paths
+    curves, lowest, _ = paths
     p1, p2, row = penalties
     path_1, path_2, path_3, path_4 = (
-        _begin(paths, slots[0]),
-        _begin(paths, slots[1]),
-        _begin(paths, slots[2]),
-        _begin(paths, slots[3]),
+        _begin(paths, slots[0], span.start),
+        _begin(paths, slots[1], span.start),
+        _begin(paths, slots[2], span.start),
+        _begin(paths, slots[3], span.start),
     )
-    for k in range(0, curves.shape[1], LANES):
+    for k in range(span.start, span.stop, LANES):
         costs = candidate_costs(candidates, r, c, k)
         path_1, cost_1 = _advance(path_1, curves, k, costs, penalties_of(p1, p2, row, 0, c, k))
         path_2, cost_2 = _advance(path_2, curves, k, costs, penalties_of(p1, p2, row, 1, c, k))
@@ -96,30 +124,32 @@ def advance_pixel(candidates, penalties, paths, slots, r, c, target, offset):
         store(target, offset + k, add(add(cost_1, cost_2), add(cost_3, cost_4)))
     lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
     lowest[slots[2]], lowest[slots[3]] = smallest(path_3[4]), smallest(path_4[4])
+    _close(candidates, span, paths, slots)
 
 
 @inlined
-def _advance_pair(candidates, penalties, paths, slots, i, r, c):
+def _advance_pair(candidates, span, penalties, paths, slots, i, r, c):
     """Advance the paths ``i`` and ``i + 1``, which have ``slots``, by the pixel ``(r, c)``."""
-    curves, lowest = paths
+    curves, lowest, _ = paths
     p1, p2, row = penalties
-    path_1, path_2 = _begin(paths, slots[0]), _begin(paths, slots[1])
-    for k in range(0, curves.shape[1], LANES):
+    path_1, path_2 = _begin(paths, slots[0], span.start), _begin(paths, slots[1], span.start)
+    for k in range(span.start, span.stop, LANES):
         costs = candidate_costs(candidates, r, c, k)
         path_1, cost_1 = _advance(path_1, curves, k, costs, penalties_of(p1, p2, row, i, c, k))
         path_2, cost_2 = _advance(path_2, curves, k, costs, penalties_of(p1, p2, row, i + 1, c, k))
         store(curves, path_1[0] + k, cost_1)
         store(curves, path_2[0] + k, cost_2)
     lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
+    _close(candidates, span, paths, slots)
 
 
 @inlined
-def advance_wave(candidates, penalties, paths, slots, wave, r, c):
+def advance_wave(candidates, span, penalties, paths, slots, wave, r, c):
     """Advance the two paths of a wave by the pixel ``(r, c)``."""
     if wave == 0:
-        _advance_pair(candidates, penalties, paths, (slots[0], slots[1]), 0, r, c)
+        _advance_pair(candidates, span, penalties, paths, (slots[0], slots[1]), 0, r, c)
     else:
-        _advance_pair(candidates, penalties, paths, (slots[2], slots[3]), 2, r, c)
+        _advance_pair(candidates, span, penalties, paths, (slots[2], slots[3]), 2, r, c)
 
 
 @inlined
@@ -145,13 +175,21 @@ def restart(paths, slots):
     for slot in slots:
         paths.curves[slot] = 0
         paths.lowest[slot] = 0
+        paths.spans[slot, 0], paths.spans[slot, 1] = 0, paths.curves.shape[1]
 
 
 @inlined
-def add_curve(curve, volume, offset):
-    """Add ``volume.ravel()[offset : offset + curve.size]`` to a curve."""
-    for k in range(0, curve.size, LANES):
+def add_curve(curve, span, volume, offset):
+    """Add the sums of the candidates of a pixel, of which candidate k is ``volume[offset + k]``, to its curve."""
+    for k in range(span.start, span.stop, LANES):
         store(curve, k, add(load(curve, k), load(volume, offset + k)))
+
+
+@inlined
+def keep_curve(curve, span, volume, offset):
+    """Copy the candidates of a pixel to where `add_curve` reads them."""
+    for k in range(span.start, span.stop, LANES):
+        store(volume, offset + k, load(curve, k))
 
 
 @inlined
@@ -256,6 +294,7 @@ def _set_wave(paths, slots, wave, states):
         for k in range(1, states.shape[1]):
             lowest = min(lowest, states[n, k])
         paths.lowest[slot] = lowest
+        paths.spans[slot, 0], paths.spans[slot, 1] = 0, states.shape[1]
 
 
 @part

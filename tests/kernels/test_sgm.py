@@ -9,10 +9,11 @@ from helpers import codes_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals.kernels.cost import Codes, Costs, between
-from sat_intervals.kernels.matching import Settings, cost_volume
+from sat_intervals.kernels.cost import Cells, Codes, Costs, between
+from sat_intervals.kernels.matching import Settings, cost_volume, match_costs
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
 from sat_intervals.products import IMPOSSIBLE_COST, MASKED, NO_DATA
+from sat_intervals.tiling import Window
 
 bounded = settings(max_examples=80, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
@@ -309,3 +310,31 @@ def test_cost_volume__of_stored_costs_equals_that_of_codes(scene):
     costs = Costs(stored, None, left.state, right.state)
     parameters = Settings(**reference.settings_of(scene))
     np.testing.assert_array_equal(cost_volume(costs, parameters), cost_volume(between(left, right), parameters))
+
+
+@few
+@given(seed=st.integers(0, 2**32 - 1), before=st.integers(0, 70), after=st.integers(0, 70), holes=st.booleans())
+def test_match_costs__candidates_that_no_cell_searches_change_nothing(seed, before, after, holes):
+    """Cells of random ranges in a hull and in a wider one: other vectors contain the candidates of each pixel."""
+    random, (rows, columns, count) = np.random.default_rng(seed), (9, 21, 80)
+    ends = np.sort(random.integers(0, count, (2, 3, 4)), axis=0)
+    whole = Window(0, 0, rows, columns)
+
+    def codes(width):
+        words = random.integers(0, 2**24, (1, rows, width), np.uint32)
+        return Codes(words, np.where(random.random((rows, width)) < 0.15 * holes, NO_DATA, 0).astype(np.uint8))
+
+    def matched(right, padding):
+        total = right.state.shape[1] + 1 - columns
+        settings = Settings(-padding, total, 77, 8, 32, True, 60, np.arange(60, 0, -1).astype(np.uint16), True)
+        cells = Cells(ends[0] + padding, ends[1] + padding, 4, 6, 2, 1)
+        return match_costs(between(left, right), settings, whole, cells=cells)
+
+    left, right = codes(columns), codes(columns + count - 1)
+    sides = codes(before), right, codes(after)
+    wider = Codes(*(np.concatenate(parts, axis=-1) for parts in zip(*sides, strict=True)))
+    narrow, wide = matched(right, 0), matched(wider, before)
+    for name, products in narrow.raw._asdict().items():
+        np.testing.assert_array_equal(getattr(wide.raw, name), products, name)
+    inner = slice(before, before + right.state.shape[1])
+    np.testing.assert_array_equal(wide.right.winner[:, inner], narrow.right.winner)
