@@ -170,7 +170,7 @@ def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins |
     width = sample.width
     for count in _CLASSES if width.size else ():
         # between centimetres, so that rounding does not part intervals of one width
-        limits = np.unique(np.round(np.quantile(width, np.arange(1, count) / count), 2)) + 0.005
+        limits = np.unique(np.round(np.round(np.quantile(width, np.arange(1, count) / count), 2) + 0.005, 3))
         limits = limits[limits < width.max()]
         kinds = np.searchsorted(limits, width, side="right")
         cells = cells_of_height * np.bincount(kinds, minlength=limits.size + 1)
