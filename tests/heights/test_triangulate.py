@@ -369,6 +369,12 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     command = ["surface", *images, str(out), *sensors, *search, "--resolution", "1"]
     wrong = invoke(*command[:-1], "-1")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
+    (tmp_path / "heights.yaml").write_text(
+        "{name: city, coverage: 0.9, surface: {CELL: 9 m}, classes: [{below: null, margin: 1.0, cells: 99}]}"
+    )
+    wrong = invoke(*command, "--height-calibration", tmp_path / "heights.yaml")
+    assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
+    assert "calibration city belongs to other surfaces, CELL is 9 m there and 1 m here" in wrong.stderr
     monkeypatch.setattr("sat_intervals.heights.dsm.PointCloud", None)  # an error of the last step
     assert invoke(*command).exit_code == 1
     monkeypatch.undo()
