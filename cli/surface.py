@@ -83,7 +83,7 @@ def _check(
 def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish":
     """Return a function that makes the surface model of a pair of a batch, if its row asks for one.
 
-    Models and grids are read now, before hours of matching. A surface of the pair's run is kept.
+    Models and grids are read now, before hours of matching.
     """
     from sat_intervals.heights.choices import SurfaceChoices
 
@@ -97,22 +97,10 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         from sat_intervals.heights.triangulate import triangulate
 
         folder = out / pair.name
-        if not pair.sensors or not pair.resolution or _has_surface(folder, pair.resolution):
+        if not pair.sensors or not pair.resolution:
             return {}
         triangulate(folder, *pair.sensors, console.progress)
         made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
         return {"surface": made}
 
     return surface_of
-
-
-def _has_surface(out: Path, resolution: float) -> bool:
-    """Return whether a folder has the surface model of its run."""
-    from sat_intervals.raster import is_surface, read_place, read_tags
-    from sat_intervals.results import open_run
-
-    file = out / "dsm.tif"
-    if not is_surface(file) or read_tags(file).get("RUNS") != open_run(out).report["finished"]:
-        return False
-    size = read_place(file)[1].pixel_size
-    return size is not None and size[0] == resolution
