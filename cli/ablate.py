@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.judging import Judging, judging_options, say_json
+from sat_intervals.cli.judging import Judging, judging_options, say_scenes
 from sat_intervals.cli.options import cost_option
 
 
@@ -35,6 +35,6 @@ def ablate(pairs: tuple[Path, ...], cost: str | None, judging: Judging) -> None:
             click.echo(f"matching {pair.name}", err=True)
         scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, config, tolerance=judging.tolerance)))
     if judging.as_json:
-        say_json(scenes)
+        say_scenes(scenes)
     else:
         show_groups(table_2(scenes), "accuracy, means over scenes, valid pixels")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.evaluate_dsm import Surface, surface_options
-from sat_intervals.cli.judging import Judging, judging_options, say_json
+from sat_intervals.cli.judging import Judging, judging_options, say_scenes
 from sat_intervals.cli.options import COSTS
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def evaluate(
     if not judging.quiet:
         _warn_of_whole_truth(scenes, judging.tolerance)
     if judging.as_json:
-        say_json(scenes)
+        say_scenes(scenes)
     elif len(scenes) == 1:
         show_scene(scenes[0])
     else:

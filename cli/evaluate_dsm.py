@@ -9,6 +9,8 @@ from typing import Any
 
 import click
 
+from sat_intervals.cli.options import say_json
+
 _FILE = click.Path(path_type=Path)
 # In the first line of files of figures: those without it are not replaced.
 _MARK = "sat-intervals"
@@ -42,7 +44,7 @@ class Surface:
             raise click.UsageError(f"--pictures {self.folder} is no folder: give an existing one.")
         report = evaluate_surface(self.dsm, self.reference, self.classes, registers=self.registers)
         if as_json:
-            click.echo(json.dumps(report, indent=1))
+            say_json(report)
         else:
             show_surface(str(self.dsm), report)
         if self.folder is not None:

@@ -7,10 +7,10 @@ import click
 from sat_intervals.cli.options import log_options, path
 
 
-@click.command(short_help="Export a run to the files of CARS, ASP, s2p or OTB.")
+@click.command(short_help="Export a run to the files of CARS, OTB, ASP or s2p.")
 @click.argument("out", callback=path)
 @click.argument("target", callback=path)
-@click.option("--to", "form", type=click.Choice(["cars", "asp", "s2p", "otb"]), required=True, help="Target tool.")
+@click.option("--to", "form", type=click.Choice(["cars", "otb", "asp", "s2p"]), required=True, help="Target tool.")
 @log_options
 def export(out: Path, target: Path, form: str) -> None:
     """Export the finished run in the folder OUT to the folder TARGET in the format of another tool.
@@ -19,12 +19,14 @@ def export(out: Path, target: Path, form: str) -> None:
     cars   epi_disp.tif, epi_disp_interval_bounds_inf.tif and _sup.tif,
            epi_disp_ambiguity.tif (1 - confidence),
            epi_disp_mask.tif (255 = valid)
-    asp    TARGET-F.tif: horizontal, vertical, valid; TARGET is a prefix
-    s2p    rectified_disp.tif, rectified_mask.png (1 = valid),
-           rectified_disp_confidence.tif
     otb    disparity.tif (horizontal, vertical), mask.tif (255 = valid)
+    asp    experimental: TARGET-F.tif (horizontal, vertical, valid);
+           TARGET is a prefix
+    s2p    experimental: rectified_disp.tif,
+           rectified_mask.png (1 = valid), rectified_disp_confidence.tif
 
-    All have the size of the left image. Earlier exports of these names are replaced, other files are not.
+    Experimental formats follow the documentation of the tool, which has not read them yet. All files have the size of
+    the left image. Earlier exports of these names are replaced, other files are not.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.interop.export import export
 

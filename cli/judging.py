@@ -1,6 +1,5 @@
 """Options and output shared by the commands that evaluate pairs with known truth."""
 
-import json
 import math
 from dataclasses import dataclass
 from functools import wraps
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import Command, log_options, preset_option, with_options
+from sat_intervals.cli.options import Command, json_option, log_options, preset_option, say_json, with_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -87,13 +86,13 @@ def judging_options(command: Command) -> Command:
             help="Cross-check against a right view that is matched on its own, as in the paper's implementation.",
         ),
         tolerance_option,
-        click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON."),
+        json_option,
         click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
     )
 
 
-def say_json(scenes: "list[SceneMetrics]") -> None:
+def say_scenes(scenes: "list[SceneMetrics]") -> None:
     """Print reports of scenes as JSON: the report of one scene, or reports by name of several."""
     reports = {scene.name: scene.report for scene in scenes}
-    click.echo(json.dumps(scenes[0].report if len(scenes) == 1 else reports, indent=1))
+    say_json(scenes[0].report if len(scenes) == 1 else reports)

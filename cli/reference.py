@@ -1,10 +1,14 @@
 """``sat-intervals reference``: true disparities of a run from reference heights."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import log_options, path, quiet_option, sensor_options
+from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, sensor_options
+
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
 
 # Metres of height above which a shift is rather a mistake, and pixels of row misfit.
 _SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
@@ -20,6 +24,7 @@ _SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
 @click.option("--no-register", is_flag=True, help="Do not move the reference to the points of the run.")
 @click.option("--output", callback=path, metavar="FILE", help="File to write; default truth.tif in OUT.")
 @sensor_options
+@json_option
 @quiet_option
 @log_options
 def reference(
@@ -32,6 +37,7 @@ def reference(
     no_register: bool,
     output: Path | None,
     sensor_files: tuple[Path, Path, Path, Path],
+    as_json: bool,
     quiet: bool,
 ) -> None:
     """Write the disparities that reference heights have in the finished run OUT: OUT/truth.tif.
@@ -51,15 +57,28 @@ def reference(
     if ellipsoid and geoid:
         raise click.UsageError("--ellipsoid and --geoid exclude each other.")
     from sat_intervals.cli.console import Console
-    from sat_intervals.cli.tables import registration_lines
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
     from sat_intervals.raster import Vertical
 
     vertical = Vertical(ellipsoid, geoid)
     given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
     files = SensorFiles(*sensor_files)
-    with Console(quiet) as console:
+    with Console(quiet or as_json) as console:
         report = make_truth(out, files, given, path=output, registers=not no_register, progress=console.progress)
+    _say_fit(console, report)
+    console.say(
+        f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "
+        f"{100 * report['outside_range']:.1f} % of them outside the search range"
+    )
+    console.say(str(output or out / "truth.tif"))
+    if as_json:
+        say_json(report)
+
+
+def _say_fit(console: "Console", report: dict[str, Any]) -> None:
+    """Print the registration and the misfit of rows; warn of those that are suspect."""
+    from sat_intervals.cli.tables import registration_lines
+
     if report["registration"]:
         for line in registration_lines(report["registration"]):
             console.say(line)
@@ -73,8 +92,3 @@ def reference(
         console.say(f"row misfit of models and grids: {misfit[0]:.2g} px in the median, {misfit[1]:.2g} px at most")
         if misfit[0] > _SUSPECT_ROWS:
             click.echo(f"warning: rows of both images differ by {misfit[0]:.2g} px: check models and grids", err=True)
-    console.say(
-        f"{report['pixels']} pixels with a true disparity ({100 * report['share']:.1f} %), "
-        f"{100 * report['outside_range']:.1f} % of them outside the search range"
-    )
-    console.say(str(output or out / "truth.tif"))

@@ -15,7 +15,7 @@ from sat_intervals.cli.options import json_option, say_json, store_option
 @store_option
 @json_option
 def status(out: Path, store: str | None, as_json: bool) -> None:
-    """Show how many tiles of the run in OUT are done, failed and left, during the run or after it ended.
+    """Show how many tiles and strips of the run in OUT are done, during the run or after it ended.
 
     The files of a complete run are compared with their checksums. For the folder of a batch, show the progress of each
     pair, and why pairs failed, without reading the files.
@@ -72,6 +72,8 @@ def _lines(name: str, state: dict[str, Any]) -> Iterator[str]:
     what = "a run is active" if state["running"] else "no run is active, the same command resumes it"
     if state["handed_on"]:
         what += f"; {state['handed_on']} path states are handed on"
-    yield f"{name}: {state['done']} of {state['total']} tiles done, {len(state['failed'])} failed, {left} left; {what}"
+    strips = f", {state['strips_done']} of {state['strips']} strips done" if state["strips_done"] else ""
+    tiles = f"{state['done']} of {state['total']} tiles done, {len(state['failed'])} failed, {left} left"
+    yield f"{name}: {tiles}{strips}; {what}"
     for tile, reason in state["failed"].items():
         yield f"  tile {tile}: {reason}"

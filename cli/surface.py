@@ -8,7 +8,7 @@ import click
 
 from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
 from sat_intervals.cli.matching import Pair, Run, Settings, pair_options, run_options, search_options
-from sat_intervals.cli.options import path, sensor_options
+from sat_intervals.cli.options import json_option, path, say_json, sensor_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -24,12 +24,14 @@ if TYPE_CHECKING:
 @sensor_options
 @cell_options
 @calibration_option("--height-calibration")
+@json_option
 @run_options
 def surface(
     pair: Pair,
     out: Path,
     sensor_files: tuple[Path, Path, Path, Path],
     cells: dict[str, Any],
+    as_json: bool,
     settings: Settings,
     run: Run,
 ) -> None:
@@ -41,7 +43,7 @@ def surface(
     from sat_intervals.cli.console import Console
 
     config = settings.load()
-    with Console(run.quiet) as console:
+    with Console(run.quiet or as_json) as console:
         from sat_intervals.heights.dsm import make_surface
         from sat_intervals.heights.triangulate import triangulate
         from sat_intervals.run.before import report_before
@@ -51,8 +53,10 @@ def surface(
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
-        triangulate(out, *sensor_files, progress=console.progress)
+        points = triangulate(out, *sensor_files, progress=console.progress)
         made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
+    if as_json:
+        say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))

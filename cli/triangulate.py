@@ -25,7 +25,8 @@ def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], as_json:
     OUT/points.json  size and checksum of points.tif
 
     Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files. Grids contain the sensor column and row (bands 1 and 2)
-    of epipolar positions, as written by CARS and shareloc. All must be local files. Swapping both models and grids of
+    of epipolar positions, as written by CARS and shareloc, or displacements to them, if OTB's tag METADATATYPE=OTB
+    says so. All must be local files. Swapping both models and grids of
     left and right is not detected, and inverts the relief.
     Needs shareloc: pip install 'sat-intervals[dsm]'.
     """  # noqa: D301 (\b keeps the line breaks in click)

@@ -37,10 +37,15 @@ GALLERY = (
 
 
 def adapted(text: str) -> str:
-    """Adapt the links of a document, which are those of the repository, to the pages of the site."""
+    """Adapt the links of a document, which are those of the repository, to the pages of the site.
+
+    A picture is a link to itself, in full size.
+    """
+    text = re.sub(r"\[(?:docs/)?(\w+)\.md\]\(", r"[\1](", text)
     text = re.sub(r"\]\((?:\.\./)?README\.md", "](index.md", text)
     text = re.sub(r"\]\((?:\.\./)?docs/", "](", text)
     text = re.sub(r"\]\((?:\.\./)?\.github/pictures/", "](pictures/", text)
+    text = re.sub(r"!\[([^\]]*)\]\(([^)]*)\)", r"[![\1](\2)](\2)", text)
     return text.replace("](../", "](")
 
 
@@ -119,7 +124,7 @@ def command_reference() -> str:
     for step, commands in STEPS.items():
         lines += [f"## {step}", ""]
         for command in commands:
-            context = click.Context(command, info_name=f"sat-intervals {command.name}", terminal_width=100)
+            context = click.Context(command, info_name=f"sat-intervals {command.name}", terminal_width=78)
             lines += [f"### {command.name}", "", "```text", command.get_help(context), "```", ""]
     return "\n".join(lines)
 
@@ -142,12 +147,17 @@ def gallery() -> str:
         lines += [f"## {title}", "", "```", command, "```", ""]
         if file:
             link = f"gallery-files/{file}"
-            lines += [f"![{title}]({link})" if file.endswith(".png") else f"[Open the page]({link})", ""]
+            lines += [f"[![{title}]({link})]({link})" if file.endswith(".png") else f"[Open the page]({link})", ""]
     for raster in (*folder.rglob("*.tif"), *folder.rglob("run.json")):
         raster.unlink()
     return "\n".join(lines)
 
 
+# Long commands and wide tables are read without scrolling.
+STYLE = """\
+.md-typeset pre > code { white-space: pre-wrap; }
+.md-typeset table:not([class]) th, .md-typeset table:not([class]) td { min-width: 0; padding: 0.5em 0.6em; }
+"""
 RUN = "import sys; from sat_intervals.cli import main; sys.argv[0] = 'sat-intervals'; main()"
 
 
@@ -160,6 +170,7 @@ def write_pages() -> None:
         name = "index.md" if file.name == "README.md" else file.name
         (PAGES / name).write_text(adapted(file.read_text()))
     (PAGES / "settings-reference.md").write_text(settings_reference())
+    (PAGES / "style.css").write_text(STYLE)
     (PAGES / "commands.md").write_text(command_reference())
     (PAGES / "python.md").write_text(python_reference())
 

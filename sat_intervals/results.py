@@ -15,6 +15,7 @@ from sat_intervals.errors import RunError, SatIntervalsError, check_regular
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import (
+    Georeferencing,
     Image,
     open_image,
     read_layers,
@@ -75,6 +76,17 @@ class Run:
     def shape(self) -> tuple[int, int]:
         """Return the rows and columns of the results."""
         return self.region.height, self.region.width
+
+    @property
+    def georeferencing(self) -> Georeferencing:
+        """Return the georeferencing of the results."""
+        return open_image(self.out / "validity.tif").georeferencing
+
+    @property
+    def left_georeferencing(self) -> Georeferencing:
+        """Return the georeferencing of the whole left image."""
+        region = self.region
+        return self.georeferencing.shifted(Window(-region.row, -region.column, region.height, region.width))
 
     def read_bands(self, window: Window) -> Bands:
         """Read the bands of a window of the results."""

@@ -12,22 +12,28 @@ LONGITUDE, LATITUDE = 1.45, 43.6
 EAST, NORTH = 80_700.0, 111_110.0
 
 
-def camera(path, view, longitude=LONGITUDE):
-    """Write the RPC of a view: column = u + view (h - h0), row down the latitudes; u in pixels, heights in metres."""
+def camera(path, view, longitude=LONGITUDE, *, turn=0.0, shift=(0.0, 0.0), pixels=None):
+    """Write an image and the RPC of a view: x = u + view (h - h0), y down the latitudes; u in pixels, h in metres.
+
+    Its columns and rows are x and y, turned clockwise by an angle in radians and shifted.
+    """
     scale = 0.01, 60.0  # degrees, metres; over a few metres lines in degrees are straight
-    column, line, one = np.zeros(20), np.zeros(20), np.eye(20)[0]
-    column[1], column[3] = EAST / PIXEL * scale[0], view * scale[1]
-    line[2] = -NORTH / PIXEL * scale[0]
+    x, y, one = np.zeros(20), np.zeros(20), np.eye(20)[0]
+    x[1], x[3] = EAST / PIXEL * scale[0], view * scale[1]
+    y[2] = -NORTH / PIXEL * scale[0]
+    column = np.cos(turn) * x - np.sin(turn) * y + shift[0] * one
+    line = np.sin(turn) * x + np.cos(turn) * y + shift[1] * one
     rpc = RPC(
         line_off=0.0, line_scale=1.0, samp_off=0.0, samp_scale=1.0,
         lat_off=LATITUDE, lat_scale=scale[0], long_off=longitude, long_scale=scale[0],
         height_off=DATUM, height_scale=scale[1],
         line_num_coeff=list(line), line_den_coeff=list(one), samp_num_coeff=list(column), samp_den_coeff=list(one),
     )  # fmt: skip
-    with rasterio.open(
-        path, "w", driver="GTiff", height=8, width=8, count=1, dtype="uint8", crs="EPSG:4326", rpcs=rpc
-    ) as dataset:
-        dataset.write(np.zeros((1, 8, 8), np.uint8))
+    pixels = np.zeros((8, 8), np.uint8) if pixels is None else pixels
+    height, width = pixels.shape
+    kind = {"height": height, "width": width, "count": 1, "dtype": pixels.dtype}
+    with rasterio.open(path, "w", driver="GTiff", rpcs=rpc, **kind) as dataset:
+        dataset.write(pixels, 1)
     return path
 
 

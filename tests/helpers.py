@@ -19,7 +19,8 @@ from sat_intervals.config import Config, key_of
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import Scene
 from sat_intervals.kernels.cost import between, census
-from sat_intervals.kernels.matching import Settings, match_costs
+from sat_intervals.kernels.matching import match_costs
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import INVALID
 from sat_intervals.raster import north_up, write_layer
 from sat_intervals.tiling import Window

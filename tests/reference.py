@@ -691,7 +691,7 @@ def span_of(scene):
 
 
 def settings_of(scene, alpha="0.9", eta_max="0.7", eta_step="0.01", refine=True, cuts=(-1, -1), steps=0):
-    """The fields of ``sat_intervals.kernels.matching.Settings`` for a scene; None = the step is off."""
+    """The fields of ``sat_intervals.kernels.sweeps.Settings`` for a scene; None = the step is off."""
     cost_span = span_of(scene)
     weights = np.zeros(0, np.uint16)
     if eta_max is not None:

@@ -53,8 +53,8 @@ OVER_THE_LIMITS = {
 # Test files without a module of their name: they test several modules together.
 LAWS = {
     "./architecture", "./documents", "./package", "./release", "cli/commands", "cli/coverage", "cli/messages",
-    "match/accuracy", "match/pandora", "raster/raster", "run/damage", "run/kept_files", "run/survival", "run/waits",
-    "show/pictures",
+    "interop/otb", "match/accuracy", "match/pandora", "raster/raster", "run/damage", "run/kept_files", "run/survival",
+    "run/waits", "show/pictures",
 }  # fmt: skip
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())

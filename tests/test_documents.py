@@ -140,6 +140,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / pair / "meta.json").write_text('{"disparity": [-12, 40]}')
         for side in ("left", "right", "truth"):
             copies.setdefault(side, []).append(f"{pair}/{side}.tif")
+    copies |= {f"{side}_model": [f"raw_{side}.tif"] for side in ("left", "right")}
     for side, names in copies.items():
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -214,3 +215,5 @@ def test_site__has_a_page_for_every_document_and_every_setting() -> None:
         site.adapted("[a](../METHOD.md#1) [b](docs/x.md) [c](../README.md)")
         == "[a](METHOD.md#1) [b](x.md) [c](index.md)"
     )
+    assert site.adapted("[docs/x.md](docs/x.md#y)") == "[x](x.md#y)"
+    assert site.adapted("![a](.github/pictures/b.png)") == "[![a](pictures/b.png)](pictures/b.png)"

@@ -24,13 +24,11 @@ from sat_intervals.kernels.registration import LEAST, Blocks, Registration, regi
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     MARK,
-    Georeferencing,
     HeightRaster,
     OutputWriter,
     Projection,
     Vertical,
     check_marked,
-    open_image,
     truth_file,
     utm_of,
 )
@@ -123,13 +121,13 @@ def make_truth(
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     if registers:
         triangulated([run.out])
-    work = _Work(run, Sensors.load(*files), reference)
+    work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))
     tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), **MARK}
     tags["SHIFT"] = " ".join(f"{part:.3f}" for part in shift) + " m"
     tally = _Tally(run)
-    with OutputWriter(path.parent, [truth_file(path.name)], *run.shape, _georeferencing(run), tags) as writer:
+    with OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer:
         for row, strip in work.strips(shift, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))
             tally.add(row, strip)
@@ -138,10 +136,6 @@ def make_truth(
         writer.publish()
         progress("files", 1, 1)
     return tally.report() | {"row_misfit": work.row_misfit, "registration": found and found.report()}
-
-
-def _georeferencing(run: Run) -> Georeferencing:
-    return open_image(run.out / "validity.tif").georeferencing
 
 
 class _Work:

@@ -3,13 +3,16 @@
 import math
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.grids import read_grid
 from sat_intervals.kernels.lattice import interpolate
+from sat_intervals.raster import Georeferencing
 from sat_intervals.tiling import Window
 
 try:
@@ -60,8 +63,18 @@ class Sensors:
     right_grid: RectificationGrid
 
     @classmethod
-    def load(cls, left_model: Path, right_model: Path, left_grid: Path, right_grid: Path) -> "Sensors":
-        """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and position grids (GeoTIFF: sensor column, sensor row).
+    def load(
+        cls,
+        left_model: Path,
+        right_model: Path,
+        left_grid: Path,
+        right_grid: Path,
+        *,
+        left: Georeferencing | None = None,
+    ) -> "Sensors":
+        """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`.
+
+        ``left`` is the georeferencing of the whole left epipolar image, which grids of OTB refer to.
 
         Raises
         ------
@@ -69,7 +82,8 @@ class Sensors:
             A file is missing or has another content.
         """
         models = (_read(path, "RPC model", GeoModel) for path in (left_model, right_model))
-        grids = (_read(path, "epipolar grid", RectificationGrid) for path in (left_grid, right_grid))
+        read = partial(read_grid, left=left or Georeferencing())
+        grids = (_read(path, "epipolar grid", read) for path in (left_grid, right_grid))
         return cls(*models, *grids)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
@@ -99,6 +113,8 @@ def _read(path: Path, kind: str, reader: Any) -> Any:
     try:
         with warnings.catch_warnings(action="ignore"):
             return reader(str(path))
+    except SatIntervalsError:
+        raise
     except Exception as error:  # shareloc, scipy and GDAL raise many types
         reason = " ".join(str(error).split()) or type(error).__name__
         raise SatIntervalsError(f"shareloc cannot read {path} as {kind}: {reason}") from error

@@ -15,7 +15,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.progress import Progress
-from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, open_image, read_tags
+from sat_intervals.raster import POINT_FILES, OutputWriter, read_tags
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -49,7 +49,8 @@ def triangulate(
         RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
     left_grid, right_grid
         Epipolar grids: band 1 is the sensor column, band 2 the sensor row. The geotransform gives the epipolar position
-        of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image.
+        of each node (convention of shareloc and CARS). Epipolar positions refer to the whole left image. Grids of OTB,
+        known by their tag ``METADATATYPE=OTB``, have displacements instead of positions.
     progress
         Callback, see `Progress`.
 
@@ -71,12 +72,13 @@ def triangulate(
     _check_own(run.out)
     run.check_kept([run.out / name for name in (_POINTS, _REPORT)], [left_model, right_model, left_grid, right_grid])
     search = run.config.disparity
-    sensors = Sensors.load(*map(Path, (left_model, right_model, left_grid, right_grid)))
+    files = map(Path, (left_model, right_model, left_grid, right_grid))
+    sensors = Sensors.load(*files, left=run.left_georeferencing)
     right_width = run.report["inputs"]["right"]["width"]
     lattice = Lattice(sensors, run.region, right_width, search.minimum, search.maximum)
     tags = {"RUN": run.report["finished"], "LEFT_MODEL": str(left_model), "RIGHT_MODEL": str(right_model)}
     tally = _Tally()
-    with OutputWriter(run.out, POINT_FILES, *run.shape, _georeferencing(run), tags) as writer:
+    with OutputWriter(run.out, POINT_FILES, *run.shape, run.georeferencing, tags) as writer:
         for window, disparities in _strips(run):
             bands = _bands(lattice, window, disparities)
             writer.write(window.row, bands)
@@ -148,10 +150,6 @@ class _Tally:
 
     def report(self) -> dict[str, Any]:
         return {"points": self._points, "lost": self._valid - self._points, **self._ends}
-
-
-def _georeferencing(run: Run) -> Georeferencing:
-    return open_image(run.out / "validity.tif").georeferencing
 
 
 def _strips(run: Run) -> Iterator[tuple[Window, np.ndarray]]:

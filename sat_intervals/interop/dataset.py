@@ -11,7 +11,7 @@ from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, Band, flag_attributes
-from sat_intervals.raster import Georeferencing, grid_mapping, open_image, read_layers, read_tags
+from sat_intervals.raster import Georeferencing, grid_mapping, read_layers, read_tags
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -71,7 +71,7 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
         Raised by reading: another run has replaced the files.
     """
     run = open_run(out)
-    place = open_image(run.out / "validity.tif").georeferencing
+    place = run.georeferencing
     dataset = xr.Dataset(coords=_coordinates(place, run.shape))
     dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals"} | {
         name: value

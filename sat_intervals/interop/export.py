@@ -1,7 +1,8 @@
 """Export a run to the file formats of other photogrammetry tools.
 
 All of them define disparity as ``x_right - x_left`` of the epipolar pair, as here, and none uses a CRS. The files have
-the size of the left image; pixels outside the matched region are invalid.
+the size of the left image; pixels outside the matched region are invalid. Those for OTB keep the transform of the left
+image, which is the place of its pixels in OTB's grids.
 """
 
 from collections.abc import Callable
@@ -51,13 +52,13 @@ def _cars(prefix: str, config: Config) -> list[Raster]:
 
 
 def _asp(prefix: str, config: Config) -> list[Raster]:
-    """Return the input of ``parallel_stereo --entry-point 5``: horizontal, vertical, 1 = valid."""
+    """Return the input of ``parallel_stereo --entry-point 5``, not run with it: horizontal, vertical, 1 = valid."""
     file = _file(f"{prefix}-F.tif", "horizontal", "vertical", "valid")
     return [(file, lambda pixels: _two(np.nan_to_num(pixels.disparity), pixels.valid))]
 
 
 def _s2p(prefix: str, config: Config) -> list[Raster]:
-    """Return the files of s2p after matching a tile: NaN = no disparity, 1 = valid in the mask."""
+    """Return the files of s2p after matching a tile, not run with it: NaN = no disparity, 1 = valid in the mask."""
     confidence: Raster = (
         _file("rectified_disp_confidence.tif", "confidence", nodata=float("nan")),
         lambda pixels: pixels.confidence,
@@ -77,7 +78,7 @@ def _otb(prefix: str, config: Config) -> list[Raster]:
     ]
 
 
-FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "asp": _asp, "s2p": _s2p, "otb": _otb}
+FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "otb": _otb, "asp": _asp, "s2p": _s2p}
 
 
 def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
@@ -113,7 +114,8 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
     for file in files:
         check_marked(folder / file.name)
-    with OutputWriter(folder, files, *shape, Georeferencing(), MARK) as writer:
+    place = Georeferencing(transform=run.left_georeferencing.transform if form == "otb" else None)
+    with OutputWriter(folder, files, *shape, place, MARK) as writer:
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))

@@ -17,7 +17,6 @@ from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
 from sat_intervals.raster import (
     Georeferencing,
     footprint,
-    open_image,
     read_layers,
     read_place,
     read_shape,
@@ -93,7 +92,7 @@ def _check_own(file: Path) -> None:
 
 
 def _item(run: Run, taken: str, identifier: str) -> dict[str, Any]:
-    place = open_image(run.out / "validity.tif").georeferencing
+    place = run.georeferencing
     assets = dict(_assets(run, place))
     corners = footprint(place, run.shape)
     if corners is None and "dsm" in assets:

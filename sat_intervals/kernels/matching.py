@@ -1,8 +1,4 @@
-"""SGM and the reading of every finished cost curve, in two sweeps over a patch.
-
-The sweep down stores the sum of its four paths. The sweep up adds its own four, and reads winner, refinement, interval,
-ambiguity and the right view's winner from the finished curve while it is in the cache. No other volume is stored, and
-each sweep ends at the last row of the wanted pixels.
+"""Matching of a patch: matching costs in, products of every pixel out (METHOD.md, sections 2 to 6).
 
 Letters: r row, c column, k disparity index (disparity = minimum + k).
 """
@@ -11,96 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.kernels.compiled import cached, part
-from sat_intervals.kernels.cost import (
-    Candidates,
-    Cells,
-    Costs,
-    Ranges,
-    cost_curve,
-    enter_cells,
-    new_ranges,
-    one_cell,
-    padded_to_lanes,
-    span_at,
-    volume_starts,
-)
-from sat_intervals.kernels.penalties import Gradients, Penalties, fill_row, make_penalties
-from sat_intervals.kernels.reading import (
-    Rectangle,
-    RightPixels,
-    close_impossible,
-    columns_of,
-    contains,
-    open_curve,
-    read_curve,
-    rectangle_of,
-    search_flags,
-    update_right,
-)
-from sat_intervals.kernels.sgm import (
-    LAST_WAVE,
-    WALL,
-    WAVEFRONTS,
-    Borders,
-    Edge,
-    Paths,
-    Ring,
-    add_curve,
-    advance_pixel,
-    advance_wave,
-    enter_row,
-    hand_on,
-    keep_curve,
-    new_paths,
-    no_borders,
-    path_slots,
-    restart,
-    take_over,
-)
-from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY, NOT_REFINED
+from sat_intervals.kernels.cost import Cells, Costs, padded_to_lanes, volume_starts
+from sat_intervals.kernels.penalties import Gradients
+from sat_intervals.kernels.reading import RightPixels, rectangle_of
+from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Edge
+from sat_intervals.kernels.sweeps import Settings, Volume, prepare, sweep_down, sweep_up, trace_wave
+from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tiling import Window
-
-
-class Settings(NamedTuple):
-    """Settings in the form that the kernels take.
-
-    Attributes
-    ----------
-    minimum, count
-        First disparity of the search range and number of disparities.
-    impossible
-        Matching cost of an impossible candidate inside SGM, above all possible ones.
-    p1, p2, regularized
-        Constant SGM penalties, and whether SGM runs; without it the aggregated cost is the matching cost.
-    cut_level
-        ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
-    high, low, steps
-        Levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1: one level.
-        ``steps`` 0: bounds in whole pixels.
-    weights
-        uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
-    refine
-        Whether winners are refined, and bounds extended by one for it.
-    offset, total
-        First disparity, and number of disparities, of the whole search range that this one is a part of: ``minimum -
-        offset`` is the first. 0: this is the whole range.
-    """
-
-    minimum: int
-    count: int  # type: ignore[assignment]
-    impossible: int
-    p1: int
-    p2: int
-    regularized: bool
-    cut_level: int
-    weights: np.ndarray
-    refine: bool
-    high: float = -1.0
-    low: float = -1.0
-    steps: int = 0
-    offset: int = 0
-    total: int = 0
 
 
 class Raw(NamedTuple):
@@ -172,215 +85,15 @@ class Matched(NamedTuple):
     leaving: Edge
 
 
-class _Volume(NamedTuple):
-    """Sums of L of the wanted pixels, each with the vectors that it searches.
-
-    Attributes
-    ----------
-    sums
-        uint16, one after another by row, column and candidate.
-    rows
-        ``(rows + 1,)`` int64: where each row begins.
-    places
-        ``(columns,)`` int64: where the candidate 0 of each pixel of the row is, or would be if it were searched.
-    """
-
-    sums: np.ndarray
-    rows: np.ndarray
-    places: np.ndarray
-
-
-class _Buffers(NamedTuple):
-    """Inputs of both sweeps, and buffers for the current row, paths and curve.
-
-    Attributes
-    ----------
-    ranges
-        Those of the pixels of the row.
-    usable
-        ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
-    possible
-        ``(columns,)`` int64: number of possible candidates of each pixel of the row.
-    curve, opened
-        ``(size,)`` uint16: buffer of one curve; ``(2,)`` int64: its vectors that are in use.
-    inside
-        Pixels whose paths are computed; those of the pixels around them come from ``rings``.
-    rings
-        Rings of the two waves of the sweep.
-    leaving
-        States that leave the pixels ``inside``, to fill; empty if nobody takes them over.
-    down
-        Direction of the sweep. As a constant argument of `_enter_row` it would be compiled for each direction.
-    """
-
-    candidates: Candidates
-    cells: Cells
-    ranges: Ranges
-    usable: np.ndarray
-    possible: np.ndarray
-    penalties: Penalties
-    paths: Paths
-    curve: np.ndarray
-    opened: np.ndarray
-    inside: Rectangle
-    rings: tuple[Ring, ...]
-    leaving: Edge
-    down: bool
-
-
-def _prepare(
-    costs: Costs,
-    gradients: Gradients | None,
-    settings: Settings,
-    borders: Borders | None,
-    cells: Cells | None,
-    down: bool = True,
-) -> _Buffers:
-    (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
-    left = borders.inside if borders else Window(0, 0, 0, 0)
-    inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
-    cells, k = cells or one_cell(rows, columns, settings.count), np.arange(size)
-    walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
-    return _Buffers(
-        Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
-        cells,
-        new_ranges(columns),
-        np.zeros(columns + settings.count, np.int64),
-        np.zeros(columns, np.int64),
-        make_penalties(gradients, settings.p1, settings.p2, columns, size),
-        new_paths(columns, size),
-        np.zeros(size, np.uint16),
-        np.array([0, size]),
-        rectangle_of(inside),
-        rings[:2] if down else rings[2:],
-        Edge(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
-        down,
-    )
-
-
-@part
-def _enter_row(buffers, gradients, settings, r):
-    """Fill a row's barrier, numbers of possible candidates and penalties, and start the paths that enter it.
-
-    Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
-    """
-    candidates, cells, ranges, usable, possible, penalties, paths, _, _, inside, rings, _, down = buffers
-    costs, barrier = candidates.costs, candidates.barrier
-    for x in range(costs.right_state.shape[1]):
-        barrier[x] = settings.impossible if costs.right_state[r, x] else 0
-        usable[x + 1] = usable[x] + (costs.right_state[r, x] == 0)
-    enter_cells(candidates, cells, ranges, r)
-    for c in range(possible.size):
-        inner = usable[c + ranges.last[c] + 1] - usable[c + ranges.first[c]]
-        possible[c] = inner if costs.left_state[r, c] == 0 else 0
-    falling, rising = -r % possible.size, r % possible.size
-    enter_row(paths, possible.size, falling, rising, down)
-    take_over(paths, rings, inside, r, falling, rising, down)
-    fill_row(gradients, r, down, penalties.row)
-    return falling, rising
-
-
-@cached
-def _trace(buffers, gradients, settings, wave):
-    """Advance the paths of one wave through a patch and copy the states that leave it."""
-    candidates, _, ranges, _, possible, penalties, paths, _, _, inside, _, leaving, down = buffers
-    rows = candidates.costs.left_state.shape[0]
-    for step in range(inside.row_stop if down else rows - inside.row):
-        r = step if down else rows - 1 - step
-        falling, rising = _enter_row(buffers, gradients, settings, r)
-        for c in columns_of(inside, r, down):
-            slots = path_slots(c, possible.size, falling, rising)
-            if possible[c] == 0:
-                restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
-            else:
-                advance_wave(candidates, span_at(ranges, c), penalties, paths, slots, wave, r, c)
-        if inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, wave, down, leaving)
-
-
-@part
-def _enter_output(volume, ranges, output, r):
-    """Set the places of the pixels of a row in the volume."""
-    begin = volume.rows[r - output.row]
-    for c in range(output.column, output.column_stop):
-        volume.places[c] = begin - ranges.start[c]
-        begin += ranges.stop[c] - ranges.start[c]
-
-
-@cached
-def _sweep_down(buffers, gradients, settings, output, volume):
-    """Store the sums of the four downward paths at the pixels of ``output``."""
-    candidates, _, ranges, _, possible, penalties, paths, curve, _, inside, _, _, _ = buffers
-    for r in range(output.row_stop):
-        falling, rising = _enter_row(buffers, gradients, settings, r)
-        if r >= output.row:
-            _enter_output(volume, ranges, output, r)
-        for c in columns_of(inside, r, True):
-            slots = path_slots(c, possible.size, falling, rising)
-            if possible[c] == 0:
-                restart(paths, slots)
-            elif contains(output, r, c):
-                span, place = span_at(ranges, c), volume.places[c]
-                advance_pixel(candidates, span, penalties, paths, slots, r, c, volume.sums, place)
-            else:
-                advance_pixel(candidates, span_at(ranges, c), penalties, paths, slots, r, c, curve, 0)
-
-
-@cached
-def _sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
-    """Finish and read the curves of the pixels of ``output``, update the right view, copy states of the last wave."""
-    candidates, _, ranges, _, possible, penalties, paths, curve, opened, inside, _, leaving, _ = buffers
-    winner, lower, upper, disparity, cost, ambiguity, validity, lower_low, upper_low = raw
-    costs = candidates.costs
-    for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
-        falling, rising = _enter_row(buffers, gradients, settings, r)
-        if r < output.row_stop:
-            _enter_output(volume, ranges, output, r)
-        for c in columns_of(inside, r, False):
-            slots, span = path_slots(c, possible.size, falling, rising), span_at(ranges, c)
-            open_curve(curve, opened, span)
-            if possible[c] == 0:
-                restart(paths, slots)
-            elif settings.regularized:
-                advance_pixel(candidates, span, penalties, paths, slots, r, c, curve, 0)
-            if not contains(output, r, c):
-                continue
-            i, j, place = r - output.row, c - output.column, volume.places[c]
-            if possible[c] < span.last + 1 - span.first:
-                validity[i, j] = search_flags(costs, r, c, span.first, span.last, possible[c])
-            if possible[c] == 0:
-                if keep:
-                    volume.sums[place + span.start : place + span.stop] = IMPOSSIBLE_COST
-                continue
-            if settings.regularized:
-                add_curve(curve, span, volume.sums, place)
-            else:
-                cost_curve(candidates, span, r, c, curve)
-            lowest = close_impossible(curve, candidates, span, c)
-            winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, span, lowest, settings)
-            lower[i, j], upper[i, j] = high
-            if settings.low >= 0:
-                lower_low[i, j], upper_low[i, j] = low
-            disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
-            if not refined:
-                validity[i, j] |= NOT_REFINED
-            if contains(right.core, r, c):
-                update_right(curve, span, right, r, c)
-            if keep:
-                keep_curve(curve, span, volume.sums, place)
-        if leaving.row.shape[0] and inside.row <= r < inside.row_stop:
-            hand_on(paths, inside, r, falling, rising, LAST_WAVE, False, leaving)
-
-
 def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    buffers = _prepare(costs, gradients, settings, borders, cells)
+    buffers = prepare(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
     of_low = shape if settings.low >= 0 else (0, 0)
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     starts = volume_starts(buffers.cells, output)
-    volume = _Volume(np.empty(starts[-1], np.uint16), starts, np.zeros(costs.left_state.shape[1], np.int64))
+    volume = Volume(np.empty(starts[-1], np.uint16), starts, np.zeros(costs.left_state.shape[1], np.int64))
     raw = Raw(
         winner=np.full(shape, NO_DISPARITY, np.int16),
         lower=np.full(shape, NO_DISPARITY, np.int16),
@@ -396,9 +109,9 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     cost = np.full((core.height, core.width + size), IMPOSSIBLE_COST, np.uint16)
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
-        _sweep_down(buffers, gradients, settings, wanted, volume)
-        buffers = _prepare(costs, gradients, settings, borders, cells, down=False)
-    _sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
+        sweep_down(buffers, gradients, settings, wanted, volume)
+        buffers = prepare(costs, gradients, settings, borders, cells, down=False)
+    sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
     winner[cost == IMPOSSIBLE_COST] = NO_DISPARITY
@@ -420,8 +133,8 @@ def trace(
     Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
     """
     down, wave = WAVEFRONTS[wavefront]
-    buffers = _prepare(costs, gradients, settings, borders, cells, down)
-    _trace(buffers, gradients, settings, wave)
+    buffers = prepare(costs, gradients, settings, borders, cells, down)
+    trace_wave(buffers, gradients, settings, wave)
     return buffers.leaving
 
 

@@ -96,13 +96,14 @@ def _advance(path, curves, k, costs, penalties):
 
 
 @inlined
-def advance_pixel(candidates, span, penalties, paths, slots, r, c, target, offset):
-    """Advance the four paths in ``slots`` by the pixel ``(r, c)``; write their sum of L to ``target`` from ``offset``.
+def advance_pixel(candidates, span, penalties, paths, slots, r, c, target):
+    """Advance the four paths in ``slots`` by the pixel ``(r, c)`` and write their sums of L.
 
-    The sum of candidate k goes to ``offset + k``. The four paths have names because numba does not unroll a loop over a
-    tuple.
+    ``target`` is an array and an offset: the sum of candidate k goes to ``array[offset + k]``.
+    The four paths have names because numba does not unroll a loop over a tuple.
     """
     curves, lowest, _ = paths
+    array, offset = target
     p1, p2, row = penalties
     path_1, path_2, path_3, path_4 = (
         _begin(paths, slots[0], span.start),
@@ -121,7 +122,7 @@ def advance_pixel(candidates, span, penalties, paths, slots, r, c, target, offse
         store(curves, path_2[0] + k, cost_2)
         store(curves, path_3[0] + k, cost_3)
         store(curves, path_4[0] + k, cost_4)
-        store(target, offset + k, add(add(cost_1, cost_2), add(cost_3, cost_4)))
+        store(array, offset + k, add(add(cost_1, cost_2), add(cost_3, cost_4)))
     lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
     lowest[slots[2]], lowest[slots[3]] = smallest(path_3[4]), smallest(path_4[4])
     _close(candidates, span, paths, slots)

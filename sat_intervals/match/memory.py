@@ -14,6 +14,12 @@ PROCESS_BYTES = 300 * 10**6
 _PATCH_BYTES, _CORE_BYTES = 40, 60
 # Per pixel of a block of tiles: pixels and states of both images.
 _VIEW_BYTES = 20
+# Pixels of a piece of a strip, in whole rows, and bytes for each: raw products, final bands and temporary arrays.
+STRIP_PIXELS = 1 << 19
+_PIECE_BYTES, _PIECE_ROWS = 100, 64
+# Per pixel of a strip: final bands, which are compressed one file after another; and per pixel of the columns that are
+# compressed at a time: what is written, read back and compared.
+_BAND_BYTES, _BLOCK_BYTES, _COLUMNS = 18, 64, 2048
 # Per column of a patch: layers of MC-CNN's network for a strip of rows, and the features of both images.
 _NETWORK_BYTES = 140_000
 
@@ -58,6 +64,20 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     return volume + paths + _PATCH_BYTES * patch * (patch + config.disparity.count) + _CORE_BYTES * size**2
 
 
+def waiting_bytes(config: Config) -> int:
+    """Bytes of images and products of a tile that is read or written while others are matched."""
+    size = config.tiles.size
+    side = size * tiles_together(config, size) + 2 * config.tiles.support
+    return _VIEW_BYTES * side * (side + config.disparity.count) + _CORE_BYTES * size**2
+
+
+def strip_bytes(rows: int, width: int, compression: str) -> int:
+    """Bytes that finishing a strip of final rows needs on top of its process."""
+    compressed = _BAND_BYTES if compression == "none" else _BAND_BYTES // 2
+    piece = _PIECE_BYTES * max(STRIP_PIXELS, _PIECE_ROWS * width)
+    return rows * width * _BAND_BYTES + max(piece, rows * (width * compressed + min(width, _COLUMNS) * _BLOCK_BYTES))
+
+
 def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
     """Reduce the tile size until ``tiles_at_once`` tiles fit in a process of ``memory`` bytes.
 
@@ -76,6 +96,22 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
         f"{tiles_at_once} at once, need {needed / 1e6:.0f} MB, but {memory / 1e6:.0f} MB are given: "
         "give more memory or fewer workers"
     )
+
+
+def check_strips(rows: int, width: int, config: Config, memory: int, strips_at_once: int = 1) -> None:
+    """Raise if ``strips_at_once`` strips of final rows do not fit in a process of ``memory`` bytes.
+
+    Raises
+    ------
+    ConfigError
+        Smaller tiles do not help.
+    """
+    needed = PROCESS_BYTES + strips_at_once * strip_bytes(rows, width, config.products.compression)
+    if needed > memory:
+        raise ConfigError(
+            f"strips of {rows} x {width} pixels, {strips_at_once} at once, need {needed / 1e6:.0f} MB, but "
+            f"{memory / 1e6:.0f} MB are given: give more memory or fewer workers, or match a narrower window"
+        )
 
 
 def check_memory(needed: int, what: str, way_out: str) -> None:

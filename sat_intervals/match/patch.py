@@ -7,8 +7,9 @@ import numpy as np
 
 from sat_intervals.config import Config, CosineSgm, Disparity, Sgm
 from sat_intervals.kernels.cost import Cells
-from sat_intervals.kernels.matching import Raw, RightView, Settings, match_costs
+from sat_intervals.kernels.matching import Raw, RightView, match_costs
 from sat_intervals.kernels.sgm import Borders, Edge
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, textureless, view_windows
 from sat_intervals.match.normalization import PairStatistics

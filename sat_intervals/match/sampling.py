@@ -140,11 +140,9 @@ def row_offsets(left: Codes, right: Codes, index: np.ndarray, known: np.ndarray)
     known
         bool of the same shape: the matches.
     """
-    costs = [
-        np.min([_boxed(_distances(left, right, index + shift, ROWS + rows), known) for shift in (-1, 0, 1)], axis=0)
-        for rows in range(-ROWS, ROWS + 1)
-    ]
-    stack = np.stack(costs)
+    shifted = np.stack([index - 1, index, index + 1])[:, np.newaxis]
+    rows = np.arange(2 * ROWS + 1)[:, np.newaxis, np.newaxis]
+    stack = _boxed(_distances(left, right, shifted, rows), known).min(axis=0)
     best = np.argmin(stack, axis=0)
     told = known & np.isfinite(stack[0]) & (stack.min(axis=0) < np.median(stack, axis=0))
     at = np.clip(best, 1, 2 * ROWS - 1)[np.newaxis]
@@ -155,9 +153,12 @@ def row_offsets(left: Codes, right: Codes, index: np.ndarray, known: np.ndarray)
     return np.asarray((best - ROWS + np.where(inner, np.nan_to_num(shift), 0))[told])
 
 
-def _distances(left: Codes, right: Codes, index: np.ndarray, rows: int) -> np.ndarray:
-    """Hamming distances of left codes from the right ones ``index`` columns and ``rows`` rows further, as float32."""
-    height, width = index.shape
+def _distances(left: Codes, right: Codes, index: np.ndarray, rows: np.ndarray | int) -> np.ndarray:
+    """Hamming distances of left codes from the right ones ``index`` columns and ``rows`` rows further, as float32.
+
+    ``index`` is ``(..., rows, columns)``; ``rows`` is a number or an array with two last axes of length 1.
+    """
+    height, width = index.shape[-2:]
     column = np.clip(np.arange(width) + index, 0, right.state.shape[1] - 1)
     row = np.arange(height)[:, np.newaxis] + rows
     differ = np.bitwise_count(left.words[0] ^ right.words[0][row, column]).astype(np.float32)
@@ -165,12 +166,16 @@ def _distances(left: Codes, right: Codes, index: np.ndarray, rows: int) -> np.nd
 
 
 def _boxed(costs: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Mean over the known pixels of a box around each pixel."""
+    """Mean over the known pixels of a box around each pixel; of arrays ``(..., rows, columns)``."""
     radius = _BOX // 2
 
     def sums(values: np.ndarray) -> np.ndarray:
-        total = np.pad(values.astype(np.float64), ((radius + 1, radius), (radius + 1, radius))).cumsum(0).cumsum(1)
-        return np.asarray(total[_BOX:, _BOX:] - total[:-_BOX, _BOX:] - total[_BOX:, :-_BOX] + total[:-_BOX, :-_BOX])
+        height, width = values.shape[-2:]
+        total = np.zeros((*values.shape[:-2], height + _BOX, width + _BOX))
+        total[..., radius + 1 : height + radius + 1, radius + 1 : width + radius + 1] = values
+        total = total.cumsum(-2).cumsum(-1)
+        high, low = total[..., _BOX:, :], total[..., :-_BOX, :]
+        return np.asarray(high[..., _BOX:] - low[..., _BOX:] - high[..., :-_BOX] + low[..., :-_BOX])
 
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(sums(np.where(known, costs, 0)) / sums(known))

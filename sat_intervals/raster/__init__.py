@@ -1,6 +1,7 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
-from sat_intervals.raster.cog import BLOCK, Copy, Part, codec_versions, compressed, factors
+from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
+from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
 from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
@@ -24,9 +25,10 @@ from sat_intervals.raster.layers import (
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, grid_mapping, utm_of
 from sat_intervals.raster.publishing import OutputError, stamps
+from sat_intervals.raster.space import check_space, file_bytes, part_bytes
 from sat_intervals.raster.surfaces import check_reference, is_surface, read_heights, read_place, resolution_of
 from sat_intervals.raster.windows import read_views, read_window
-from sat_intervals.raster.writer import OutputWriter, check_space, remove_scratch, restore
+from sat_intervals.raster.writer import OutputWriter, remove_scratch, restore
 
 __all__ = [
     "BLOCK",
@@ -34,7 +36,6 @@ __all__ = [
     "POINT_FILES",
     "RUN_FILES",
     "ControlPoint",
-    "Copy",
     "File",
     "Frame",
     "Georeferencing",
@@ -53,6 +54,7 @@ __all__ = [
     "codec_versions",
     "compressed",
     "factors",
+    "file_bytes",
     "footprint",
     "grid_mapping",
     "is_marked",
@@ -60,6 +62,7 @@ __all__ = [
     "north_up",
     "open_image",
     "other_files",
+    "part_bytes",
     "put_back",
     "read_heights",
     "read_layers",

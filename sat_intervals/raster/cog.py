@@ -1,4 +1,4 @@
-"""Put Cloud-Optimized GeoTIFFs together from blocks that were compressed apart, in any order and by any worker.
+"""Assemble Cloud-Optimized GeoTIFFs from blocks that were compressed apart, in any order and by any worker.
 
 GDAL makes all of it but the places: it compresses blocks in memory, and writes every tag into a small template of the
 same kind. The layout is that of GDAL's COG driver: directories, then the smallest overview first, each block between
@@ -16,145 +16,43 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import rasterio
 from rasterio import Env
-from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 
 from sat_intervals.raster import gdal
-from sat_intervals.raster.files import File, run_files
+from sat_intervals.raster.blocks import AROUND, BLOCK, factors, tiled
+from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 
-BLOCK = 512
-"""Side of a block in pixels, and largest side of the smallest overview."""
-
-# Every GeoTIFF reader supports DEFLATE. On the bands of a Pleiades pair level 1 writes 5.4 Mpx per second and core, 49
-# bits per pixel; level 6: 3.2 and 46; no compression: 9.1 and 186. Predictors are slower and larger (4.3 and 63), since
-# bounds are integers and V-fits are fractions of small ones, whose bytes repeat.
-# Of noisy bands ZSTD 3 writes 34 bits a pixel in 1.4 times the time of DEFLATE 1 (37), LERC 23 in twice the time.
-_LEVELS: dict[str, dict[str, float]] = {
-    "deflate": {"zlevel": 1},
-    "zstd": {"zstd_level": 3},
-    "lerc": {"max_z_error": 0.01},
-    "none": {},
-}
-_PREDICTORS = {"NO": 1, "FLOATING_POINT": 3}
-# Columns compressed at a time: padded and interleaved copies stay small.
-_COLUMNS = 4 * BLOCK
-# Bytes around each block: its size before it, and the copy of its end.
-_AROUND = 8
+# Side of a block of the template, the smallest of GDAL's COG driver: larger ones take time and hold nothing.
+_SMALL = 128
 # Size from which a file is a BigTIFF.
 _CLASSIC = 1 << 32
 # Tags of a TIFF directory, its types, and their sizes in bytes.
-_WIDTH, _HEIGHT, _OFFSETS, _SIZES = 256, 257, 324, 325
-_LONG, _LONG8 = 4, 16
-_BYTES = {1: 1, 2: 1, 3: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
+_WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES = 256, 257, 322, 323, 324, 325
+_SHORT, _LONG, _LONG8 = 3, 4, 16
+_BYTES = {1: 1, 2: 1, _SHORT: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
 _CRC = 0xEDB88320  # polynomial of CRC-32, its highest power in the lowest bit
 
 Directory = dict[int, tuple[int, int, bytes]]
 """Type, count and values of each tag."""
 
 
-class Blocks(NamedTuple):
-    """Compressed blocks of a row of blocks, as in the file: sizes of the blocks alone, bytes with what is around."""
-
-    sizes: list[int]
-    content: bytes
-
-
 class Part(NamedTuple):
-    """A row of blocks that is stored elsewhere: sizes of its blocks, CRC-32 of its bytes, how to read them, a label."""
+    """A compressed row of blocks: sizes of the blocks, CRC-32 of its bytes, and where they are, for `CopyParts`."""
 
     sizes: Sequence[int]
     checksum: int
-    read: Callable[[], bytes]
-    label: Any = None
+    source: Any
 
     @property
     def length(self) -> int:
         """Return the number of bytes, with those around each block."""
-        return sum(self.sizes) + _AROUND * len(self.sizes)
+        return sum(self.sizes) + AROUND * len(self.sizes)
 
 
-Copy = Callable[[Path, Sequence[tuple[int, Part]]], None]
+CopyParts = Callable[[Path, Sequence[tuple[int, Part]]], None]
 """Writes parts into a file, each at its offset."""
-
-
-def factors(height: int, width: int) -> list[int]:
-    """Return the factors of a file's levels: 1, and those of its overviews; pixel (i, j) is (factor i, factor j)."""
-    return [1, *(2**level for level in range(1, 32) if max(height, width) > BLOCK << (level - 1))]
-
-
-def compressed(bands: np.ndarray, file: File) -> Blocks:
-    """Compress ``(bands, at most BLOCK rows, columns)``, from left to right; the blocks are decoded and compared.
-
-    Raises
-    ------
-    OSError
-        They differ.
-    """
-    sizes: list[int] = []
-    pieces: list[bytes | memoryview] = []
-    for first in range(0, bands.shape[2], _COLUMNS):
-        for block in _compressed(bands[:, :, first : first + _COLUMNS], file):
-            sizes.append(len(block))
-            pieces += [struct.pack("<I", len(block)), block, block[-4:]]
-    return Blocks(sizes, b"".join(pieces))
-
-
-def _compressed(bands: np.ndarray, file: File) -> list[memoryview]:
-    count, rows, columns = bands.shape
-    whole = np.zeros((count, BLOCK, -(-columns // BLOCK) * BLOCK), file.dtype)  # what is beyond the image is equal, too
-    whole[:, :rows, :columns] = bands
-    kind = {"height": BLOCK, "width": whole.shape[2], "count": count, "dtype": file.dtype, "nodata": file.nodata}
-    options = _tiled(file) | _LEVELS[file.compression] | {"num_threads": 1}
-    with Env(), MemoryFile() as memory:
-        with gdal.create(memory.name, **kind, **options) as dataset:
-            dataset.write(whole)
-        with gdal.reading(memory.name) as dataset:
-            if not _is_same(dataset.read(), whole, file):
-                raise OSError(errno.EIO, "the content read back differs from that written")
-            places = [
-                [int(dataset.get_tag_item(f"BLOCK_{name}_{x}_0", "TIFF", bidx=1)) for name in ("OFFSET", "SIZE")]
-                for x in range(whole.shape[2] // BLOCK)
-            ]
-        content = memoryview(memory.read())
-    return [content[offset : offset + size] for offset, size in places]
-
-
-def _tiled(file: File) -> dict[str, Any]:
-    return {
-        "tiled": True,
-        "blockxsize": BLOCK,
-        "blockysize": BLOCK,
-        "interleave": "pixel",
-        "compress": file.compression,
-        **({"predictor": _PREDICTORS[file.predictor]} if file.compression in ("deflate", "zstd") else {}),
-    }
-
-
-def _is_same(read: np.ndarray, written: np.ndarray, file: File) -> bool:
-    if file.compression != "lerc":
-        return np.array_equal(_bits(read), _bits(written))
-    known = np.isfinite(written)
-    error = _LEVELS["lerc"]["max_z_error"] + 2 * np.spacing(np.abs(written))  # float32 rounds, too
-    return np.array_equal(np.isfinite(read), known) and bool((np.abs(read - written) <= error)[known].all())
-
-
-def _bits(bands: np.ndarray) -> np.ndarray:
-    return bands.view(f"uint{8 * bands.itemsize}")
-
-
-@cache
-def codec_versions(compression: str) -> dict[str, Any]:
-    """Return what decides the bytes of blocks of a run: versions, and checksums of some compressed numbers."""
-    numbers = np.random.default_rng(0).integers(0, 99, (1, 99, 99))
-    made = [
-        compressed(numbers, File("", "uint16", None, (), compression=file.compression)).content
-        for file in run_files(compression)
-    ]
-    checksums = [zlib.crc32(content) for content in made]
-    return {"rasterio": rasterio.__version__, "gdal": rasterio.__gdal_version__, "codecs": checksums}
 
 
 def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch: Path) -> bytes:
@@ -162,11 +60,10 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
     small = scratch.with_name(f"strips-{scratch.name}")
     predictor = {"PREDICTOR": file.predictor} if file.compression in ("deflate", "zstd") else {}
-    options = {"COMPRESS": file.compression.upper(), "OVERVIEW_RESAMPLING": "NEAREST", **predictor}
+    options = {"COMPRESS": file.compression.upper(), "OVERVIEW_RESAMPLING": "NEAREST", "BLOCKSIZE": _SMALL, **predictor}
+    kind |= tiled(file) | {"blockxsize": _SMALL, "blockysize": _SMALL, "height": _SMALL + 1, "width": _SMALL + 1}
     with Env():
-        with gdal.create(
-            str(small), height=BLOCK + 1, width=BLOCK + 1, **kind, **_tiled(file), **place.creation_options()
-        ) as dataset:
+        with gdal.create(str(small), **kind, **place.creation_options()) as dataset:
             dataset.update_tags(**tags)
             file.describe(dataset)
         copy(str(small), str(scratch), driver="COG", SPARSE_OK="YES", **options)
@@ -176,12 +73,8 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch
     return made
 
 
-def put_together(
-    path: Path,
-    made: bytes,
-    shape: tuple[int, int],
-    levels: Sequence[Sequence[Part]],
-    copy_all: Copy | None = None,
+def assemble(
+    path: Path, made: bytes, shape: tuple[int, int], levels: Sequence[Sequence[Part]], copy_parts: CopyParts
 ) -> dict[str, int]:
     """Write a file from the rows of blocks of each level, see `factors`; return its size and CRC-32.
 
@@ -195,8 +88,8 @@ def put_together(
         Rows and columns.
     levels
         Rows of blocks of each level, from the top.
-    copy_all
-        Writes the parts into the file; by default they are read and written one after another.
+    copy_parts
+        Writes them into the file.
     """
     head = header(made, shape, [[size for part in level for size in part.sizes] for level in levels])
     parts = [part for level in reversed(levels) for part in level]
@@ -206,14 +99,9 @@ def put_together(
     *offsets, size = accumulate((part.length for part in parts), initial=len(head))
     with open(path, "wb") as stream:
         stream.write(head)
-        if copy_all is None:
-            for part in parts:
-                stream.write(part.read())
-        else:
-            stream.truncate(size)
-            stream.flush()
-            copy_all(path, list(zip(offsets, parts, strict=True)))
+        stream.truncate(size)
         stream.flush()
+        copy_parts(path, list(zip(offsets, parts, strict=True)))
         os.fsync(stream.fileno())
     if (found := path.stat().st_size) != size:
         raise OSError(errno.EIO, f"{found} of {size} bytes were written")
@@ -240,8 +128,9 @@ def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) 
         numbers = {_WIDTH: width, _HEIGHT: height}
         changed = {tag: (_LONG, 1, struct.pack("<I", number)) for tag, number in numbers.items()}
         changed[_SIZES] = _LONG, len(of_level), np.array(of_level, "<u4").tobytes()
+        changed |= dict.fromkeys((_BLOCK_WIDTH, _BLOCK_HEIGHT), (_SHORT, 1, struct.pack("<H", BLOCK)))
         directories.append((whole if factor == 1 else overview) | changed)
-    data = sum(size + _AROUND for of_level in sizes for size in of_level)
+    data = sum(size + AROUND for of_level in sizes for size in of_level)
     is_big = data + len(_written(ghost, directories, sizes, 0, is_big=False)) >= _CLASSIC
     start = len(_written(ghost, directories, sizes, 0, is_big=is_big))
     return _written(ghost, directories, sizes, start, is_big=is_big)
@@ -254,7 +143,7 @@ def _written(
     kind, dtype = (_LONG8, "<u8") if is_big else (_LONG, "<u4")
     offsets: list[bytes] = []
     for of_level in reversed(sizes):
-        *places, start = accumulate(of_level, lambda place, size: place + size + _AROUND, initial=start)
+        *places, start = accumulate(of_level, lambda place, size: place + size + AROUND, initial=start)
         offsets.insert(0, (np.array(places, np.uint64) + 4).astype(dtype).tobytes())
     out = bytearray(struct.pack("<2sHHHQ", b"II", 43, 8, 0, 0) if is_big else struct.pack("<2sHI", b"II", 42, 0))
     pointer, number, entry = (8, "<Q", "<HHQ8s") if is_big else (4, "<I", "<HHI4s")

@@ -21,6 +21,11 @@ class File:
     driver: str = "COG"
     compression: str = "deflate"
 
+    @property
+    def kind(self) -> str:
+        """Return the name without its suffix."""
+        return self.name.partition(".")[0]
+
     def describe(self, dataset: DatasetWriter) -> None:
         """Write names, units and meanings of the bands."""
         for index, band in enumerate(self.bands, start=1):

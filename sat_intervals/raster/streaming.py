@@ -3,17 +3,16 @@
 import errno
 import os
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.raster.cog import BLOCK, Part, compressed, factors
+from sat_intervals.raster.blocks import BLOCK, COLUMNS, compressed, factors
+from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import File
-
-# Columns that a thread compresses at a time.
-_COLUMNS = 4 * BLOCK
 
 
 class Stream:
@@ -27,7 +26,6 @@ class Stream:
         self._file, self._place, self._threads = file, place, threads
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
-        self._sizes = [0 for _ in self._shapes]
         self._buffers = [self._buffer(level) for level in range(len(self._shapes))]
         self.parts: list[list[Part]] = [[] for _ in self._shapes]
 
@@ -58,27 +56,29 @@ class Stream:
 
     def _end_row(self, level: int, rows: np.ndarray) -> None:
         """Compress a row of blocks, and add its reduced rows to the next level."""
-        columns = (rows[:, :, first : first + _COLUMNS] for first in range(0, rows.shape[2], _COLUMNS))
-        start = self._sizes[level]
+        columns = (rows[:, :, first : first + COLUMNS] for first in range(0, rows.shape[2], COLUMNS))
         with ThreadPoolExecutor(self._threads) as pool, open(self._path("strips", level), "ab") as out:
-            sizes, checksum = [], 0
+            start, sizes, checksum = out.tell(), list[int](), 0
             for blocks in pool.map(partial(compressed, file=self._file), columns):
                 out.write(blocks.content)
                 checksum = zlib.crc32(blocks.content, checksum)
                 sizes += blocks.sizes
-            length = out.tell() - start
-        self._sizes[level] += length
-        self.parts[level].append(Part(sizes, checksum, partial(self._read, level, start, length, checksum)))
+        self.parts[level].append(Part(sizes, checksum, (level, start)))
         if level + 1 < len(self._shapes):
             self._add(level + 1, rows[:, ::2, ::2])
 
-    def _read(self, level: int, start: int, length: int, checksum: int) -> bytes:
-        with open(self._path("strips", level), "rb") as stream:
-            stream.seek(start)
-            content = stream.read(length)
-        if zlib.crc32(content) != checksum:
-            raise OSError(errno.EIO, "the content read back differs from that written")
-        return content
+    def copy_parts(self, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
+        """Write the parts into a file; see `CopyParts`."""
+        with open(path, "r+b") as out:
+            for offset, part in parts:
+                level, start = part.source
+                with open(self._path("strips", level), "rb") as stream:
+                    stream.seek(start)
+                    content = stream.read(part.length)
+                if zlib.crc32(content) != part.checksum:
+                    raise OSError(errno.EIO, "the content read back differs from that written")
+                out.seek(offset)
+                out.write(content)
 
     def check_complete(self) -> None:
         """Raise if rows are missing."""

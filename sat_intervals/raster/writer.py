@@ -18,11 +18,12 @@ from rasterio.shutil import copy
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.raster import gdal
-from sat_intervals.raster.cog import Copy, Part, put_together, template
+from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, publish, put_back, stamps
+from sat_intervals.raster.space import WAY_OUT, check_space, file_bytes
 from sat_intervals.raster.streaming import Stream
 from sat_intervals.store.folder import LocalFolder
 
@@ -36,7 +37,6 @@ _PNG = {"WRITE_METADATA_AS_TEXT": "YES"}
 # GDAL's block cache in bytes; the default is a twentieth of the memory.
 _CACHE = 16 << 20
 _SUM_WRAPS = 1 << 64  # sums of bits are modulo 2^64
-_WAY_OUT = "free disk space or choose another folder"
 
 
 class OutputWriter:
@@ -117,7 +117,7 @@ class OutputWriter:
                 self._remove_scratch()
                 self._replaced.mkdir(parents=True, exist_ok=True)
                 self._there = stamps(self._folder, self._names)
-            check_space(self._folder, self._files, *self._shape)
+            self._check_space(1)
         except BaseException:
             self._clean()
             raise
@@ -130,6 +130,8 @@ class OutputWriter:
 
     def write(self, row: int, *rasters: np.ndarray) -> None:
         """Write the strip that begins at ``row``; one array per file, ``(bands, rows, width)`` or ``(rows, width)``."""
+        if not row:
+            self._check_space(2)  # for parts or a plain file beside each final one
         for file, raster in zip(self._files, rasters, strict=True):
             bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
             with self._failing(self._folder / file.name):
@@ -155,23 +157,22 @@ class OutputWriter:
             strips.write(bands, window=RasterioWindow(0, row, self._shape[1], bands.shape[1]))
             self._pictures[file.name] = strips, before + _sum(bands)
 
-    def put_together(self, name: str, levels: Sequence[Sequence[Part]], copy_all: Copy | None = None) -> dict[str, int]:
-        """Make a file of rows of blocks, see `cog.put_together`, under a temporary name; return size and CRC-32."""
+    def assemble(self, name: str, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
+        """Make a file of rows of blocks, see `cog.assemble`, under a temporary name."""
         (file,) = (file for file in self._files if file.name == name)
         with self._failing(self._folder / name):
             made = template(file, self._georeferencing, self._tags, self._scratch / name)
             # a name of its own: a worker that was lost must not write into the file of a later run
             path = self._scratch / f"strips-{uuid.uuid4().hex}-{name}"
-            self._made[name] = put_together(path, made, self._shape, levels, copy_all)
+            self._made[name] = assemble(path, made, self._shape, levels, copy_parts)
             os.replace(path, self._scratch / name)
-        return self._made[name]
 
     def build(self) -> dict[str, dict[str, int]]:
         """Build the final files under temporary names; return size and CRC-32 by name."""
         for name, stream in self._streams.items():
             with self._failing(self._folder / name):
                 stream.check_complete()
-            self.put_together(name, stream.parts)
+            self.assemble(name, stream.parts, stream.copy_parts)
             stream.remove()
         self._streams.clear()
         for name, (strips, expected) in self._pictures.items():
@@ -220,17 +221,17 @@ class OutputWriter:
                 raise OutputError(
                     f"{path} cannot be written: not enough memory ({gdal.reason(error)}): give the process more memory"
                 ) from error
-            raise OutputError(f"{path} cannot be written: {self._reason(error)}: {_WAY_OUT}") from error
+            raise OutputError(f"{path} cannot be written: {self._reason(error)}: {WAY_OUT}") from error
 
     def _reason(self, error: Exception) -> str:
         if isinstance(error, OSError) and error.strerror:
             return error.strerror
-        # GDAL hides the system's reason. A Cloud-Optimized GeoTIFF needs room for two copies.
-        free = shutil.disk_usage(self._folder).free
-        full = (
-            f"{os.strerror(errno.ENOSPC)}, {_size(free)} free: " if free < 2 * _bytes(self._files, *self._shape) else ""
-        )
-        return full + gdal.reason(error)
+        # GDAL hides the system's reason
+        is_full = shutil.disk_usage(self._folder).free < file_bytes(self._files, *self._shape)
+        return f"{os.strerror(errno.ENOSPC)}: {gdal.reason(error)}" if is_full else gdal.reason(error)
+
+    def _check_space(self, copies: int) -> None:
+        check_space(self._folder, copies * file_bytes(self._files, *self._shape), "files")
 
     def _clean(self) -> None:
         for strips, _ in self._pictures.values():
@@ -276,24 +277,6 @@ def _killed(folder: Path, files: Sequence[File]) -> Iterator[OutputWriter]:
         yield writer
 
 
-def check_space(folder: Path, files: Sequence[File], height: int, width: int) -> None:
-    """Raise if a folder has not enough free space for files of ``height`` x ``width`` pixels.
-
-    Raises
-    ------
-    OutputError
-        Gives free and needed space.
-    """
-    needed, free = _bytes(files, height, width), shutil.disk_usage(folder).free
-    if needed > free:
-        raise OutputError(f"{folder} has {_size(free)} free, the bands need at least {_size(needed)}: {_WAY_OUT}")
-
-
-def _bytes(files: Sequence[File], height: int, width: int) -> int:
-    """Return the size of all bands without compression."""
-    return height * width * sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in files)
-
-
 def _sum(bands: np.ndarray) -> int:
     """Return the sum of an array's bits as unsigned integers, modulo 2^64; independent of the order of blocks."""
     return int(bands.view(f"uint{8 * bands.itemsize}").sum(dtype=np.uint64))
@@ -303,7 +286,3 @@ def _flush(path: Path) -> None:
     """Flush a file to the disk; raises if that fails."""
     with open(path, "rb") as stream:
         os.fsync(stream.fileno())
-
-
-def _size(count: int) -> str:
-    return f"{count / 1e6:,.1f} MB"

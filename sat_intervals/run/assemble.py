@@ -3,7 +3,7 @@
 import json
 import logging
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -11,22 +11,20 @@ from functools import cache
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
 from sat_intervals.config import Config, calibration_of
 from sat_intervals.errors import RunError
-from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
+from sat_intervals.match.postprocess import ConfidenceScale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
+from sat_intervals.run.copying import assemble_files
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
-from sat_intervals.run.quality import quality_of, warnings_of
+from sat_intervals.run.quality import checked_scale, quality_of, warnings_of
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
-from sat_intervals.run.strips import check_done, check_matched, finish_strips, levels_of, parts_of
-from sat_intervals.run.workers import Workers
+from sat_intervals.run.strips import finish_strips, parts_of
+from sat_intervals.run.workers import Workers, reason
 from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, replaceable_files
 
 # Meanings of some of the counts, for readers of run.json.
@@ -73,42 +71,39 @@ def assemble(
     SatIntervalsError
         No pixel could be matched.
     """
-    config, store, region = job.config, job.store, job.store.grid.region
-    records, statistics = store.records(), job.statistics()
-    check_done(job, records)
-    histogram, seams = store.histogram(records), store.seams(records) if store.has_seams else None
-    check_matched(job, records, int(histogram.sum()))
-    scale = confidence_scale(config.ambiguity, histogram) if config.ambiguity else ConfidenceScale(np.nan, np.nan)
-    tally = Tally(config.disparity.count, config.disparity.minimum)
-    where = job.left.georeferencing.shifted(region)
-    files = run_files(config.products.compression)
-    with _resumable(), OutputWriter(job.out, files, region.height, region.width, where, _tags(config)) as writer:
+    region, place = job.store.grid.region, job.left.georeferencing.shifted(job.store.grid.region)
+    files, records = run_files(job.config.products.compression), job.store.records()
+    scale = checked_scale(job, records)
+    with _resumable(), OutputWriter(job.out, files, region.height, region.width, place, _tags(job.config)) as writer:
         with logged_stage(seconds, "bands"):
-            parts, copy_all = finish_strips(job, client, scale, records, progress)
-            for place in parts:
-                tally.merge(parts[place].get("counts", {}))
+            parts, workers = finish_strips(job, client, scale, records, progress)
         with logged_stage(seconds, "files"):
-            progress("files", 0, 1)
-            for file in files:
-                writer.put_together(file.name, levels_of(job, file.name, parts), copy_all)
+            assemble_files(job, writer, parts, workers, progress)
             job.check_inputs()
-            progress("files", 0, 1)  # a last chance to interrupt the run before it publishes
+            steps = len(files) * len(parts)
+            progress("files", steps, steps)  # a last chance to interrupt the run before it publishes
         _add_seconds(seconds, records)
-        report = _report(job, statistics, scale, tally, seconds, seams) | {"files": writer.build()}
-        report["quality"] = quality_of(job, records)
-        report["warnings"] = warnings_of(job, report["counts"], report["quality"])
+        report = _report(job, records, scale, parts.values(), seconds, writer.build())
         for line in report["warnings"]:
             _LOG.warning("%s", line)
-        if not keep_tiles:
-            mark_finished(store.home, job.name)
-        text = json.dumps(report, indent=1) + "\n"
-        writer.publish(("run.json", text), replaceable=replaceable_files(store.home))
-        if not keep_tiles:
-            mark_finished(store.home, job.name, list(stamps(job.out, OUTPUTS).values()))
-        mark_replaced(store.home)
-        parts_of(job).drop()
-        progress("files", 1, 1)
+        _publish(job, writer, report, keep_tiles=keep_tiles)
+        progress("files", steps, steps)
     return report
+
+
+def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> None:
+    home = job.store.home
+    if not keep_tiles:
+        mark_finished(home, job.name)
+    writer.publish(("run.json", json.dumps(report, indent=1) + "\n"), replaceable=replaceable_files(home))
+    if not keep_tiles:
+        mark_finished(home, job.name, list(stamps(job.out, OUTPUTS).values()))
+    mark_replaced(home)
+    if keep_tiles:  # otherwise the parts are removed with them
+        try:
+            parts_of(job).drop()
+        except OSError as error:  # the run is complete
+            _LOG.warning("parts of the files stay in %s: %s", job.store.folder, reason(error))
 
 
 def _add_seconds(seconds: dict[str, float], records: Records) -> None:
@@ -161,14 +156,18 @@ def _calibration(config: Config) -> dict[str, Any] | None:
 
 def _report(
     job: Job,
-    statistics: PairStatistics | None,
+    records: Records,
     scale: ConfidenceScale,
-    tally: Tally,
+    parts: Iterable[Mapping[str, Any]],
     seconds: dict[str, float],
-    seams: np.ndarray | None,
+    files: dict[str, dict[str, int]],
 ) -> dict[str, Any]:
     """Return the content of run.json."""
-    grid, config = job.store.grid, job.config
+    grid, config, statistics = job.store.grid, job.config, job.statistics()
+    tally = Tally(config.disparity.count, config.disparity.minimum)
+    for part in parts:
+        tally.merge(part.get("counts", {}))
+    counts, quality = tally.report(), quality_of(job, records)
     return {
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "settings": config.model_dump(mode="json"),
@@ -187,12 +186,15 @@ def _report(
         "calibration": _calibration(config),
         "normalization": statistics and statistics.report(),
         "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
-        "counts": tally.report(),
+        "counts": counts,
         "counts_meaning": _COUNTS_MEANING,
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },
-        "overlap_left": None if seams is None else seam_report(seams, grid),
+        "overlap_left": seam_report(job.store.seams(records), grid) if job.store.has_seams else None,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": dict(_versions()),
+        "files": files,
+        "quality": quality,
+        "warnings": warnings_of(job, counts, quality),
     }

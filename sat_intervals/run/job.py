@@ -14,10 +14,22 @@ from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.mccnn import load_network
-from sat_intervals.match.memory import check_memory, fitted, volume_bytes
+from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
-from sat_intervals.raster import RUN_FILES, Image, check_pair, check_space, open_image, restore, stamps
+from sat_intervals.raster import (
+    BLOCK,
+    RUN_FILES,
+    Image,
+    check_pair,
+    check_space,
+    file_bytes,
+    open_image,
+    part_bytes,
+    restore,
+    run_files,
+    stamps,
+)
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.local_ranges import searched
@@ -25,8 +37,9 @@ from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, h
 from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.run.workers import parse_memory
 from sat_intervals.store.before import inputs_before, search_before
-from sat_intervals.store.folder import folder_at
+from sat_intervals.store.folder import LocalFolder, folder_at
 from sat_intervals.store.manifest import digest
+from sat_intervals.store.removal import PARTS
 from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run
 from sat_intervals.tiling import Grid, Tile, Window
 
@@ -63,6 +76,8 @@ class Job:
         Digest of the local search ranges, None without them.
     local
         The local search ranges; not on workers, which read them from the store.
+    has_looks
+        Whether tiles are looked at for the quality of the pair, which a report tells.
     """
 
     left: Image
@@ -76,6 +91,7 @@ class Job:
     found: Found | None = None
     grid: str | None = None
     local: LocalRanges | None = None
+    has_looks: bool = True
 
     @property
     def manifest(self) -> dict[str, Any]:
@@ -207,12 +223,12 @@ def prepare(
     checked_pair(left, right, config)
     config = fitted_to_jobs(config)
     check_tiles(config, region)
-    check_space(out, RUN_FILES, region.height, region.width)
     read = [*files, config.disparity.grid, inputs["weights"]["path"] if "weights" in inputs else None]
     run = digest(_manifest(config, inputs, region, marked))
     if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
         name = "-".join(filter(None, (pair, run)))
         elsewhere = str(folder_at(config.cluster.store).inside(name))
+    _check_space(out, config, region, has_parts=elsewhere is None)
     # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
@@ -221,8 +237,19 @@ def prepare(
     grid = Grid(region, config.tiles.size)
     levels = config.subpixel_levels
     has_seams = config.tiles.overlap != "exact"
-    store = Store(home, grid, config.disparity.count, config.largest_ambiguity, levels, has_seams, run, elsewhere)
+    count, most = config.disparity.count, config.largest_ambiguity
+    store = Store(home.absolute(), grid, count, most, levels, has_seams, run, elsewhere)
     return Job(left, right, config, store, out, inputs, files, requested, found, marked, local)
+
+
+def _check_space(out: Path, config: Config, region: Window, *, has_parts: bool) -> None:
+    """Raise if the disk has no room for the files, and for the parts that are not there yet if it has them, too."""
+    files, needed = run_files(config.products.compression), 0
+    if has_parts:
+        there = sum(LocalFolder(out / "tiles" / PARTS).sizes().values())
+        needed = max(0, part_bytes(files, region.height, region.width) - there)
+    needed += file_bytes(files, region.height, region.width)
+    check_space(out, needed, "files and their parts" if has_parts else "files")
 
 
 def _find(find: Search | None, left: Image, right: Image, files: dict[str, dict[str, Any]]) -> Found:
@@ -273,10 +300,13 @@ def fitted_to_jobs(config: Config) -> Config:
     ConfigError
         See `fitted` and `parse_memory`.
     """
-    if config.cluster.memory is None or config.disparity.is_auto:
-        return config
-    # dask kills workers at 95 % of their memory
-    return fitted(config, 9 * parse_memory(config.cluster.memory) // 10, config.cluster.cores)
+    memory = _job_bytes(config)
+    return config if memory is None or config.disparity.is_auto else fitted(config, memory, config.cluster.cores)
+
+
+def _job_bytes(config: Config) -> int | None:
+    """Return the usable memory of a job of a batch system: dask kills workers at 95 %."""
+    return None if config.cluster.memory is None else 9 * parse_memory(config.cluster.memory) // 10
 
 
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
@@ -304,13 +334,22 @@ def checked_region(left: Image, window: Window | None) -> Window:
 
 
 def check_tiles(config: Config, region: Window) -> None:
-    """Raise if tiles do not fit in the memory of this machine; not checked for jobs and existing schedulers."""
+    """Raise if tiles and strips do not fit in the memory of this machine or of a job; schedulers have their own."""
+    rows, memory = min(BLOCK, region.height), _job_bytes(config)
+    if memory is not None:
+        check_strips(rows, region.width, config, memory, config.cluster.cores)
     if config.cluster.kind not in ("threads", "processes"):
         return
     height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
-    workers = min(config.cluster.workers or usable_cores(), len(Grid(region, config.tiles.size)))
+    most = config.cluster.workers or usable_cores()
+    tiles, strips = min(most, len(Grid(region, config.tiles.size))), min(most, -(-region.height // BLOCK))
     check_memory(
-        workers * volume_bytes(height, width, config),
-        f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {workers} at once,",
+        tiles * volume_bytes(height, width, config),
+        f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {tiles} at once,",
         "choose a smaller --tile-size or fewer --workers",
+    )
+    check_memory(
+        strips * strip_bytes(rows, region.width, config.products.compression),
+        f"strips of {rows} x {region.width} pixels, {strips} at once,",
+        "choose fewer --workers or a narrower --window",
     )

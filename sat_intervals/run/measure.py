@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -16,10 +16,10 @@ from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ladder, measure
+from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import (
     ConfidenceScale,
     RawRows,
-    confidence_scale,
     filter_rows,
     halo,
     regularized,
@@ -33,7 +33,7 @@ from sat_intervals.raster import Image, open_image
 from sat_intervals.results import Layer
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
-from sat_intervals.run.strips import STRIP_PIXELS, check_done, check_matched
+from sat_intervals.run.quality import checked_scale
 from sat_intervals.run.workers import Workers, connected
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
@@ -171,6 +171,7 @@ def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) ->
     """Prepare the job that matches a subject at two levels; open its store."""
     config = _at_levels(subject.config, float(levels[0]), float(levels[1]), None)
     job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name)
+    job = replace(job, has_looks=False)
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin()
     stack.callback(job.store.remove)
@@ -263,11 +264,7 @@ class _Gauge:
 def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:
     """Yield first row of the region, raw rows with their halo, ``first`` and ``last`` of `with_halo`, and the scale."""
     records, region = job.store.records(), job.store.grid.region
-    check_done(job, records)
-    histogram = job.store.histogram(records)
-    check_matched(job, records, int(histogram.sum()))
-    assert job.config.ambiguity is not None  # checked
-    scale = confidence_scale(job.config.ambiguity, histogram)
+    scale = checked_scale(job, records)
     row = 0
     raw = (RawRows(**strip) for strip in job.store.strips(max(1, STRIP_PIXELS // region.width), records))
     for rows, first, last in with_halo(raw, halo(job.config)):

@@ -8,25 +8,23 @@ from typing import Any
 
 from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.match.memory import PROCESS_BYTES, fitted, tile_bytes
+from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
 from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, Image
+from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes, run_files
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
-from sat_intervals.run.strips import strip_bytes
-from sat_intervals.run.workers import reason, tiles_at_once
+from sat_intervals.run.workers import readers, reason, tiles_at_once
 from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.
 SAMPLE = 512
-# Bytes per pixel on the disk during a run: raw products (8 to 12 compressed, 2 more for each sub-pixel level),
-# parts of the files with what overviews are made of, files.
-_STORE_BYTES, _PART_BYTES, _FILE_BYTES = 12, 18, 10
+# Bytes per pixel of raw products: 8 to 12 compressed, 2 more for each sub-pixel level.
+_STORE_BYTES = 12
 
 
 @dataclass(frozen=True)
@@ -99,15 +97,18 @@ def plan(
     config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
     workers = workers or tiles_at_once(config.cluster)
     region = checked_region(left, window)
+    strip = min(BLOCK, region.height), region.width
+    if memory is not None:
+        check_strips(*strip, config, memory)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
     # Compiled once a machine: a part of the first plan, not of the run.
     progress("kernels", 0, 1)
     compile_kernels(config)
     seconds, extra = _expected(left, right, config, workers, grid)
-    pixels = region.height * region.width
+    pixels, files = region.height * region.width, run_files(config.products.compression)
     together = {"threads": workers, "processes": 1, "address": 1}.get(config.cluster.kind, config.cluster.cores)
-    task = max(tile_bytes(config), strip_bytes(region.width))
+    task = max(tile_bytes(config), strip_bytes(*strip, config.products.compression))
     return Plan(
         tile_size=config.tiles.size,
         tiles=len(grid),
@@ -115,8 +116,10 @@ def plan(
         extra_work=extra,
         worker_bytes=PROCESS_BYTES + task,
         together=together,
-        together_bytes=PROCESS_BYTES + together * task,
-        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels + _PART_BYTES + _FILE_BYTES)
+        together_bytes=PROCESS_BYTES + together * task + readers(config.cluster) * waiting_bytes(config),
+        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels)
+        + part_bytes(files, region.height, region.width)
+        + file_bytes(files, region.height, region.width)
         + handed_bytes(grid, config),
         seconds=seconds,
     )

@@ -63,13 +63,14 @@ class Tally:
         median = float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP) if upto[-1] else None
         sums = np.arange(self._sums.size)
         valid = sums & INVALID == 0
+        causes = cause(sums)
         return {
             "pixels": int(self._sums.sum()),
             "valid": self._count(valid),
             "ambiguous": int(self._widths[self._whole]),
             "low_confidence": self._count(valid & (sums & REGULARIZED != 0)),
             "flags": {flag.name: self._count(sums & flag.value != 0) for flag in FLAGS},
-            "causes": {flag.name: self._count(cause(sums) == flag.value) for flag in FLAGS if flag.invalid},
+            "causes": {flag.name: self._count(causes == flag.value) for flag in FLAGS if flag.invalid},
             "range_ends": {"minimum": int(self._ends[0]), "maximum": int(self._ends[1])},
             "median_interval_width": None if median is None else round(median, 2),
         }

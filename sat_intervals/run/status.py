@@ -7,7 +7,9 @@ from typing import Any
 
 from sat_intervals.config.pairs import REPORT
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import BLOCK
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.parts import parts_in
 from sat_intervals.store.place import ElsewhereError
 from sat_intervals.store.removal import BORDERS
 from sat_intervals.store.tiles import is_replacing, store_of
@@ -17,7 +19,7 @@ __all__ = ["ElsewhereError", "Status", "is_replacing", "read_report", "read_stat
 
 @dataclass(frozen=True)
 class Status:
-    """Progress of the tiles of a run.
+    """Progress of the tiles and strips of a run.
 
     Attributes
     ----------
@@ -25,6 +27,8 @@ class Status:
         Numbers of tiles.
     handed_on
         Number of path states that tiles handed to their neighbours, which come before the tiles.
+    strips, strips_done
+        Numbers of strips, which come after the tiles.
     failed
         Why tiles failed, by name, without those done since.
     running
@@ -34,6 +38,8 @@ class Status:
     total: int
     done: int
     handed_on: int
+    strips: int
+    strips_done: int
     failed: dict[str, str]
     running: bool
 
@@ -55,7 +61,15 @@ def read_status(home: Path, store: str | None = None) -> Status:
     """
     there = store_of(home, store)
     handed_on = len(there.folder.inside(BORDERS).sizes())
-    return Status(len(there.grid), len(there.done()), handed_on, there.failures(), LocalFolder(home).is_locked())
+    return Status(
+        total=len(there.grid),
+        done=len(there.done()),
+        handed_on=handed_on,
+        strips=-(-there.grid.region.height // BLOCK),
+        strips_done=parts_in(there).strips_done(),
+        failed=there.failures(),
+        running=LocalFolder(home).is_locked(),
+    )
 
 
 def read_report(out: Path) -> dict[str, dict[str, Any]] | None:

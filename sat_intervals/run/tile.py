@@ -32,6 +32,7 @@ from sat_intervals.raster.identity import check_unchanged
 from sat_intervals.run.job import Job
 from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
+from sat_intervals.run.workers import computing
 from sat_intervals.store.removal import BORDERS, COSTS
 from sat_intervals.tiling import Tile, Views, Window, hull
 
@@ -104,13 +105,15 @@ def _match_tile(
     job: Job, tile: Tile, source: "_Source", handed: list[Handed], ranges: LocalRanges | None, seconds: dict[str, float]
 ) -> None:
     """Match a tile and write its products; add the states of the last wavefront that it hands on to ``handed``."""
-    views, costs = _costed(job, tile, source, ranges, seconds)
-    seconds["match"] = seconds.get("match", 0.0) + seconds.pop("costs", 0.0)
-    frame, borders = _frame(job, tile), None
-    with timed(seconds, "match"):
-        if job.hands_states_on:
-            borders = [_borders(job, tile, view, handed, ranges) for view in range(len(costs))]
-        patch = match_costed(views, frame, costs, job.config, borders, ranges)
+    with computing(job.config.cluster):
+        views, costs = _costed(job, tile, source, ranges, seconds)
+        seconds["match"] = seconds.get("match", 0.0) + seconds.pop("costs", 0.0)
+        frame, borders = _frame(job, tile), None
+        with timed(seconds, "match"):
+            if job.hands_states_on:
+                borders = [_borders(job, tile, view, handed, ranges) for view in range(len(costs))]
+            patch = match_costed(views, frame, costs, job.config, borders, ranges)
+        del costs, borders
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     if handed:
         handed[LAST][_place(tile)] = patch.leaving
@@ -124,7 +127,8 @@ def _match_tile(
 def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
     """Look at the quality of the pair in some of the tiles, unless the search for its range did so."""
     grid, search = job.store.grid, job.config.disparity
-    if job.found or tile.grid_row % -(-grid.rows // _LOOKS) or tile.grid_column % -(-grid.columns // _LOOKS):
+    steps = -(-grid.rows // _LOOKS), -(-grid.columns // _LOOKS)
+    if job.found or not job.has_looks or tile.grid_row % steps[0] or tile.grid_column % steps[1]:
         return []
     return look_in_tile(views, tile.core, search.minimum, search.maximum)
 
@@ -135,6 +139,7 @@ def _trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
         tiles, ranges = job.store.grid.within(block.core), job.ranges()
         source = _read(job, tiles, ranges, seconds)
         handed = _handed(job, block, wavefront)
+    with computing(job.config.cluster), timed(seconds, "trace"):
         for tile in in_order(wavefront, tiles):
             _, costs = _costed(job, tile, source, ranges, seconds)
             of_wavefronts = [handed if other == wavefront else {} for other in range(len(WAVEFRONTS))]
@@ -142,6 +147,7 @@ def _trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
                 trace_area(cost, frame, _borders(job, tile, view, of_wavefronts, ranges), wavefront, job.config, ranges)
                 for view, (cost, frame) in enumerate(zip(costs, _frames(job, tile), strict=True))
             ]
+    with timed(seconds, "trace"):
         _write_states(job, block, wavefront, handed)
     costs_seconds = seconds.get("costs", 0.0)
     return {"tiles.costs": costs_seconds, "tiles.trace": seconds["trace"] - costs_seconds}

@@ -8,7 +8,7 @@ import numpy as np
 
 from sat_intervals.evaluate.comparison import Comparison
 from sat_intervals.evaluate.dsm import Profile, error_map
-from sat_intervals.show.canvas import DPI, INK, NOTHING, page, pointed_ends, say_empty
+from sat_intervals.show.canvas import DPI, INK, NOTHING, page, plain_logarithm, pointed_ends, say_empty
 from sat_intervals.show.legend import BLUE, ORANGE
 
 # Cells of a class that are worth a point, and pixels of the longer side of a map.
@@ -30,6 +30,8 @@ def draw_reliability(report: dict[str, Any], path: Path, name: str, dpi: int = D
         ends = [max(0.05, 0.8 * min(stated, default=0.1)), 1.25 * max(stated, default=10.0)]
         left.plot(ends, ends, color=INK, lw=0.8, ls="--", label="intervals as wide as needed")
         left.set(xlabel="mean half width of intervals (m)", xscale="log", yscale="log")
+        for axis in (left.xaxis, left.yaxis):
+            plain_logarithm(axis)
         left.legend(loc="upper left", frameon=False)
         right.bar(range(len(kinds)), [kind["coverage"] for kind in kinds], color=BLUE, width=0.7)
         right.axhline(report["all"]["coverage"] or 0.0, color=ORANGE, lw=1, label="measured, all cells")

@@ -16,8 +16,10 @@ from sat_intervals.raster import whole_file
 try:
     from matplotlib import rc_context
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.colorbar import Colorbar
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 except ImportError as error:
     raise SatIntervalsError("pictures need matplotlib: pip install 'sat-intervals[plot]'") from error
 
@@ -86,10 +88,17 @@ def add_histogram(bar: Colorbar, widths: np.ndarray, end: float, step: float) ->
     shares = np.maximum(counts / known.size, _LEAST_SHARE)
     side.stairs(shares, bar.norm(edges), baseline=_LEAST_SHARE, orientation="horizontal", fill=True, color=INK)
     side.set(xscale="log", xlim=(1, _LEAST_SHARE), ylim=(0, 1), yticks=[])
-    side.set_xticks([1, 0.01], ["100", "1 %"], fontsize=8, color=INK)
+    side.set_xticks([1, 0.01], ["100 %", "1 %"], fontsize=8, color=INK)
     side.set_xticks([], minor=True)
     side.spines[:].set_visible(False)
     side.patch.set_visible(False)
+
+
+def plain_logarithm(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers, such as 2, 5 and 10."""
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def say_empty(panel: Axes, values: np.ndarray, text: str) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_subpixel_cut, read_winners
-from sat_intervals.kernels.matching import Settings, cost_volume
+from sat_intervals.kernels.matching import cost_volume
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import kernel_settings

@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.show.canvas import DPI, INK, page
+from sat_intervals.show.canvas import DPI, INK, page, plain_logarithm
 from sat_intervals.show.legend import BLUE, ORANGE
 
 _CLASSES = (("all", "valid pixels", "black"), ("high", "high confidence", BLUE), ("low", "low confidence", ORANGE))
@@ -35,6 +35,7 @@ def draw_coverage(runs: Sequence[Path], path: Path, dpi: int = DPI, **judging: A
         left.set(xlabel="nominal coverage (or alpha)", ylabel="measured coverage", xlim=(0.45, 1), ylim=(0, 1.02))
         left.legend(loc="lower right", frameon=False)
         right.set(xlabel="measured coverage", ylabel="mean width (px)", yscale="log")
+        plain_logarithm(right.yaxis)
 
 
 def _draw_line(chart: Axes, points: Sequence[tuple[float, float]], label: str, colour: str, style: str) -> None:

@@ -123,7 +123,7 @@ def _is_free(file: Path, written: Written) -> bool:
 
 def _results(run: Run, written: Written) -> Iterator[Layer]:
     file, group = run.out / "intervals.tif", "Disparity"
-    place = open_image(run.out / "validity.tif").georeferencing
+    place = run.georeferencing
     disparity, lower, upper, _ = read_small_layers(file, _fitting(run.shape))
     counts = np.zeros(1 << 16, np.int64)
     for window in run.windows():
@@ -149,7 +149,7 @@ def _points(run: Run, written: Written) -> Iterator[Layer]:
     if read_tags(file).get("RUN") != run.report["finished"] or read_shape(file)[1:] != run.shape:
         written.notes.append(f"{file} belongs to another run and is left out: rerun sat-intervals triangulate")
         return
-    place = open_image(run.out / "validity.tif").georeferencing
+    place = run.georeferencing
     bands = read_small_layers(file, _fitting(run.shape))
     for number, ramp in ((6, styles.MAGMA), (3, styles.VIRIDIS)):
         name, is_height = POINTS[number - 1].name, number == 3

@@ -5,70 +5,113 @@ record is intact and its contents have these sizes. The names of parts have a di
 such as the median and the versions of the codecs: parts of other settings are no parts of a run.
 """
 
-from collections.abc import Mapping
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sat_intervals.store.folder import Folder
-from sat_intervals.store.manifest import MANIFEST, sealed, unsealed
-from sat_intervals.store.removal import PARTS
-from sat_intervals.store.tiles import DamagedTilesError
+from sat_intervals.errors import RunError
+from sat_intervals.store.folder import Folder, folder_at
+from sat_intervals.store.manifest import MANIFEST, digest, sealed, unsealed
+from sat_intervals.store.removal import PARTS, final_name
+from sat_intervals.store.tiles import DamagedTilesError, Store
 from sat_intervals.store.zarr_arrays import checksum
 
-Place = tuple[int, int]
+PartKey = tuple[int, int]
 """Level of a file, 0 for its pixels, and row of blocks from the top."""
+
+# Digits of a name that are the same for all runs of a folder.
+_OWNER_DIGITS = 8
+# Records of strips, with the digest of what made them.
+_STRIP = re.compile(r"([0-9a-f]{32})_0_\d+\.json")
 
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a run in the folder of its tiles; ``run`` is a digest of all that decides their bytes."""
+    """The parts of a run in the folder of its tiles.
+
+    Attributes
+    ----------
+    folder
+        Folder of the tiles.
+    owner
+        Folder of the run if ``folder`` is in a store that runs share, otherwise empty: no run uses another's parts.
+    made_by
+        Digest of all that decides their bytes.
+    """
 
     folder: Folder
-    run: str
+    owner: str
+    made_by: str
 
-    def _name(self, place: Place) -> str:
-        return f"{self.run}_{place[0]}_{place[1]}"
+    @property
+    def _owner(self) -> str:
+        return digest({"owner": self.owner})[:_OWNER_DIGITS]
 
-    def done(self) -> dict[Place, dict[str, Any]]:
+    @property
+    def _run(self) -> str:
+        return self._owner + self.made_by[_OWNER_DIGITS:]
+
+    def _name(self, key: PartKey) -> str:
+        return f"{self._run}_{key[0]}_{key[1]}"
+
+    def done(self) -> dict[PartKey, dict[str, Any]]:
         """Return the records of the parts that are done."""
         texts, sizes = self.folder.read_all(PARTS), self.folder.inside(PARTS).sizes()
         found = {}
         for name, text in texts.items():
-            run, *place = name.split("_")
-            record = unsealed(text, name) if run == self.run else None
+            run, *key = name.split("_")
+            record = unsealed(text, name) if run == self._run else None
             if record and all(sizes.get(f"{name}_{kind}") == size for kind, (size, _) in record["files"].items()):
-                level, row = map(int, place)
+                level, row = map(int, key)
                 found[level, row] = record
         return found
 
-    def record(self, place: Place) -> dict[str, Any] | None:
+    def strips_done(self) -> int:
+        """Return the number of finished strips, whatever made them; with several settings the largest number."""
+        records = filter(None, map(_STRIP.fullmatch, self.folder.inside(PARTS).sizes()))
+        made_by = Counter(record[1] for record in records if record[1].startswith(self._owner))
+        return max(made_by.values(), default=0)
+
+    def record(self, key: PartKey) -> dict[str, Any] | None:
         """Return the record of a part; None if it is missing or damaged."""
-        name = self._name(place)
+        name = self._name(key)
         return unsealed(self.folder.read(f"{PARTS}/{name}.json"), name)
 
-    def write(self, place: Place, contents: Mapping[str, bytes], record: Mapping[str, Any]) -> None:
-        """Write contents by kind, and then the record with their checksums in ``files``; the part is then done."""
-        name = self._name(place)
-        for kind, content in contents.items():
-            self.folder.write_bytes(f"{PARTS}/{name}_{kind}", content)
-        files = {kind: checksum(content) for kind, content in contents.items()}
-        self.folder.write(f"{PARTS}/{name}.json", sealed({**record, "files": files}, name))
+    def write(self, key: PartKey, kind: str, content: bytes) -> list[int]:
+        """Write a content of a part; return its size and checksum."""
+        self.folder.write_bytes(f"{PARTS}/{self._name(key)}_{kind}", content)
+        return checksum(content)
+
+    def write_record(self, key: PartKey, record: Mapping[str, Any]) -> None:
+        """Write the record of a part, with the checksums of its contents in ``files``; the part is then done."""
+        name = self._name(key)
+        self.folder.write(f"{PARTS}/{name}.json", sealed(record, name))
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
-            names = (f"{PARTS}/{name}{end}" for end in (".json", *(f"_{kind}" for kind in contents)))
+            names = (f"{PARTS}/{name}{end}" for end in (".json", *(f"_{kind}" for kind in record["files"])))
             self.folder.delete_all([*names], [PARTS])
             self.folder.delete_if_empty()
 
-    def read(self, place: Place, kind: str, record: Mapping[str, Any]) -> bytes:
-        """Read a content.
+    def read(self, key: PartKey, kind: str, file: Sequence[int]) -> bytes:
+        """Read a content with this size and checksum.
 
         Raises
         ------
         DamagedTilesError
             It is missing or damaged; the part is no longer done.
+        RunError
+            It cannot be read.
         """
-        name = self._name(place)
-        content = self.folder.read_bytes(f"{PARTS}/{name}_{kind}")
-        if content is None or checksum(content) != list(record["files"][kind]):
+        name = self._name(key)
+        try:
+            content = self.folder.read_bytes(f"{PARTS}/{name}_{kind}")
+        except OSError as error:
+            raise RunError(
+                f"the part {name}_{kind} in {self.folder} cannot be read: {error.strerror or error}; rerun the same "
+                "command: it resumes"
+            ) from error
+        if content is None or checksum(content) != list(file):
             self.folder.delete(f"{PARTS}/{name}.json")
             raise DamagedTilesError(
                 f"the part {name}_{kind} in {self.folder} is damaged: rerun the same command: it makes it again"
@@ -76,6 +119,14 @@ class Parts:
         return content
 
     def drop(self) -> None:
-        """Delete the parts of the run; call it once its files are published."""
+        """Delete the parts of all runs of the owner, such as those of earlier settings; call it after publishing."""
         names = self.folder.inside(PARTS).sizes()
-        self.folder.delete_all([f"{PARTS}/{name}" for name in names if name.startswith(f"{self.run}_")], [PARTS])
+        self.folder.delete_all(
+            [f"{PARTS}/{name}" for name in names if final_name(name).startswith(self._owner)], [PARTS]
+        )
+
+
+def parts_in(store: Store, made_by: str = "") -> Parts:
+    """Return the parts of a run with these tiles."""
+    is_shared = store.folder != folder_at(store.home)
+    return Parts(store.folder, str(store.home.absolute()) if is_shared else "", made_by)

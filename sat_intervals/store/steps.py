@@ -41,18 +41,16 @@ class Steps:
             self.folder.delete(file)
 
     def read(self, kind: str, name: str, wanted: Iterable[int] | None = None) -> list[np.ndarray] | None:
-        """Read what `write` wrote, or only the ``wanted`` arrays; None if the file is missing.
+        """Read what `write` wrote, or only the ``wanted`` arrays.
 
-        None after its removal if it is damaged, or belongs to another run, tile or wavefront.
+        None if the file is missing, damaged, or of another run, tile or wavefront. It is not deleted: another worker
+        may just have written it again.
         """
         content = self.folder.read_bytes(f"{kind}/{name}")
-        found = None if content is None else _parsed(content, f"{self.run}/{kind}/{name}", wanted)
-        if content is not None and found is None:
-            self.folder.delete(f"{kind}/{name}")
-        return found
+        return None if content is None else _parsed(content, f"{self.run}/{kind}/{name}", wanted)
 
     def intact(self, kind: str) -> Callable[[str], bool]:
-        """Return a function that tells whether a file was written and is not damaged; a damaged one is removed."""
+        """Return a function that tells whether a file was written and is not damaged."""
         there = self.folder.inside(kind).sizes().keys()
 
         @cache

@@ -43,7 +43,7 @@ Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 10
+LAYOUT = 11
 
 # Marker files in the folder of a run: present while it replaces an earlier run; its name, from the publication of its
 # files to the removal of its tiles.
@@ -277,7 +277,7 @@ class Store:
             record = unsealed(texts.get(tile.name), f"{self.run}/{tile.name}")
             files = record.get("files", {}) if record else {}
             is_complete = files.keys() == self._arrays.files_of(tile)
-            if record and is_complete and all(sizes.get(name) == size for name, (size, _) in files.items()):
+            if record and is_complete and all(sizes.get(name) == size for name, (size, *_) in files.items()):
                 found[tile.name] = record
         return found
 

@@ -14,7 +14,8 @@ from sat_intervals.demo import make_scene
 
 # Commands that print figures.
 WITH_JSON = (
-    "ablate", "batch", "calibrate", "demo", "dsm", "evaluate", "match", "plan", "range", "status", "triangulate"
+    "ablate", "batch", "calibrate", "demo", "dsm", "evaluate", "match", "plan", "range", "reference", "status",
+    "surface", "triangulate",
 )  # fmt: skip
 
 

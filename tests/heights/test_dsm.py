@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 import rasterio
-from finished import FINISHED, write_run
+from finished import FINISHED, write_file, write_run
 from helpers import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,7 +21,7 @@ from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.splat import AGREEING, COUNT, MEDIAN, NEAREST, cell_bounds, empty_cells, reaching, splat
 from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
-from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, Projection, north_up, write_layer
+from sat_intervals.raster import POINT_FILES, Projection, north_up, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -47,9 +47,7 @@ def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run
         "height_upper": height + upper,
     }
     points = np.stack([np.where(nothing, np.nan, layers[band.name]) for band in POINTS])
-    with OutputWriter(out, POINT_FILES, *height.shape, Georeferencing(), {"RUN": run}) as writer:
-        writer.write(0, points)
-        writer.publish()
+    write_file(out / "points.tif", POINT_FILES[0], points, tags={"RUN": run})
     return out
 
 
@@ -227,7 +225,7 @@ def test_cell_bounds__equal_their_slow_twins(seed):
 @pytest.mark.parametrize("bounds", BOUNDS[2:])
 def test_make_surface__heights_do_not_depend_on_the_bounds(tmp_path, bounds, monkeypatch):
     random = np.random.default_rng(1)
-    x, y = random.uniform(0, 9, (2, 20, 20))
+    x, y = random.uniform(0, 6, (2, 14, 14))
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     wide, _, _ = surface_of([out], tmp_path)
     narrow, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds=bounds))

@@ -1,6 +1,7 @@
 """Reference heights to true disparities: analytic scenes, registration, files of points, inputs that do not fit."""
 
 import csv
+import json
 from contextlib import suppress
 
 import numpy as np
@@ -300,6 +301,11 @@ def test_reference_command__writes_a_truth_for_evaluate_and_calibrate(relief):
     assert "reference moved: easting" in result.output
     assert f"{ROWS * COLUMNS} pixels with a true disparity (100.0 %), 0.0 % of them outside" in result.output
     assert result.output.splitlines()[-1] == str(out / "truth.tif")
+    figures = json.loads(
+        invoke("reference", out, "--heights", reference, "--ellipsoid", *sensor_words(files), "--json").stdout
+    )
+    assert (figures["pixels"], figures["share"], figures["outside_range"]) == (ROWS * COLUMNS, 1.0, 0.0)
+    assert max(map(abs, figures["registration"]["shift"])) < 0.1
     judged = invoke("evaluate", out, "--truth", out / "truth.tif")
     assert judged.exit_code == 0, judged.output
     assert judged.stdout.splitlines()[2].split()[2:4] == [str(ROWS * COLUMNS), "1.000"]

@@ -384,6 +384,10 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert (out / "run.json").read_bytes() == before
     assert "% with a height" in result.stdout
     assert "median half width +-" in result.stdout
+    figures = json.loads(invoke(*command, "--json").stdout)
+    assert figures["run"] == json.loads(before)
+    assert figures["points"]["points"] > 0
+    assert 0 < figures["surface"]["filled"] <= 1
     assert invoke("match", *images, str(steps), *search, "--quiet").exit_code == 0
     assert invoke("triangulate", str(steps), *sensors, "--quiet").exit_code == 0
     assert invoke("dsm", str(steps), "--resolution", "1", "--quiet").exit_code == 0

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from finished import random_bands, without_intervals, write_run
+from finished import PLACE, random_bands, without_intervals, write_run
 from helpers import invoke
 from numpy.testing import assert_array_equal
+from rasterio.transform import Affine
 
 from sat_intervals.products import INVALID
 
@@ -112,6 +113,10 @@ def test_export__a_region_lies_at_its_place_in_the_left_image(tmp_path, row):
     expected[row : row + 30, 7:27] = np.where(validity & INVALID == 0, bands[0], np.nan)
     assert_array_equal(look(tmp_path / "s2p" / "rectified_disp.tif")[0][0], expected)
     assert_array_equal(look(tmp_path / "s2p" / "rectified_mask.png")[0][0], np.isfinite(expected))
+    exported(out, "otb", tmp_path / "otb")
+    for name in ("disparity.tif", "mask.tif"):
+        with rasterio.open(tmp_path / "otb" / name) as dataset:
+            assert (dataset.transform, dataset.crs) == (PLACE.transform * Affine.translation(-7, -row), None)
 
 
 def test_export__refuses_what_is_no_run_and_what_it_does_not_know(run, tmp_path):

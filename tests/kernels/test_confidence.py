@@ -13,12 +13,13 @@ from hypothesis.extra import numpy as hnp
 from sat_intervals.config import Ambiguity
 from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
 from sat_intervals.kernels.cost import Codes, between
-from sat_intervals.kernels.matching import Settings, match_costs
+from sat_intervals.kernels.matching import match_costs
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.postprocess import confidence_scale
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA, NO_DISPARITY
 from sat_intervals.tiling import Window
 
-bounded = settings(max_examples=50, derandomize=True, deadline=None)
+bounded = settings(max_examples=30, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 N = np.nan

@@ -13,7 +13,8 @@ from hypothesis.extra import numpy as hnp
 
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.disparity import cross_check, median
-from sat_intervals.kernels.matching import Settings, match_costs
+from sat_intervals.kernels.matching import match_costs
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import (
     IMPOSSIBLE_COST,
     LEFT_WINDOW,
@@ -29,7 +30,7 @@ from sat_intervals.products import (
 )
 from sat_intervals.tiling import Window
 
-bounded = settings(max_examples=80, derandomize=True, deadline=None)
+bounded = settings(max_examples=50, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 N = NO_DISPARITY

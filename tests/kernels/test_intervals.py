@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from sat_intervals.config import load_config
 from sat_intervals.kernels.cost import Codes, between
 from sat_intervals.kernels.intervals import regularize
-from sat_intervals.kernels.matching import Settings, match_costs
+from sat_intervals.kernels.matching import match_costs
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.in_memory import match_arrays
 from sat_intervals.match.patch import Frame, match_patch, patch_windows
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, postprocess_rows
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST, INVALID, NO_DATA, NO_DISPARITY, REJECTED
 from sat_intervals.tiling import View, Window
 
-bounded = settings(max_examples=60, derandomize=True, deadline=None)
+bounded = settings(max_examples=40, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
-some = settings(max_examples=40, derandomize=True, deadline=None)
+some = settings(max_examples=25, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 64, 65, 70)
 ALPHAS = ("0.9", "0.5", "0.98", "1", "0.01", "0.005")
 N = NO_DISPARITY

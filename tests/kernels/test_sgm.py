@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between
-from sat_intervals.kernels.matching import Settings, cost_volume, match_costs
+from sat_intervals.kernels.matching import cost_volume, match_costs
 from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
+from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import IMPOSSIBLE_COST, MASKED, NO_DATA
 from sat_intervals.tiling import Window
 
-bounded = settings(max_examples=80, derandomize=True, deadline=None)
+bounded = settings(max_examples=50, derandomize=True, deadline=None)
 few = settings(max_examples=20, derandomize=True, deadline=None)
 COUNTS = (1, 2, 31, 32, 33, 63, 64, 65, 70, 96, 97)
 X = IMPOSSIBLE_COST

@@ -1,8 +1,9 @@
-"""Cloud-Optimized GeoTIFFs put together from parts: valid, equal to what was written, the same bytes in any order."""
+"""Cloud-Optimized GeoTIFFs assembled from parts: valid, equal to what was written, the same bytes in any order."""
 
 import random
 import warnings
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals.products import Band
-from sat_intervals.raster import POINT_FILES, RUN_FILES, File, Georeferencing, cog, north_up, run_files
-from sat_intervals.raster.cog import BLOCK, Part, codec_versions, combined, compressed, factors, put_together, template
+from sat_intervals.raster import POINT_FILES, RUN_FILES, File, Georeferencing, blocks, cog, north_up, run_files
+from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
+from sat_intervals.raster.cog import Part, assemble, combined, template
 from sat_intervals.raster.streaming import Stream
 
 INTERVALS, VALIDITY = RUN_FILES
@@ -37,14 +39,21 @@ def parts_of(bands: np.ndarray, file: File, order: random.Random | None = None) 
         order.shuffle(places)
     made = {}
     for k, row in places:
-        blocks = compressed(bands[:, :: levels[k], :: levels[k]][:, row : row + BLOCK], file)
-        made[k, row] = Part(blocks.sizes, zlib.crc32(blocks.content), lambda content=blocks.content: content)
+        rows = compressed(bands[:, :: levels[k], :: levels[k]][:, row : row + BLOCK], file)
+        made[k, row] = Part(rows.sizes, zlib.crc32(rows.content), rows.content)
     return [[made[place] for place in sorted(made) if place[0] == k] for k in range(len(levels))]
 
 
 def write(path: Path, bands: np.ndarray, file: File, place: Georeferencing = PLACE, **options) -> dict[str, int]:
     made = template(file, place, {"ALPHA": "0.9"}, path)
-    return put_together(path, made, bands.shape[1:], parts_of(bands, file, **options))
+    return assemble(path, made, bands.shape[1:], parts_of(bands, file, **options), copy_parts)
+
+
+def copy_parts(path: Path, parts: Sequence[tuple[int, Part]]) -> None:
+    with path.open("r+b") as out:
+        for offset, part in reversed(parts):
+            out.seek(offset)
+            out.write(part.source)
 
 
 def assert_valid(path: Path) -> None:
@@ -65,7 +74,7 @@ def assert_valid(path: Path) -> None:
         (*POINT_FILES, (20, 513), False),
     ],
 )
-def test_put_together__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file, shape, is_big):
+def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file, shape, is_big):
     monkeypatch.setattr(cog, "_CLASSIC", 0 if is_big else 1 << 32)
     bands, path = noise(file, *shape), tmp_path / file.name
     made = write(path, bands, file)
@@ -85,7 +94,7 @@ def test_put_together__is_a_valid_file_with_every_level(tmp_path, monkeypatch, f
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lerc", "none"])
-def test_put_together__with_other_compressions(tmp_path, compression):
+def test_assemble__with_other_compressions(tmp_path, compression):
     for file, shape in zip(run_files(compression), [(513, 40), (40, 30)], strict=True):
         bands, path = noise(file, *shape), tmp_path / file.name
         write(path, bands, file)
@@ -96,14 +105,14 @@ def test_put_together__with_other_compressions(tmp_path, compression):
             np.testing.assert_allclose(dataset.read(), bands, rtol=0, atol=error)
 
 
-def test_put_together__gives_the_same_bytes_whatever_the_order(tmp_path):
+def test_assemble__gives_the_same_bytes_whatever_the_order(tmp_path):
     bands = noise(INTERVALS, 1100, 600)
     whole = write(tmp_path / "a.tif", bands, INTERVALS)
     assert whole == write(tmp_path / "b.tif", bands, INTERVALS, order=random.Random(1))
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
 
 
-def test_put_together__has_the_tags_of_gdals_own_driver(tmp_path):
+def test_assemble__has_the_tags_of_gdals_own_driver(tmp_path):
     bands, place = noise(VALIDITY, 600, 700), north_up(32631, 3e5, 4.8e6, 0.5)
     write(tmp_path / "ours.tif", bands, VALIDITY, place)
     options = {"count": 1, "dtype": "uint16", **place.creation_options()}
@@ -127,27 +136,29 @@ def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
     stream = Stream(INTERVALS, tmp_path / "a.tif", bands.shape[1:], 2)
     for row in range(0, 1100, rows):
         stream.write(row, bands[:, row : row + rows])
-    expected = parts_of(bands, INTERVALS)
-    assert [[part.read() for part in level] for level in stream.parts] == [
-        [part.read() for part in level] for level in expected
-    ]
+    for found, expected in zip(stream.parts, parts_of(bands, INTERVALS), strict=True):
+        assert [part[:2] for part in found] == [part[:2] for part in expected]
+    made = template(INTERVALS, PLACE, {"ALPHA": "0.9"}, tmp_path / "a.tif")
+    assemble(tmp_path / "a.tif", made, bands.shape[1:], stream.parts, stream.copy_parts)
+    write(tmp_path / "b.tif", bands, INTERVALS)
+    assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
     stream.remove()
-    assert list(tmp_path.iterdir()) == []
+    assert {path.name for path in tmp_path.iterdir()} == {"a.tif", "b.tif"}
 
 
 def test_compressed__refuses_blocks_that_decode_to_something_else(monkeypatch):
-    class Losing(cog.gdal.DatasetWriter):
+    class Losing(blocks.gdal.DatasetWriter):
         def write(self, bands):
             super().write(bands * (bands > 0))
 
-    monkeypatch.setattr(cog.gdal, "DatasetWriter", Losing)
+    monkeypatch.setattr(blocks.gdal, "DatasetWriter", Losing)
     with pytest.raises(OSError, match="differs from that written"):
         compressed(noise(INTERVALS, 20, 30), INTERVALS)
 
 
 def test_codec_versions__follow_the_bytes_of_blocks(monkeypatch):
     before = codec_versions("deflate")
-    monkeypatch.setitem(cog._LEVELS, "deflate", {"zlevel": 9})
+    monkeypatch.setitem(blocks._LEVELS, "deflate", {"zlevel": 9})
     assert codec_versions("deflate") == before  # once a process
     codec_versions.cache_clear()
     assert codec_versions("deflate")["codecs"] != before["codecs"]

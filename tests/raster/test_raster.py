@@ -669,15 +669,15 @@ def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_pa
     assert left_behind(tmp_path) == []
 
 
-# The bands have 18 bytes a pixel, 5.2 MB: there is no room for them, none beside another file, none for the files made
-# of them, which noise hardly shortens.
+# The bands have 18 bytes a pixel, 5.2 MB, and their files at most 3.5 MB with overviews if they were no noise, which
+# hardly shortens: there is no room for the files, for what they are made of beside them, or for another file.
 @pytest.mark.parametrize(
     ("size", "others", "reason"),
     [
-        (4 << 20, 0, "has 4.2 MB free, the bands need at least 5.2 MB"),
-        (6 << 20, 2 << 20, "No space left on device"),
-        (6 << 20, 0, "No space left on device"),
+        (3 << 20, 0, "has 3.1 MB free, files may need 3.5 MB"),
+        (6 << 20, 0, "has 6.3 MB free, files may need 7.0 MB"),
         (9 << 20, 0, "No space left on device"),
+        (9 << 20, 1 << 20, "No space left on device"),
     ],
 )
 def test_output_writer__leaves_nothing_on_a_full_disk(disk, products, size, others, reason):

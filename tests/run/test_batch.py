@@ -38,7 +38,7 @@ from sat_intervals.store.tiles import mark_finished
 def images(tmp_path_factory):
     folder = tmp_path_factory.mktemp("images")
     for seed in (1, 2):
-        scene = make_scene(150, 200, seed=seed)
+        scene = make_scene(80, 140, seed=seed)
         for side in ("left", "right"):
             write_layer(folder / f"{side}{seed}.tif", getattr(scene, side), 0, PLACE)
     return folder
@@ -131,7 +131,7 @@ def test_match_batch__takes_no_result_of_another_image_for_that_of_a_pair(images
         shutil.copy(file, tmp_path)
     pairs = read_batch(rows(tmp_path))
     match_batch(pairs, tmp_path / "out")
-    scene = make_scene(150, 200, seed=3)
+    scene = make_scene(80, 140, seed=3)
     write_layer(tmp_path / "left1.tif", scene.left, 0, PLACE)
     report = match_batch(pairs, tmp_path / "out")
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done before"}
@@ -422,10 +422,10 @@ def test_parse_memory__refuses_what_is_none(text):
 def test_plan__counts_tiles_and_the_work_of_overlaps(images):
     config = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64, "overlap": 10}}
     made = plan(images / "left1.tif", images / "right1.tif", config, workers=2)
-    # 150 x 200 px: 3 x 4 tiles; a patch is as wide as core and overlaps, its sweeps see half of the rows behind it
-    widths, heights = [74, 84, 82, 18], [64 + 5, 64 + 10, 22 + 5]
-    assert made.tiles == 12
-    assert made.extra_work == pytest.approx(sum(widths) * sum(heights) / (150 * 200) - 1)
+    # 80 x 140 px: 2 x 3 tiles; a patch is as wide as core and overlaps, its sweeps see half of the rows behind it
+    widths, heights = [74, 84, 22], [64 + 5, 16 + 5]
+    assert made.tiles == 6
+    assert made.extra_work == pytest.approx(sum(widths) * sum(heights) / (80 * 140) - 1)
     assert made.seconds > 0
 
 
@@ -458,7 +458,7 @@ def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(
     settings = tmp_path / "settings.yaml"
     settings.write_text(yaml.safe_dump({"disparity": {"minimum": -18, "maximum": 40}, "cluster": cluster}))
     arguments = ["plan", str(bands), str(images / "right1.tif"), "--config", str(settings), "--band", "1"]
-    result = invoke(*arguments, "--window", "20", "0", "100", "200", "--tile-size", "512")
+    result = invoke(*arguments, "--window", "20", "0", "60", "140", "--tile-size", "512")
     assert result.exit_code == 0, result.stderr
     assert "24 tiles at once" in result.stdout
     assert "with 3 tiles at once" in result.stdout
@@ -468,7 +468,7 @@ def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(
 def test_plan__takes_another_sample_where_the_centre_holds_no_data_and_refuses_what_match_does(images, tmp_path):
     for side in ("left", "right"):
         with rasterio.open(images / f"{side}1.tif") as file:
-            image = np.tile(file.read(1), (5, 4))[:700, :700]
+            image = np.tile(file.read(1), (9, 5))[:700, :700]
         image[90:610, 90:610] = 0
         write_layer(tmp_path / f"{side}.tif", image, 0, PLACE)
     config = {"disparity": {"minimum": -18, "maximum": 40}}
@@ -491,6 +491,6 @@ def test_status__tells_done_and_failed_tiles_from_the_store(images, tmp_path):
     (out / "tiles" / "records" / "1_1.json").unlink()
     Path(out / "tiles" / "failures" / "0_1.json").write_text(json.dumps("no more disk"))
     result = invoke("status", out)
-    assert "10 of 12 tiles done, 1 failed, 1 left; no run is active" in result.stdout
-    assert "; 45 path states are handed on\n" in result.stdout  # 11 tiles in three wavefronts, 12 with their matching
+    assert "4 of 6 tiles done, 1 failed, 1 left; no run is active" in result.stdout
+    assert "; 21 path states are handed on\n" in result.stdout  # 5 tiles in three wavefronts, 6 with their matching
     assert "tile 0_1: no more disk" in result.stdout

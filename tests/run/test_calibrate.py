@@ -16,6 +16,7 @@ from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibrat
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
 from sat_intervals.evaluate.disparity import evaluate_run
+from sat_intervals.match import measurement
 from sat_intervals.raster import write_layer
 from sat_intervals.run import tune
 from sat_intervals.run.calibrate import check_subjects
@@ -28,7 +29,7 @@ from sat_intervals.run.tune import Tuned, best_of, candidates
 def scene(tmp_path_factory):
     """A folder of a pair, with its calibration in calibration.yaml and what the command printed in said."""
     folder = tmp_path_factory.mktemp("scene")
-    write_pair(folder, make_scene(200, 260, seed=5))
+    write_pair(folder, make_scene(150, 200, seed=5))
     result = invoke("calibrate", folder, "--output", folder / "calibration.yaml")
     assert result.exit_code == 0, result.output
     (folder / "said").write_text(result.output)
@@ -78,10 +79,10 @@ def test_calibrate__workers_do_not_change_a_byte(scene, tmp_path):
 def test_calibrate__a_finished_run_equals_its_pair(scene, tmp_path):
     """The run is matched again from its images, with its own settings."""
     match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "run", settings_with(scene, alpha=0.7))
-    found = [calibrated(folder, tmp_path / "one.yaml") for folder in (scene, tmp_path / "run")]
-    contents = [yaml.safe_load(content) for content in found]
-    assert contents[0]["levels"] == contents[1]["levels"]
-    assert contents[0]["key"] == contents[1]["key"]
+    found = yaml.safe_load(calibrated(tmp_path / "run", tmp_path / "one.yaml"))
+    expected = yaml.safe_load((scene / "calibration.yaml").read_text())
+    assert (found["name"], expected["name"]) == ("one", "calibration")
+    assert (found["levels"], found["key"]) == (expected["levels"], expected["key"])
 
 
 def test_calibrate__bias_and_tolerance_make_up_for_a_shifted_truth(scene, tmp_path):
@@ -116,9 +117,9 @@ def one_line(result):
     ("truth", "words"),
     [
         (np.zeros((30, 40)), "30 x 40 pixels"),
-        (np.full((200, 260), np.nan), "0 known truths, at least 1000"),
-        (np.where(np.arange(200 * 260) == 30_000, -5, np.nan).reshape(200, 260), "1 known truths, at least 1000"),
-        (np.full((200, 260), 500), "52000 of 52000 truths are outside the search range"),
+        (np.full((150, 200), np.nan), "0 known truths, at least 1000"),
+        (np.where(np.arange(150 * 200) == 20_000, -5, np.nan).reshape(150, 200), "1 known truths, at least 1000"),
+        (np.full((150, 200), 500), "30000 of 30000 truths are outside the search range"),
     ],
 )
 def test_calibrate__a_wrong_truth_is_one_line(scene, tmp_path, truth, words):
@@ -275,7 +276,7 @@ def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
     """Settings that cannot be compared are left out."""
     found = [("weak", {"sgm": {"p2": 10**6}}), ("stronger", {"sgm": {"p2": 64}})]
     monkeypatch.setattr(tune, "candidates", lambda own, with_network: found)
-    arguments = "calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml", "--tile-size", 128
+    arguments = "calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml", "--tile-size", 512
     result = invoke(*arguments)
     assert result.exit_code == 0, result.output
     assert "weak is left out: sgm.p2 is 1e+06, allowed" in result.output
@@ -287,12 +288,13 @@ def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
     result = invoke("match", *arguments, "--config", tmp_path / "tuned.yaml", "--quiet")
     assert result.exit_code == 0, result.output
     used = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
-    assert (used["sgm"]["p2"], used["interval"]["coverage"], used["tiles"]["size"]) == (64, 0.9, 128)
+    assert (used["sgm"]["p2"], used["interval"]["coverage"], used["tiles"]["size"]) == (64, 0.9, 512)
     assert used["interval"]["calibration"]["name"] == "stronger"
 
 
 def test_tune__a_name_and_quiet(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(tune, "candidates", lambda own, with_network: [("own settings", None)])
+    monkeypatch.setattr(measurement, "_RUNGS", 5)  # the levels do not matter here
     assert calibrated(scene, tmp_path / "tuned.yaml", "--tune", "--config", stronger(tmp_path))
     written = yaml.safe_load((tmp_path / "tuned.yaml").read_text())
     assert written["interval"]["calibration"]["name"] == "one"

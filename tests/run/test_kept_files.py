@@ -40,25 +40,25 @@ from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.tile import match_block
-from sat_intervals.show.maps import draw_overview
+from sat_intervals.show.profile import draw_profile
 from sat_intervals.show.report import write_report
 from sat_intervals.store.folder import LocalFolder
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 LOCK = ".sat-intervals.lock"
-VRT = """<VRTDataset rasterXSize="180" rasterYSize="150"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
+VRT = """<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
 <SourceFilename relativeToVRT="1">mask.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return make_scene(150, 180, seed=2)
+    return make_scene(80, 100, seed=2)
 
 
 @pytest.fixture
 def pair(scene, tmp_path):
-    """A folder with left.tif, right.tif, mask.tif, mask.vrt of it, and other.tif; and settings of nine tiles."""
+    """A folder with left.tif, right.tif, mask.tif, mask.vrt of it, and other.tif; and settings of four tiles."""
     write_layer(tmp_path / "other.tif", scene.right[::-1].copy(), 0, PLACE)
     write_layer(tmp_path / "mask.tif", np.zeros(scene.left.shape, np.uint8), 0, PLACE)
     (tmp_path / "mask.vrt").write_text(VRT)
@@ -101,7 +101,7 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
         right = folder / "link.tif"
         right.symlink_to("right.tif")
     before = (folder / "mask.tif").read_bytes()
-    write_layer(folder / "masked.tif", np.ones((150, 180), np.uint8), 0, PLACE)
+    write_layer(folder / "masked.tif", np.ones((80, 100), np.uint8), 0, PLACE)
     undone = True
 
     def progress(now, done, total):
@@ -161,7 +161,7 @@ def test_match_pair__knows_an_image_in_an_archive(pair, kind):
 def test_other_files__are_those_of_the_sources_of_a_virtual_raster_too(pair):
     folder, _ = pair
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(folder / "mask.tif", "r+") as file:
-        file.write_mask(np.full((150, 180), 255, np.uint8))
+        file.write_mask(np.full((80, 100), 255, np.uint8))
     assert other_files(str(folder / "mask.vrt")) == [str(folder / "mask.tif"), str(folder / "mask.tif.msk")]
 
 
@@ -499,7 +499,7 @@ def elsewhere(tmp_path):
         (precious / name).parent.mkdir(parents=True, exist_ok=True)
         (precious / name).write_text("{}")
     with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         yield precious, f"http://127.0.0.1:{server.server_address[1]}/store/tiles", asked
         server.shutdown()
@@ -557,7 +557,7 @@ def test_status__looks_into_the_store_that_is_named(pair):
         f"give --store {folder / 'store'}",
     )
     result = invoke("status", folder / "out", "--store", folder / "store")
-    assert (result.exit_code, "0 of 9 tiles done" in result.output) == (0, True), result.output
+    assert (result.exit_code, "0 of 4 tiles done" in result.output) == (0, True), result.output
 
 
 # A good run
@@ -682,14 +682,14 @@ def test_report_and_plot__replace_only_files_that_they_made(finished, name):
     assert (finished / "curve.png").read_text() == "of nobody's concern"
 
 
-@pytest.mark.parametrize("name", ["report.html", "overview.png"])
+@pytest.mark.parametrize("name", ["report.html", "profile.png"])
 def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, monkeypatch, name):
 
     def write():
         if name == "report.html":
             write_report(open_results(finished))
         else:
-            draw_overview(open_results(finished), finished / name, dpi=50)
+            draw_profile(open_results(finished), finished / name, 0, dpi=50)
 
     precious = tmp_path / "precious"
     precious.write_text("mine")
@@ -739,14 +739,14 @@ def killed(number, *arguments, **options):
         patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
         publishing.publish(*arguments)
 
-    def put_together(*arguments):
+    def assemble(*arguments):
         raise Killed
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
         patch.setattr("sat_intervals.raster.writer.publish", publish)
         if not number:
-            patch.setattr(OutputWriter, "put_together", put_together)
+            patch.setattr(OutputWriter, "assemble", assemble)
         with pytest.raises(Killed):
             match_pair(*arguments, **options)
 

@@ -1,23 +1,34 @@
 """Strips finished on workers: the same bytes from any of them, resumed part by part, whatever is killed or damaged."""
 
+import errno
 import shutil
 import signal
 import subprocess
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
 import pytest
 import rasterio
-from helpers import COMMAND, OUTPUTS, hashes, wait_until, write_pair
+from helpers import COMMAND, OUTPUTS, PLACE, hashes, invoke, wait_until, write_pair
 
+from sat_intervals.config import Cluster, load_config
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.match.memory import strip_bytes
 from sat_intervals.products import INVALID
-from sat_intervals.raster import OutputWriter
+from sat_intervals.raster import BLOCK, OutputError, OutputWriter, write_layer
 from sat_intervals.results import open_run
-from sat_intervals.run import strips
+from sat_intervals.run import copying, strips
+from sat_intervals.run.job import check_tiles, prepare
 from sat_intervals.run.pair import match_pair
+from sat_intervals.run.status import read_status
+from sat_intervals.store.local import LocalFolder
+from sat_intervals.store.tiles import DamagedTilesError
+from sat_intervals.tiling import Window
 
 # Four strips, two rows of the first overview and one of the second.
 HEIGHT, WIDTH, PARTS = 1600, 120, 7
@@ -27,15 +38,17 @@ HEIGHT, WIDTH, PARTS = 1600, 120, 7
 def tall(tmp_path_factory):
     """A pair and its settings; a run that kept its tiles."""
     folder = tmp_path_factory.mktemp("tall")
-    settings = write_pair(folder, make_scene(HEIGHT, WIDTH, seed=3), tiles={"size": 320}, cluster={"workers": 2})
+    part = make_scene(HEIGHT // 8, WIDTH, seed=3)
+    images = {name: np.tile(getattr(part, name), (8, 1)) for name in ("left", "right", "truth")}
+    settings = write_pair(folder, replace(part, **images), tiles={"size": 320}, cluster={"workers": 2})
     match_pair(folder / "left.tif", folder / "right.tif", folder / "kept", settings, keep_tiles=True)
     return folder, settings
 
 
-def matched(tall, out: Path, *, keep_tiles: bool = False, **sections):
+def matched(tall, out: Path, *, keep_tiles: bool = False, progress=lambda *how: None, **sections):
     folder, settings = tall
     more = settings | {"cluster": settings["cluster"] | sections.pop("cluster", {})} | sections
-    return match_pair(folder / "left.tif", folder / "right.tif", out, more, keep_tiles=keep_tiles)
+    return match_pair(folder / "left.tif", folder / "right.tif", out, more, keep_tiles=keep_tiles, progress=progress)
 
 
 def with_tiles(tall, out: Path) -> Path:
@@ -47,6 +60,14 @@ def with_tiles(tall, out: Path) -> Path:
 def parts(out: Path, kind: str = "*.json") -> dict[str, int]:
     """Times of the parts that are done, by name."""
     return {file.name: file.stat().st_mtime_ns for file in (out / "tiles" / "parts").glob(f"[!.]{kind}")}
+
+
+def damage(out: Path, name: str, how: str) -> None:
+    """Damage a file of the parts: ``0_1_half`` of the second strip."""
+    (file,) = (out / "tiles" / "parts").glob(f"*_{name}")
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.unlink() if how == "gone" else file.write_bytes(content if how == "bit" else content[:-9])
 
 
 def test_finish_strips__gives_the_counts_and_overviews_of_the_whole(tall):
@@ -93,33 +114,90 @@ def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, mon
 
 
 @pytest.mark.parametrize("by", ["workers", "command"])
-def test_copy_parts__gives_the_same_bytes_as_one_after_another(tall, tmp_path, monkeypatch, by):
-    copied, copy_part = [], strips.copy_part
-    monkeypatch.setattr(strips, "copy_part", lambda *part: (copied.append(part), copy_part(*part))[1])
+def test_assemble_files__gives_the_same_bytes_whoever_copies(tall, tmp_path, monkeypatch, by):
+    threads, outcomes = [], copying.Threads.outcomes
+
+    def counted(pool, tasks):
+        for outcome in outcomes(pool, tasks):
+            threads.append((pool._count, outcome.label))
+            yield outcome
+
+    monkeypatch.setattr(copying.Threads, "outcomes", counted)
     # a store of its own may be out of the workers' reach
     store = {} if by == "workers" else {"store": str(tmp_path / "store")}
-    matched(tall, tmp_path / "out", cluster=store)
-    assert len(copied) == (2 * PARTS if by == "workers" else 0)
+    done = []
+    matched(tall, tmp_path / "out", cluster=store | {"workers": 3}, progress=lambda *how: done.append(how))
+    copied = [count for count, label in threads if isinstance(label[-1], str)]
+    assert copied == 2 * PARTS * [3 if by == "workers" else 2]
+    assert [how for how in done if how[0] == "files"][:-2] == [("files", n, 2 * PARTS) for n in range(2 * PARTS + 1)]
     assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
 
 
 @pytest.mark.parametrize("how", ["gone", "bit"])
-def test_copy_part__meets_a_damaged_part_which_is_made_again(tall, tmp_path, monkeypatch, how):
+def test_assemble_files__makes_all_damaged_parts_again_at_once(tall, tmp_path, monkeypatch, caplog, how):
     out = with_tiles(tall, tmp_path / "out")
-    copy_part = strips.copy_part
+    assemble_files = copying.assemble_files
 
-    def damaged(job, codecs, place, kind, *rest):
+    def damaged(*arguments):
         if not (tmp_path / "done").exists():
             (tmp_path / "done").touch()
-            (file,) = (out / "tiles" / "parts").glob(f"*_{place[0]}_{place[1]}_{kind}")
-            content = bytearray(file.read_bytes())
-            content[len(content) // 2] ^= 4
-            file.unlink() if how == "gone" else file.write_bytes(content)
-        return copy_part(job, codecs, place, kind, *rest)
+            for name in ("0_1_intervals", "0_3_validity", "1_0_validity"):
+                damage(out, name, how)
+        assemble_files(*arguments)
 
-    monkeypatch.setattr(strips, "copy_part", damaged)
+    monkeypatch.setattr("sat_intervals.run.assemble.assemble_files", damaged)
+    matched(tall, out)
+    (warning,) = [record.getMessage() for record in caplog.records if "trying this now" in record.getMessage()]
+    assert all(name in warning for name in ("0_1_intervals", "0_3_validity", "1_0_validity"))
+    assert hashes(out) == hashes(tall[0] / "kept")
+
+
+@pytest.mark.parametrize("kind", ["half", "validity"])
+def test_match_pair__names_the_part_that_cannot_be_read(tall, tmp_path, monkeypatch, kind):
+    out = with_tiles(tall, tmp_path / "out")
+    read_bytes = LocalFolder.read_bytes
+
+    def failing(folder, name):
+        if name.startswith("parts/") and name.endswith(f"_0_1_{kind}"):
+            raise OSError(errno.EIO, "Input/output error", str(folder.path / name))
+        return read_bytes(folder, name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalFolder, "read_bytes", failing)
+        with pytest.raises(RunError, match=rf"^the part \w+_0_1_{kind} in \S+ cannot be read: Input/output error; rer"):
+            matched(tall, out, cluster={"retries": 0})
     matched(tall, out)
     assert hashes(out) == hashes(tall[0] / "kept")
+
+
+def test_match_pair__names_the_file_that_cannot_be_written(tall, tmp_path, monkeypatch):
+    def full(stream):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    out = with_tiles(tall, tmp_path / "out")
+    with monkeypatch.context() as patch:
+        patch.setattr(copying.os, "fsync", full)
+        message = r"out/intervals.tif cannot be written: No space left on device: .*; rerun the same command"
+        with pytest.raises(RunError, match=message):
+            matched(tall, out, cluster={"retries": 0})
+    matched(tall, out)
+    assert hashes(out) == hashes(tall[0] / "kept")
+
+
+@pytest.mark.parametrize(("key", "rows"), [((0, 3), "1536 to 1599"), ((1, 0), "0 to 1023"), ((2, 0), "0 to 1599")])
+def test_finish_strips__names_the_rows_that_could_not_be_finished(tall, tmp_path, monkeypatch, key, rows):
+    def failing(function):
+        def fail(job, codecs, place, *rest):
+            if place == key:
+                raise ValueError("no reason")
+            return function(job, codecs, place, *rest)
+
+        return fail
+
+    for name in ("finish_strip", "reduce_rows"):
+        monkeypatch.setattr(strips, name, failing(getattr(strips, name)))
+    with pytest.raises(RunError, match=f"^rows {rows} could not be finished: no reason; rerun the same command"):
+        matched(tall, with_tiles(tall, tmp_path / "out"))
 
 
 @pytest.mark.parametrize("kind", ["0_1_half", "1_0_intervals", "0_3_validity", "0_1.json"])
@@ -131,15 +209,12 @@ def test_finish_strips__makes_damaged_parts_again(tall, tmp_path, monkeypatch, k
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(OutputWriter, "put_together", stop)
+        patch.setattr(OutputWriter, "assemble", stop)
         with pytest.raises(KeyboardInterrupt):
             matched(tall, out)
-    (file,) = (out / "tiles" / "parts").glob(f"*_{kind}")
     if kind.endswith("half"):  # so that it is needed again
         next((out / "tiles" / "parts").glob("*_1_0.json")).unlink()
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 4
-    file.unlink() if how == "gone" else file.write_bytes(content if how == "bit" else content[:-9])
+    damage(out, kind, how)
     matched(tall, out)
     assert hashes(out) == hashes(tall[0] / "kept")
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
@@ -180,6 +255,102 @@ def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkey
     with pytest.raises(RunError, match=r"this worker compresses with .*'gdal'.*install the same version of rasterio"):
         matched(tall, out)
     assert not parts(out)
+
+
+# ---- Memory and space -------------------------------------------------------------------------------------------
+def wide_job(folder: Path, compression: str):
+    write_layer(folder / "wide.tif", np.ones((600, 5000), np.uint8), 0, PLACE)
+    settings = {"disparity": {"minimum": 0, "maximum": 3}, "products": {"compression": compression}}
+    return prepare(folder / "wide.tif", folder / "wide.tif", folder / "out", settings)
+
+
+@pytest.mark.parametrize("compression", ["deflate", "none"])
+def test_strip_bytes__bounds_what_writing_a_strip_takes(tmp_path, compression):
+    job = wide_job(tmp_path, compression)
+    noise = np.random.default_rng(0).integers(0, 1 << 10, (4, BLOCK, 5000))
+    rasters = noise.astype(np.float32) / 8, noise[:1].astype(np.uint16)
+    bands = sum(raster.nbytes for raster in rasters)
+    del noise
+    parts = strips.parts_of(job)
+    parts.folder.make("parts")
+    tracemalloc.start()
+    strips._write(job, parts, (0, 0), rasters, {})
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    most = strip_bytes(BLOCK, 5000, compression)
+    assert 0.5 * most < bands + peak < most
+
+
+def test_check_tiles__refuses_strips_that_do_not_fit(monkeypatch):
+    config, wide = (
+        load_config({"disparity": {"minimum": 0, "maximum": 3}, "tiles": {"size": 64}}),
+        Window(0, 0, 900, 99999),
+    )
+    monkeypatch.setattr("sat_intervals.match.memory.usable_memory", lambda: 2 * 10**9)
+    check_tiles(config.model_copy(update={"cluster": Cluster(workers=1)}), wide)
+    with pytest.raises(
+        SatIntervalsError, match=r"512 x 99999 pixels, 2 at once, need 3.1 GB, this process may use 2.0 GB"
+    ):
+        check_tiles(config.model_copy(update={"cluster": Cluster(workers=8)}), wide)
+    jobs = Cluster(kind="slurm", memory="2GB", cores=1)
+    check_tiles(config.model_copy(update={"cluster": jobs.model_copy(update={"memory": "3GB"})}), wide)
+    with pytest.raises(
+        SatIntervalsError, match=r"512 x 99999 pixels, 1 at once, need 18\d\d MB, but 1800 MB are given"
+    ):
+        check_tiles(config.model_copy(update={"cluster": jobs}), wide)
+
+
+@pytest.mark.parametrize(("compression", "needed"), [("deflate", "90.0"), ("none", "162.0")])
+def test_prepare__refuses_a_disk_without_room_for_parts_and_files(tmp_path, monkeypatch, compression, needed):
+    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=80 * 10**6))
+    with pytest.raises(OutputError, match=f"has 80.0 MB free, files and their parts may need {needed} MB"):
+        wide_job(tmp_path, compression)
+
+
+# ---- What stays -------------------------------------------------------------------------------------------------
+def test_drop__that_fails_does_not_fail_the_run(tall, tmp_path, monkeypatch, caplog):
+    def unreachable(parts):
+        raise OSError(errno.EIO, "unreachable")
+
+    monkeypatch.setattr(strips.Parts, "drop", unreachable)
+    matched(tall, tmp_path / "out", keep_tiles=True)
+    assert "parts of the files stay in" in caplog.text
+    assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
+
+
+def test_drop__leaves_tiles_only_and_the_parts_of_other_runs(tall, tmp_path, monkeypatch):
+    store = {"store": str(tmp_path / "store")}
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    for name, median in (("one", None), ("two", {"size": 3})):
+        with monkeypatch.context() as patch:
+            patch.setattr(OutputWriter, "assemble", stop)
+            with pytest.raises(KeyboardInterrupt):
+                matched(tall, tmp_path / name, cluster=store, median=median)
+    there = {file.name for file in tmp_path.glob("store/*/parts/*")}
+    assert len({name[:8] for name in there}) == 2
+    matched(tall, tmp_path / "one", cluster=store, keep_tiles=True)  # with another median than before
+    left = {file.name for file in tmp_path.glob("store/*/parts/*")}
+    assert left < there
+    assert len(left) == len(there) / 2
+    assert read_status(tmp_path / "two" / "tiles", store["store"]).strips_done == 4
+    assert read_status(tmp_path / "one" / "tiles", store["store"]).strips_done == 0
+
+
+def test_status__counts_strips(tall, tmp_path, monkeypatch):
+    out = with_tiles(tall, tmp_path / "out")
+    finish = strips.finish_strip
+
+    def first_only(job, codecs, key, *rest):
+        return finish(job, codecs, key, *rest) if key == (0, 0) else "not made"
+
+    monkeypatch.setattr(strips, "finish_strip", first_only)
+    with pytest.raises(DamagedTilesError):
+        matched(tall, out)
+    result = invoke("status", out)
+    assert "5 of 5 tiles done, 0 failed, 0 left, 1 of 4 strips done; no run is active" in result.output
 
 
 class Second:

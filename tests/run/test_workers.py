@@ -7,9 +7,12 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from helpers import hashes, wait_until, write_pair
 
+from sat_intervals import match_pair
 from sat_intervals.config import Cluster
-from sat_intervals.run import workers
+from sat_intervals.demo import make_scene
+from sat_intervals.run import tile, workers
 from sat_intervals.run.workers import Task, Threads, connected
 
 
@@ -68,3 +71,31 @@ def test_threads__need_neither_dask_nor_xarray(module):
     code = f"import sys, {module}; print(*{{'dask', 'distributed', 'xarray'}} & sys.modules.keys())"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.split() == []
+
+
+def test_computing__lets_one_more_thread_read_while_kernels_run(tmp_path, monkeypatch):
+    settings = write_pair(tmp_path, make_scene(140, 70, seed=1), tiles={"size": 64, "overlap": 10})
+    pair = tmp_path / "left.tif", tmp_path / "right.tif"
+    match_pair(*pair, tmp_path / "local", settings)
+    read_views, match_costed = tile.read_views, tile.match_costed
+    reads, at_work, most = [], [], []
+
+    def read(*arguments):
+        reads.append(threading.current_thread())
+        return read_views(*arguments)
+
+    def match(*arguments):
+        at_work.append(None)
+        most.append(len(at_work))
+        if len(most) == 1:
+            wait_until(lambda: len(set(reads)) == 2, "another tile is read meanwhile")
+        try:
+            return match_costed(*arguments)
+        finally:
+            at_work.pop()
+
+    monkeypatch.setattr(tile, "read_views", read)
+    monkeypatch.setattr(tile, "match_costed", match)
+    match_pair(*pair, tmp_path / "out", settings | {"cluster": {"workers": 1, "store": "memory://tiles"}})
+    assert max(most) == 1
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "local")

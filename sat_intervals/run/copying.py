@@ -1,0 +1,122 @@
+"""Copy the finished parts of a run into its files, on workers that share its folder, else in this process."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.progress import Progress
+from sat_intervals.raster import OutputWriter, Part, run_files
+from sat_intervals.run.job import Job
+from sat_intervals.run.strips import codecs_of, on_worker, rows_of_levels
+from sat_intervals.run.workers import Task, Threads, Workers, reason
+from sat_intervals.store.parts import PartKey
+from sat_intervals.store.tiles import DamagedTilesError
+
+# Threads of this process that copy parts which workers cannot copy: one reads while another writes.
+_THREADS = 2
+
+
+def assemble_files(
+    job: Job,
+    writer: OutputWriter,
+    records: Mapping[PartKey, Mapping[str, Any]],
+    workers: Workers | None,
+    progress: Progress,
+) -> None:
+    """Make the files of a run from its finished parts.
+
+    Parameters
+    ----------
+    job
+        The pair.
+    writer
+        Writes the files.
+    records
+        Records of all parts.
+    workers
+        Workers that are there, None without.
+    progress
+        Called after each part.
+
+    Raises
+    ------
+    DamagedTilesError
+        Names all damaged parts; they must be made again.
+    OutputError, RunError
+        A file cannot be written, or a part not be read.
+    """
+    files = run_files(job.config.products.compression)
+    damage: dict[str, None] = {}
+    copied, total = 0, len(files) * len(records)
+
+    def copy_parts(path: Path, parts: Sequence[tuple[int, Part]]) -> None:
+        nonlocal copied
+        for outcome in there.outcomes(_tasks(job, path, parts)):
+            if outcome is not None and outcome.error is not None:
+                if isinstance(outcome.error, (OSError, SatIntervalsError)):
+                    raise outcome.error
+                raise RunError(
+                    f"a part of {path} could not be copied: {reason(outcome.error)}; rerun the same command: it resumes"
+                ) from outcome.error
+            if outcome is not None:
+                copied += 1
+                damage.update({outcome.result: None} if outcome.result else {})
+            progress("files", copied, total)
+
+    progress("files", 0, total)
+    with _copiers(job, workers) as there:
+        for file in files:
+            levels = [
+                [_part(file.kind, (level, row), records[level, row]) for row in range(count)]
+                for level, count in enumerate(rows_of_levels(job))
+            ]
+            writer.assemble(file.name, levels, copy_parts)
+    if damage:
+        raise DamagedTilesError("; ".join(damage))
+
+
+@contextmanager
+def _copiers(job: Job, workers: Workers | None) -> Iterator[Workers]:
+    if workers is not None and job.store.elsewhere is None:
+        yield workers
+    else:
+        with closing(Threads(_THREADS)) as threads:
+            yield threads
+
+
+def _part(kind: str, key: PartKey, record: Mapping[str, Any]) -> Part:
+    return Part(record["blocks"][kind], record["files"][kind][1], (key, kind))
+
+
+def _tasks(job: Job, path: Path, parts: Sequence[tuple[int, Part]]) -> Iterator[Task]:
+    codecs, retries = codecs_of(job), job.config.cluster.retries
+    for offset, part in parts:
+        place = path, offset
+        yield Task(part.source, copy_part, (job, codecs, *part.source, (part.length, part.checksum), place), retries)
+
+
+def copy_part(
+    job: Job,
+    codecs: Mapping[str, Any],
+    key: PartKey,
+    kind: str,
+    file: tuple[int, int],
+    place: tuple[Path, int],
+) -> str | None:
+    """Write a part with a size and checksum into a file at an offset; return what is wrong if it is damaged."""
+    path, offset = place
+    with on_worker(job, codecs) as parts:
+        try:
+            content = parts.read(key, kind, file)
+        except DamagedTilesError as error:
+            return str(error)
+        # not for reading: NFS would write whole pages, over bytes of the neighbours
+        with open(os.open(path, os.O_WRONLY), "wb") as stream:
+            stream.seek(offset)
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+    return None
