@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from types import NoneType
@@ -39,14 +40,20 @@ GALLERY = (
 def adapted(text: str) -> str:
     """Adapt the links of a document, which are those of the repository, to the pages of the site.
 
-    A picture is a link to itself, in full size.
+    A picture is a link to itself, in full size. Long commands are folded.
     """
     text = re.sub(r"\[(?:docs/)?(\w+)\.md\]\(", r"[\1](", text)
     text = re.sub(r"\]\((?:\.\./)?README\.md", "](index.md", text)
     text = re.sub(r"\]\((?:\.\./)?docs/", "](", text)
     text = re.sub(r"\]\((?:\.\./)?\.github/pictures/", "](pictures/", text)
     text = re.sub(r"!\[([^\]]*)\]\(([^)]*)\)", r"[![\1](\2)](\2)", text)
+    text = re.sub(r"^(?:sat-intervals|otbcli_|parallel_stereo)[^#|'\"\n]{78,}$", folded, text, flags=re.MULTILINE)
     return text.replace("](../", "](")
+
+
+def folded(command: re.Match[str]) -> str:
+    """Return a long command on several lines, as a shell reads it."""
+    return " \\\n".join(textwrap.wrap(command[0], 76, break_on_hyphens=False, subsequent_indent="    "))
 
 
 def settings_reference() -> str:

@@ -216,4 +216,8 @@ def test_site__has_a_page_for_every_document_and_every_setting() -> None:
         == "[a](METHOD.md#1) [b](x.md) [c](index.md)"
     )
     assert site.adapted("[docs/x.md](docs/x.md#y)") == "[x](x.md#y)"
+    long = "sat-intervals match left.tif right.tif " + " ".join(["--left-mask mask.tif"] * 5)
+    lines = site.adapted(long).split(" \\\n")
+    assert [len(line) <= 80 for line in lines] == [True, True]
+    assert " ".join(line.strip() for line in lines) == long
     assert site.adapted("![a](.github/pictures/b.png)") == "[![a](pictures/b.png)](pictures/b.png)"
