@@ -18,10 +18,12 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: Settings, run: Run) -
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
-    sgm.p2. A failed pair does not stop the others. OUT/batch.json has the state of each pair; the exit status is 1 if
-    any failed.
+    sgm.p2. Rows with left_model, right_model, left_grid, right_grid and resolution go on to a surface model, as
+    `surface` does. A failed pair does not stop the others. OUT/batch.json has the state of each pair; the exit status
+    is 1 if any failed.
     """
     from sat_intervals.cli.console import Console
+    from sat_intervals.cli.surface import surfaces_of
     from sat_intervals.config.pairs import REPORT, read_batch
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.batch import match_batch
@@ -37,6 +39,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: Settings, run: Run) -
             overwrite=run.overwrite,
             keep_tiles=run.keep_tiles,
             progress=console.progress,
+            finish=surfaces_of(rows, out, console),
         )
     if as_json:
         say_json(report)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.calibrate_dsm import Heights, height_options, show_heights
 from sat_intervals.cli.judging import tolerance_option
 from sat_intervals.cli.matching import Settings, settings_options
 from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
@@ -27,11 +28,16 @@ _SETTINGS = """\
 # Settings with their calibration, found by sat-intervals calibrate --tune.
 # Use them with: sat-intervals match LEFT RIGHT OUT --disparity MIN MAX --config FILE
 """
-_HEADS = _CALIBRATION, _SETTINGS
+_HEIGHTS = """\
+# Calibration of heights: metres that widen the intervals of a surface model, found by sat-intervals calibrate --dsm.
+# Use it with: sat-intervals dsm OUT --calibration FILE, with the options that the surface was made with.
+# `below`: end of a class of interval widths; `margin`: both bounds move outwards by it, inwards if negative (metres).
+"""
+_HEADS = _CALIBRATION, _SETTINGS, _HEIGHTS
 
 
 @click.command(short_help="Find the levels that reach a coverage, on pairs with known truth.")
-@click.argument("pairs", nargs=-1, required=True, type=_FILE)
+@click.argument("pairs", nargs=-1, type=_FILE)
 @click.option("--output", callback=path, required=True, metavar="FILE", help="Calibration to write (YAML).")
 @click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order.")
 @tolerance_option
@@ -43,6 +49,7 @@ _HEADS = _CALIBRATION, _SETTINGS
 @click.option(
     "--tune", is_flag=True, help="Compare presets and penalties; write the best as settings for match --config."
 )
+@height_options
 @json_option
 @settings_options
 @quiet_option
@@ -53,6 +60,7 @@ def calibrate(
     truth: tuple[Path, ...],
     name: str | None,
     tune: bool,
+    heights: Heights | None,
     settings: Settings,
     as_json: bool,
     quiet: bool,
@@ -70,7 +78,16 @@ def calibrate(
 
     The table shows what to expect: figures of each pair with the levels found on the others, means over pairs. A single
     pair is judged in 16 blocks.
+
+    With --dsm: find the metres that the intervals of a surface model need to contain its coverage, or --coverage, of
+    the heights of --reference. Use them with: dsm --calibration FILE.
     """
+    if heights is not None:
+        heights.check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
+        _calibrate_heights(heights, output, name, settings, as_json, quiet)
+        return
+    if not pairs:
+        raise click.UsageError("give PAIRS, or --dsm and --reference.")
     if "interval" in settings.sections:
         raise click.UsageError("--coverage and --calibration are options of match: leave them out.")
     from sat_intervals.cli.console import Console
@@ -202,6 +219,26 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
 
     with whole_file(output) as new:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
+
+
+def _calibrate_heights(
+    heights: Heights, output: Path, name: str | None, settings: Settings, as_json: bool, quiet: bool
+) -> None:
+    """Calibrate the intervals of a surface model, and write and print their margins."""
+    from sat_intervals.evaluate.calibration import calibrate_surface
+    from sat_intervals.raster.identity import check_not_replaced
+
+    check_not_replaced([heights.dsm, heights.reference], [output])
+    _checked_folder(output)
+    coverage = settings.sections.get("interval", {}).get("coverage")
+    files = heights.dsm, heights.reference
+    calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=heights.registers)
+    _write(output, _HEIGHTS, calibration.model_dump(mode="json"))
+    if as_json:
+        say_json(calibration.model_dump(mode="json"))
+    elif not quiet:
+        show_heights(calibration)
+        click.echo(str(output))
 
 
 def _tune(

@@ -50,18 +50,24 @@ _CELL_OPTIONS = (
 
 
 def cell_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`."""
+    """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`.
+
+    A `calibration_option` goes with it.
+    """
 
     @wraps(command)
     def with_cells(**given: Any) -> Any:
         of_choices = ("bounds", "keeps_open", "outliers", "max_width", "min_confidence")
         choices = {name: given.pop(name) for name in of_choices}
+        calibration = given.pop("height_calibration")
         cells = {name: given.pop(name) for name in ("resolution", "crs", "radius", "geoid")}
         like = given.pop("grid_like")
         if (like is None) == (cells["resolution"] is None):
             raise click.UsageError("give either --resolution or --grid-like.")
+        from sat_intervals.config import load_height_calibration
         from sat_intervals.heights.choices import SurfaceChoices
 
+        choices["calibration"] = calibration and load_height_calibration(calibration)
         cells |= {"resolution": like or cells["resolution"], "choices": SurfaceChoices(**choices)}
         return command(cells=cells, **given)
 
@@ -70,18 +76,30 @@ def cell_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return with_cells
 
 
+def calibration_option(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return an option for the calibration that `cell_options` reads."""
+    return click.option(
+        *names,
+        "height_calibration",
+        callback=path,
+        metavar="FILE",
+        help="Calibration of heights by calibrate --dsm, which moves the bounds.",
+    )
+
+
 def say_surface(console: "Console", report: dict[str, Any]) -> None:
     """Print what a surface has: cells, filled share, half widths, and what was left out."""
-    from sat_intervals.heights.dsm import WIDE
+    from sat_intervals.heights.cells import WIDE
 
     console.say(
         f"{report['rows']} x {report['columns']} cells in {report['crs']} from {report['points']} points, "
         f"{100 * report['filled']:.1f} % with a height"
     )
     if report["median_half_width"] is not None:
+        by = f", calibration {report['calibration']}" if report["calibration"] else ""
         console.say(
             f"median half width +-{report['median_half_width']:.2f} m, {100 * report['wide']:.1f} % wider than "
-            f"+-{WIDE:g} m, by --bounds {report['bounds']}"
+            f"+-{WIDE:g} m, by --bounds {report['bounds']}{by}"
         )
     for name, what in (
         ("outliers", "points left out as outliers"),
@@ -99,6 +117,7 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 @click.command(short_help="Make a surface model with height intervals from one or several runs.")
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @cell_options
+@calibration_option("--calibration")
 @click.option(
     "--output",
     callback=path,
@@ -115,8 +134,8 @@ def dsm(outs: tuple[Path, ...], cells: dict[str, Any], output: Path | None, as_j
     unless --geoid is given. A point contributes to its cell and to cells whose centre is within --radius. Other cells
     are no data.
 
-    Where several OUT overlap, the intervals are intersected if they overlap. Else their hull is written and agreement
-    is 0.
+    Where several OUT overlap, their intervals are averaged, narrow ones with the most weight. Where they do not meet,
+    their hull is written and agreement is 0.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.dsm import make_surface

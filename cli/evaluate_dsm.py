@@ -105,7 +105,8 @@ def surface_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def _drawn(given: Surface, folder: Path, report: dict[str, Any]) -> list[Path]:
     """Write figures and pictures of a surface model to a folder; return their paths."""
     from sat_intervals.cli.tables import surface_markdown
-    from sat_intervals.evaluate.dsm import moved_by, open_comparison, read_profile
+    from sat_intervals.evaluate.comparison import moved_by, open_comparison
+    from sat_intervals.evaluate.dsm import read_profile
     from sat_intervals.raster import whole_file
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
     from sat_intervals.show.marks import check_made_here

@@ -1,13 +1,20 @@
 """``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.dsm import cell_options, say_surface
+from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
 from sat_intervals.cli.matching import Pair, Run, Settings, pair_options, run_options, search_options
 from sat_intervals.cli.options import json_option, path, say_json, sensor_options
+
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
+    from sat_intervals.config import Interval
+    from sat_intervals.config.pairs import PairOfBatch
+    from sat_intervals.run.batch import Finish
 
 
 @click.command(short_help="Match a pair, triangulate it and make a surface model.")
@@ -16,6 +23,7 @@ from sat_intervals.cli.options import json_option, path, say_json, sensor_option
 @click.argument("out", callback=path)
 @sensor_options
 @cell_options
+@calibration_option("--height-calibration")
 @json_option
 @run_options
 def surface(
@@ -40,7 +48,7 @@ def surface(
         from sat_intervals.heights.triangulate import triangulate
         from sat_intervals.run.before import report_before
 
-        _check(out, cells, sensor_files, settings.file)
+        _check(out, cells, sensor_files, settings.file, config.interval)
         left, right = pair.open()
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
@@ -55,9 +63,15 @@ def surface(
     run.check_strict(report["warnings"])
 
 
-def _check(out: Path, cells: dict[str, Any], sensor_files: tuple[Path, Path, Path, Path], config: Path | None) -> None:
+def _check(
+    out: Path,
+    cells: dict[str, Any],
+    sensor_files: Sequence[str | Path],
+    config: Path | None,
+    interval: "Interval | None",
+) -> None:
     """Raise for what the later steps cannot use, before hours of matching."""
-    from sat_intervals.heights.dsm import checked_cells
+    from sat_intervals.heights.dsm import checked_cells, surface_tags
     from sat_intervals.heights.sensors import Sensors
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS
@@ -65,5 +79,32 @@ def _check(out: Path, cells: dict[str, Any], sensor_files: tuple[Path, Path, Pat
     results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
     like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
     check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
-    checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
-    Sensors.load(*sensor_files)
+    _, cell, _, radius = checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
+    surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
+    Sensors.load(*map(Path, sensor_files))
+
+
+def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish":
+    """Return a function that makes the surface model of a pair of a batch, if its row asks for one.
+
+    Models and grids are read now, before hours of matching.
+    """
+    from sat_intervals.heights.choices import SurfaceChoices
+
+    cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
+    for pair in pairs:
+        if pair.sensors:
+            _check(out / pair.name, {"resolution": pair.resolution, **cells}, pair.sensors, None, None)
+
+    def surface_of(pair: "PairOfBatch") -> dict[str, Any]:
+        from sat_intervals.heights.dsm import make_surface
+        from sat_intervals.heights.triangulate import triangulate
+
+        folder = out / pair.name
+        if not pair.sensors or not pair.resolution:
+            return {}
+        triangulate(folder, *pair.sensors, console.progress)
+        made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
+        return {"surface": made}
+
+    return surface_of

@@ -56,3 +56,9 @@ def cameras(folder, rows, columns, longitude=LONGITUDE, views=VIEWS):
         grid(folder / "left_grid.tif", rows, columns),
         grid(folder / "right_grid.tif", rows, columns),
     ]
+
+
+def sensor_words(files):
+    """Return the options of a command that name these models and grids."""
+    options = "--left-model", "--right-model", "--left-grid", "--right-grid"
+    return [word for pair in zip(options, files, strict=True) for word in pair]

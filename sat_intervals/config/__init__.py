@@ -1,6 +1,12 @@
 """Settings: defaults, ranges, one-line descriptions and derived thresholds."""
 
 from sat_intervals.config.calibration import Calibration, calibration_of, key_of, load_calibration, resolved, unreached
+from sat_intervals.config.height_calibration import (
+    HeightCalibration,
+    WidthClass,
+    load_height_calibration,
+    surface_key,
+)
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
@@ -27,6 +33,7 @@ __all__ = [
     "ConfigError",
     "CosineSgm",
     "Disparity",
+    "HeightCalibration",
     "Interval",
     "InverseSgm",
     "Mccnn",
@@ -34,12 +41,15 @@ __all__ = [
     "NegativeSgm",
     "Regularization",
     "Sgm",
+    "WidthClass",
     "allowed",
     "calibration_of",
     "key_of",
     "load_calibration",
     "load_config",
+    "load_height_calibration",
     "preset_text",
     "resolved",
+    "surface_key",
     "unreached",
 ]

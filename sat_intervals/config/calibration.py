@@ -9,7 +9,7 @@ from functools import cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -26,11 +26,30 @@ COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.975, 0.99)
 _MAKE_ONE = "make one with sat-intervals calibrate and give it by --calibration"
 
 
-class _Model(BaseModel):
+# Keys of settings that no calibration has.
+SETTINGS = {"preset", "disparity", "cost", "sgm", "interval"}
+
+
+class StrictModel(BaseModel):
+    """Content of a file, without conversions and further keys."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class Levels(_Model):
+_Model = TypeVar("_Model", bound=StrictModel)
+
+
+class CalibrationFile(StrictModel):
+    """A calibration of disparities or of heights."""
+
+    @property
+    def sha256(self) -> str:
+        """Return the digest of the content, without provenance."""
+        content = self.model_dump(mode="json", exclude={"provenance"})
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+class Levels(StrictModel):
     """Levels that intervals are cut at, and the quantile of their regularisation.
 
     Attributes
@@ -54,7 +73,7 @@ class Levels(_Model):
     reached: bool = True
 
 
-class Calibration(_Model):
+class Calibration(CalibrationFile):
     """Levels for each of COVERAGES, and what they belong to.
 
     Attributes
@@ -93,12 +112,6 @@ class Calibration(_Model):
                     )
         return rows
 
-    @property
-    def sha256(self) -> str:
-        """Return the digest of the content, without provenance."""
-        content = self.model_dump(mode="json", exclude={"provenance"})
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
 
 def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calibration") -> Calibration:
     """Read and check a calibration: the name of a built-in one, a YAML file, or its content.
@@ -111,7 +124,7 @@ def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calib
     if isinstance(source, Calibration):
         return source
     if isinstance(source, Mapping):
-        return _checked(source, "calibration")
+        return checked(Calibration, source, "calibration")
     if not isinstance(source, str | os.PathLike):
         raise ConfigError(f"calibration is {source!r}, allowed: a file, the name of a built-in one, or its content")
     file = dict(_built_in_files()).get(str(source), Path(source))
@@ -120,14 +133,17 @@ def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calib
     except OSError as error:
         known = ", ".join(name for name, _ in _built_in_files()) or "none"
         raise ConfigError(f"calibration {file}: {error.strerror} (built in: {known}): {_MAKE_ONE}") from error
-    if "levels" not in values and values.keys() & {"preset", "disparity", "cost", "sgm", "interval"}:
+    if "classes" in values:
+        raise ConfigError(f"{file} is a calibration of heights: give it to dsm --calibration")
+    if "levels" not in values and values.keys() & SETTINGS:
         raise ConfigError(f"{file} has settings, not a calibration: give it by --config")
-    return _checked(values, str(file))
+    return checked(Calibration, values, str(file))
 
 
-def _checked(values: Mapping[str, Any], where: str) -> Calibration:
+def checked(model: type[_Model], values: Mapping[str, Any], where: str) -> _Model:
+    """Return the content of a file; raise `ConfigError` in one line that names the file and the first error."""
     try:
-        return Calibration.model_validate(dict(values))
+        return model.model_validate(dict(values))
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         place = ".".join(map(str, problem["loc"]))
@@ -180,18 +196,18 @@ def calibration_of(config: "Config") -> Calibration:
     assert config.interval is not None
     given, key = config.interval.calibration, key_of(config)
     if isinstance(given, Calibration):
-        if different := _differences(given.key, key):
+        if different := differences(given.key, key):
             raise ConfigError(f"calibration {given.name} belongs to other settings, {different[0]}: {_MAKE_ONE}")
         return given
     names = [name for name, _ in _built_in_files()]
     for name in sorted(names, key=lambda name: name != config.preset):  # that of the preset first: reading takes 20 ms
         if (calibration := _built_in(name)).key == key:
             return calibration
-    differences = {name: _differences(_built_in(name).key, key) for name in names}
-    nearest = min(names, key=lambda name: len(differences[name]))
+    different_of = {name: differences(_built_in(name).key, key) for name in names}
+    nearest = min(names, key=lambda name: len(different_of[name]))
     raise ConfigError(
         f"no built-in calibration belongs to these settings (that of {nearest} is the nearest: "
-        f"{', '.join(differences[nearest][:3])}): {_MAKE_ONE}"
+        f"{', '.join(different_of[nearest][:3])}): {_MAKE_ONE}"
     )
 
 
@@ -200,7 +216,7 @@ def _built_in(name: str) -> Calibration:
     return load_calibration(name)
 
 
-def _differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     """Return the differences of two keys in words."""
     one, other = _flat(there), _flat(here)
     found = []

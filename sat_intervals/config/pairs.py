@@ -27,6 +27,7 @@ _RESERVED = (REPORT, "logs")
 _LONGEST_NAME = 200
 _IMAGES = ("left", "right", "left_mask", "right_mask")
 _READING = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
+_SENSORS = ("left_model", "right_model", "left_grid", "right_grid")
 # YAML nodes allowed in a list of pairs, which may have thousands of rows.
 _NODES = 200_000
 
@@ -54,7 +55,8 @@ class PairOfBatch:
     """One row of a batch: name, images, and the pair's own settings as nested sections.
 
     ``reading`` may have ``nodata`` and ``band`` for both images, ``left_nodata`` and so on for one; ``window`` is the
-    region of the left image to match: row, column, height, width.
+    region of the left image to match: row, column, height, width. ``sensors`` are the models and grids of left and
+    right, and ``resolution`` the side of a cell in metres, of a pair whose surface model is made too.
     """
 
     name: str
@@ -65,6 +67,8 @@ class PairOfBatch:
     settings: Mapping[str, Any] = field(default_factory=dict)
     reading: Mapping[str, Any] = field(default_factory=dict)
     window: tuple[int, int, int, int] | None = None
+    sensors: tuple[str, str, str, str] | None = None
+    resolution: float | None = None
 
 
 def is_pair(path: Path) -> bool:
@@ -98,8 +102,9 @@ def read_batch(file: Path) -> list[PairOfBatch]:
     """Read the pairs of a batch from a CSV, YAML or JSON file.
 
     A row has ``name``, ``left`` and ``right``; ``minimum`` and ``maximum``, the search range; ``left_mask`` and
-    ``right_mask``; ``nodata`` and ``band``, or ``left_nodata`` and so on; ``window``; and any setting under its dotted
-    name, such as ``sgm.p2``. YAML and JSON hold a list of such rows, in which a setting may also be a section. Paths
+    ``right_mask``; ``nodata`` and ``band``, or ``left_nodata`` and so on; ``window``; ``left_model``, ``right_model``,
+    ``left_grid``, ``right_grid`` and ``resolution`` for a surface model; and any setting under its dotted name, such as
+    ``sgm.p2``. YAML and JSON hold a list of such rows, in which a setting may also be a section. Paths
     are relative to the file.
 
     Raises
@@ -195,16 +200,29 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
         raise SatIntervalsError(
             f"{place}: name {name!r} cannot be a folder's name: choose another of at most {_LONGEST_NAME} bytes"
         )
-    images = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
+    images: dict[str, Any] = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
     reading = {key: _number(place, key, row.pop(key)) for key in _READING if key in row}
     window = _window(place, row.pop("window")) if "window" in row else None
+    surface = _surface(place, row, file)
     settings: dict[str, Any] = {}
     for key, value in row.items():
         try:
             _set(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
         except (ValueError, RecursionError, yaml.YAMLError) as error:
             raise SatIntervalsError(f"{place}: {key} is {value!r}: {' '.join(str(error).split())}") from error
-    return PairOfBatch(name, settings=settings, reading=reading, window=window, **images)
+    return PairOfBatch(name, settings=settings, reading=reading, window=window, **images, **surface)
+
+
+def _surface(place: str, row: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Take what a surface model needs out of a row, all or nothing."""
+    needed = (*_SENSORS, "resolution")
+    given = {key: row.pop(key) for key in needed if key in row}
+    if not given:
+        return {}
+    if missing := [key for key in needed if key not in given]:
+        raise SatIntervalsError(f"{place} lacks {' and '.join(missing)}: a surface needs {', '.join(needed)}")
+    resolution = _number(place, "resolution", given.pop("resolution"))
+    return {"sensors": tuple(_relative_to(file, str(name)) for name in given.values()), "resolution": resolution}
 
 
 def _number(place: str, key: str, value: Any) -> int | float:

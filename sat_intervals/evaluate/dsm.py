@@ -1,7 +1,5 @@
 """Evaluate a surface model and its intervals against reference heights, tile by tile."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,24 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import LARGEST, Accuracy, Errors
-from sat_intervals.kernels.registration import REACH, Blocks, Registration, register
-from sat_intervals.raster import (
-    Georeferencing,
-    check_reference,
-    is_surface,
-    read_heights,
-    read_layers,
-    read_place,
-    read_small_layers,
-    read_tags,
-    resolution_of,
+from sat_intervals.evaluate.accuracy import Accuracy, Errors
+from sat_intervals.evaluate.comparison import (
+    Comparison,
+    check_common,
+    compared,
+    moved_by,
+    open_comparison,
+    registered,
+    tiles,
 )
+from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.raster.identity import watched
-from sat_intervals.tiling import Grid, Window
+from sat_intervals.tiling import Window
 
-# Heights evaluated at a time, some hundred bytes each.
-_TILE = 1 << 20
 # Limits of classes: slope of the reference in degrees, width of the interval in metres.
 SLOPES = (0.0, 5.0, 15.0, 30.0, 45.0, 90.0)
 WIDTHS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, np.inf)
@@ -34,65 +28,6 @@ WIDTHS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, np.inf)
 _MOST_CLASSES = 64
 # Samples of a profile, and of those read at a time.
 _SAMPLES, _AT_ONCE = 4000, 256
-# Blocks of each side that register, their sides in cells, and points of a block.
-_BLOCKS, _SMALLEST, _LARGEST_BLOCK, _POINTS = 8, 16, 256, 1000
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A surface model and its reference.
-
-    Attributes
-    ----------
-    surface, reference
-        The files.
-    shape, place
-        Size and georeferencing of the surface.
-    finer
-        Heights of the reference along a cell.
-    shift
-        Metres by which the reference is moved: easting, northing, height.
-    """
-
-    surface: Path
-    reference: Path
-    shape: tuple[int, int]
-    place: Georeferencing
-    finer: int
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def cell(self) -> float:
-        """Return the side of a cell in metres."""
-        assert self.place.pixel_size is not None
-        return self.place.pixel_size[0]
-
-    def heights(self, window: Window, finer: int = 1, *, smooth: bool = False) -> np.ndarray:
-        """Read the moved reference in a window of cells, which may reach beyond the surface, ``finer`` per side."""
-        east, north, up = self.shift
-        part = self.place.shifted(window).moved(-east, -north).refined(finer)
-        shape = finer * window.height, finer * window.width
-        smooth = smooth or (east, north) != (0.0, 0.0)
-        return np.asarray(read_heights(self.reference, part, shape, Window(0, 0, *shape), smooth=smooth) + up)
-
-
-def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
-    """Open a surface model and its reference.
-
-    Raises
-    ------
-    SatIntervalsError
-        A file cannot be read or used.
-    """
-    surface, reference = Path(surface), Path(reference)
-    shape, place = read_place(surface)
-    if not is_surface(surface):
-        raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: is it the --reference?")
-    read_place(reference)
-    check_reference(reference, surface)
-    assert place.pixel_size is not None
-    finer = max(1, round(place.pixel_size[0] / resolution_of(reference, place)))
-    return Comparison(surface, reference, shape, place, finer)
 
 
 def nominal_of(surface: Path) -> float | None:
@@ -136,13 +71,14 @@ def evaluate_surface(
     nominal = nominal_of(given.surface)
     if classes is not None:
         read_place(Path(classes))
-    found = _registered(given) if registers else None
+    found = registered(given) if registers else None
     moved = moved_by(given, found and found.report())
     before, whole = Accuracy(nominal), Accuracy(nominal)
     slopes, widths = ([Accuracy(nominal) for _ in ends[1:]] for ends in (SLOPES, WIDTHS))
     kinds: dict[int, Accuracy] = {}
-    for window in _tiles(given):
-        errors, slope, known = _compared(moved, window)
+    for window in tiles(given):
+        errors, known = _errors(moved, window)
+        slope = _slope(moved, window)[known]
         whole.add(errors)
         for group, ends, values in ((slopes, SLOPES, slope), (widths, WIDTHS, errors.width)):
             for kind, (first, last) in zip(group, pairwise(ends), strict=True):
@@ -150,14 +86,15 @@ def evaluate_surface(
         if classes is not None:
             _add_classes(kinds, errors, _classes(given, Path(classes), window)[known], Path(classes), nominal)
         if moved is not given:
-            before.add(_compared(given, window)[0])
+            before.add(_errors(given, window)[0])
     check_unchanged()
     report = whole.report()
-    _check_common(given, before.report() if moved is not given else report)
+    in_place = before.report() if moved is not given else report
+    check_common(given, in_place["count"], in_place["median"])
     return {
         "nominal": nominal,
         "registration": found and found.report(),
-        "before": before.report() if moved is not given else report,
+        "before": in_place,
         "all": report,
         "slope": _by(slopes, SLOPES),
         "width": _by(widths, WIDTHS),
@@ -165,40 +102,11 @@ def evaluate_surface(
     }
 
 
-def moved_by(given: Comparison, registration: dict[str, Any] | None) -> Comparison:
-    """Return a comparison with the reference moved by the registration of a report."""
-    return given if registration is None else replace(given, shift=tuple(registration["shift"]))
-
-
-def _check_common(given: Comparison, report: dict[str, Any]) -> None:
-    if not report["count"]:
-        raise SatIntervalsError(
-            f"no cell of {given.surface} has a height in {given.reference}: give a reference of the same place"
-        )
-    if abs(report["median"]) >= LARGEST:
-        raise SatIntervalsError(
-            f"the heights of {given.surface} and {given.reference} differ by {LARGEST} m or more in the median: check "
-            "that both are metres above the same datum"
-        )
-
-
-def _tiles(given: Comparison) -> Iterator[Window]:
-    """Yield square tiles: windows of whole rows would read the blocks of a fine reference many times."""
-    side = max(1, int(_TILE**0.5) // given.finer)
-    return (tile.core for tile in Grid(Window(0, 0, *given.shape), side))
-
-
-def _compared(given: Comparison, window: Window) -> tuple[Errors, np.ndarray, np.ndarray]:
-    """Return the errors of a tile, the slopes of the reference there, and which heights of the tile they are."""
-    finer = given.finer
-    height, lower, upper = (
-        np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
-        for band in read_layers(given.surface, window)[:3].astype(np.float64)
-    )
-    truth, slope = given.heights(window, finer), _slope(given, window)
-    known = np.isfinite(truth) & np.isfinite(height)
-    missed = np.maximum(np.maximum(lower - truth, truth - upper), 0)
-    return Errors((height - truth)[known], (upper - lower)[known], missed[known]), slope[known], known
+def _errors(given: Comparison, window: Window) -> tuple[Errors, np.ndarray]:
+    """Return the errors of a tile, and which heights of the tile they are."""
+    height, lower, upper, reference, known = compared(given, window)
+    missed = np.maximum(np.maximum(lower - reference, reference - upper), 0)
+    return Errors(height - reference, upper - lower, missed), known
 
 
 def _slope(given: Comparison, window: Window) -> np.ndarray:
@@ -237,33 +145,6 @@ def _by(classes: list[Accuracy], ends: tuple[float, ...]) -> list[dict[str, Any]
         {"from": first, "to": None if np.isinf(last) else last, **kind.report()}
         for kind, (first, last) in zip(classes, pairwise(ends), strict=True)
     ]
-
-
-def _registered(given: Comparison) -> Registration | None:
-    """Return the shift from the reference to the surface; None with too few heights."""
-    side = min(_LARGEST_BLOCK, max(_SMALLEST, min(given.shape) // _BLOCKS))
-    grid = Grid(Window(0, 0, *given.shape), side)
-    size = side + 2 * (REACH + 1)
-    surfaces: list[np.ndarray] = []
-    parts: list[tuple[np.ndarray, ...]] = []
-    rows, columns = (range(0, count, -(-count // _BLOCKS)) for count in (grid.rows, grid.columns))
-    for core in (grid.tile(row, column).core for row in rows for column in columns):
-        height = read_layers(given.surface, core)[0].astype(np.float64)
-        row, column = np.nonzero(np.isfinite(height))
-        if not row.size:
-            continue
-        chosen = slice(None, None, -(-row.size // _POINTS))
-        row, column = row[chosen], column[chosen]
-        around = Window(core.row - REACH - 1, core.column - REACH - 1, size, size)
-        surface = given.heights(around, smooth=True)
-        if np.isfinite(surface).any():
-            places = (column + REACH + 1.0, row + REACH + 1.0, height[row, column])
-            parts.append((np.full(row.size, len(surfaces)), *places))
-            surfaces.append(surface.astype(np.float32))
-    if not parts:
-        return None
-    block, x, y, heights = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return register(Blocks(np.stack(surfaces), given.cell, block, x, y, heights, 1))
 
 
 class Profile(NamedTuple):

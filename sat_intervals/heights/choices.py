@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from sat_intervals.config import HeightCalibration, Interval
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.results import Run
 
 Bounds = Literal["envelope", "mean", "median", "nearest", "agreeing"]
 BOUNDS = "envelope", "mean", "median", "nearest", "agreeing"
@@ -30,6 +30,8 @@ class SurfaceChoices:
         Leave out cells with a wider interval (metres).
     min_confidence
         Leave out cells of lower confidence, 0 to 1.
+    calibration
+        Margins that widen or narrow the intervals, before wide ones are left out; None: none.
     """
 
     bounds: Bounds | None = None
@@ -37,6 +39,7 @@ class SurfaceChoices:
     outliers: float | None = None
     max_width: float | None = None
     min_confidence: float | None = None
+    calibration: HeightCalibration | None = None
 
     def __post_init__(self) -> None:
         if self.bounds is not None and self.bounds not in BOUNDS:
@@ -47,9 +50,8 @@ class SurfaceChoices:
         if self.min_confidence is not None and not 0 <= self.min_confidence <= 1:
             raise SatIntervalsError(f"min_confidence is {self.min_confidence:g}: give one from 0 to 1")
 
-    def for_runs(self, runs: Sequence[Run]) -> "SurfaceChoices":
-        """Return the choices with the defaults of these runs, which depend on whether all have a coverage."""
-        intervals = [run.config.interval for run in runs]
+    def for_intervals(self, intervals: Sequence[Interval | None]) -> "SurfaceChoices":
+        """Return the choices with the defaults of runs, which depend on whether all have a coverage."""
         covered = all(interval is not None and interval.coverage is not None for interval in intervals)
         return replace(
             self,

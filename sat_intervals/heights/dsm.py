@@ -1,55 +1,29 @@
 """Make a surface model with height intervals from the points of one or several runs.
 
-Cells are computed in tiles, each from the points near it, so memory depends on the tile only. A point contributes to
-the cell that contains it and to all cells whose centre is within a radius. Other cells are no data; they are never
-filled.
+A point contributes to the cell that contains it and to all cells whose centre is within a radius. Other cells are no
+data; they are never filled.
 """
 
-import math
-import threading
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from sat_intervals.config import Interval, surface_key
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.heights.cells import Tally, strips
 from sat_intervals.heights.choices import SurfaceChoices
-from sat_intervals.heights.fusion import cells_of_run, fused, without_poor_cells
-from sat_intervals.heights.point_cloud import LISTED, WINDOW, Cells, Extent, PointCloud, read_points
-from sat_intervals.heights.triangulate import check_points
-from sat_intervals.products import POINTS
+from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
+from sat_intervals.heights.points import point_near_the_middle, triangulated
 from sat_intervals.progress import Progress
-from sat_intervals.raster import (
-    OutputWriter,
-    Projection,
-    is_surface,
-    north_up,
-    read_place,
-    read_shape,
-    read_tags,
-    surface_file,
-    utm_of,
-)
-from sat_intervals.results import Run, open_run
-from sat_intervals.tiling import Grid, Window
+from sat_intervals.raster import OutputWriter, Projection, is_surface, north_up, read_place, surface_file, utm_of
+from sat_intervals.results import Run
+from sat_intervals.tiling import Window
 
-# Cells of a tile: some tens of megabytes.
-_TILE_ROWS, _TILE_COLUMNS = 512, 2048
-# Cells of a strip of tiles, 24 bytes each, a few strips in memory; tiles of wide surfaces have fewer rows.
-_STRIP_CELLS, _LOWEST = 1 << 22, 64
 # More cells per point mean a wrong resolution or runs of different places.
 _CELLS_PER_POINT = 1000
 # Largest radius in cells: the work grows with its square.
 _REACH = 32
-# Points of all cells of a tile, where a cell's bounds need all its points: some 60 bytes each.
-_LISTED_POINTS = 1 << 22
-# Widths are counted in steps of 2 cm, up to this many metres.
-_WIDEST = 1000
-# Metres: half widths above this are reported as a share.
-WIDE = 20.0
 _DEFAULTS = SurfaceChoices()
 # Metres: largest cell and largest radius.
 _LARGEST = 10_000.0
@@ -83,8 +57,8 @@ def make_surface(
     geoid
         Grid of geoid heights; heights then refer to the geoid, by default to the WGS 84 ellipsoid.
     choices
-        The cell's interval, and what is left out. The intervals of several runs are intersected if they overlap; else
-        their hull is taken.
+        The cell's interval, and what is left out. The intervals of several runs are averaged where they meet, see
+        `fused`; else their hull is taken.
     progress
         Callback, see `Progress`.
 
@@ -92,9 +66,9 @@ def make_surface(
     -------
     ``crs``, ``rows``, ``columns``, ``points``, ``filled`` (share of cells with a height), ``disagreeing`` (share of the
     cells of several runs whose intervals do not overlap, None if there are none), ``without_intervals`` (folders of
-    runs without intervals); ``bounds``; ``median_half_width`` (metres) and ``wide``, the share of cells with bounds
-    whose half width exceeds 20 m, both None without bounds; ``outliers``, ``open`` and ``poor_cells``, the numbers of
-    points and cells left out.
+    runs without intervals); ``bounds``; ``calibration`` (its name, None without one); ``median_half_width`` (metres)
+    and ``wide``, the share of cells with bounds whose half width exceeds 20 m, both None without bounds; ``outliers``,
+    ``open`` and ``poor_cells``, the numbers of points and cells left out.
 
     Raises
     ------
@@ -107,21 +81,24 @@ def make_surface(
     runs = triangulated([Path(out) for out in outs])
     for run in runs:
         run.check_kept([path], [run.out / "points.tif", geoid, like])
-    choices = choices.for_runs(runs)
-    clouds = _clouds(runs, projection := _projection(runs, crs, geoid), choices, progress)
+    intervals = [run.config.interval for run in runs]
+    choices = choices.for_intervals(intervals)
+    tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
+    tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
+    projection = _projection(runs, crs, geoid)
+    clouds = _clouds(runs, projection, choices, progress)
     cells = _cells(clouds, resolution, radius, grid)
-    tags = {
-        "RUNS": runs_tag(runs),
-        **choices.tags(),
-        "RADIUS": f"{radius:g} m",
-        "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}",
-        **_nominal_tag(runs),
-    }
     place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
     writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
+    tally = Tally()
     with writer, ThreadPoolExecutor() as threads:
-        strips = _strips(threads, clouds, cells, radius, str(choices.bounds))
-        tally = _write(writer, strips, cells.rows, choices, progress)
+        for row, strip in strips(threads, clouds, cells, radius, choices):
+            tally.add(strip)
+            writer.write(row, strip.bands)
+            progress("cells", row + strip.bands.shape[1], cells.rows)
+        progress("files", 0, 1)
+        writer.publish()
+        progress("files", 1, 1)
     return {
         "crs": projection.crs,
         "rows": cells.rows,
@@ -129,6 +106,7 @@ def make_surface(
         **{name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")},
         **tally.report(cells.rows * cells.columns),
         "bounds": choices.bounds,
+        "calibration": choices.calibration and choices.calibration.name,
         "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
     }
 
@@ -154,16 +132,36 @@ def checked_cells(
     return grid, resolution, crs, radius
 
 
-def runs_tag(runs: Sequence[Run]) -> str:
-    """Return the tag RUNS of a surface, which identifies its runs."""
-    return " ".join(run.report["finished"] for run in runs)
+def surface_tags(
+    runs: Sequence[str], intervals: Sequence[Interval | None], choices: SurfaceChoices, cell: float, radius: float
+) -> dict[str, str]:
+    """Return tags of a surface: its runs, how its intervals are made and which coverage they are to reach.
 
+    Parameters
+    ----------
+    runs
+        When each run finished, which identifies it.
+    intervals
+        Settings of the runs.
+    choices
+        With the defaults of these runs.
+    cell, radius
+        Metres.
 
-def _nominal_tag(runs: Sequence[Run]) -> dict[str, str]:
-    """Return the tag COVERAGE or ALPHA of a surface, none if its runs differ or have no intervals."""
-    levels = {("COVERAGE", run.config.interval.coverage) if run.config.interval.coverage else
-              ("ALPHA", run.config.interval.alpha) for run in runs if run.config.interval}  # fmt: skip
-    return {name: str(level) for name, level in levels} if len(levels) == 1 else {}
+    Raises
+    ------
+    SatIntervalsError
+        The calibration belongs to other surfaces.
+    """
+    levels = {("COVERAGE", one.coverage) if one.coverage else ("ALPHA", one.alpha) for one in intervals if one}
+    tags = {"RUNS": " ".join(runs), **choices.tags(), "RADIUS": f"{radius:g} m"}
+    tags |= {name: str(level) for name, level in levels} if len(levels) == 1 else {}
+    calibration = choices.calibration
+    if calibration is None:
+        return tags
+    calibration.check_surface(surface_key(tags, cell))
+    tags.pop("ALPHA", None)
+    return tags | {"COVERAGE": f"{calibration.coverage:g}", "CALIBRATION": f"{calibration.name} {calibration.sha256}"}
 
 
 def _check_lengths(resolution: float, radius: float) -> None:
@@ -177,47 +175,11 @@ def _check_lengths(resolution: float, radius: float) -> None:
         )
 
 
-def triangulated(outs: Sequence[Path]) -> list[Run]:
-    """Open runs with points of their own.
-
-    Raises
-    ------
-    SatIntervalsError
-        A folder is no run, is given twice, or has no points, those of an earlier run, or damaged ones.
-    """
-    for out, count in Counter(out.resolve() for out in outs).items():
-        if count > 1:
-            raise SatIntervalsError(f"{out} is given {count} times: give each run once")
-    runs = []
-    for out in outs:
-        run = open_run(out)
-        path = out / "points.tif"
-        if not path.exists():
-            raise SatIntervalsError(f"{out} has no points.tif: run sat-intervals triangulate on it first")
-        if read_tags(path).get("RUN") != run.report["finished"] or read_shape(path) != (len(POINTS), *run.shape):
-            raise SatIntervalsError(f"{path} belongs to an earlier run in {out}: triangulate again")
-        check_points(out)
-        runs.append(run)
-    return runs
-
-
 def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Projection:
     middle = point_near_the_middle(runs)
     projection = Projection(utm_of(*middle) if crs is None else crs, geoid)
     projection.check(*middle)
     return projection
-
-
-def point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:
-    """Return longitude and latitude of the middle of a window with points, of the first run that has any."""
-    for run in runs:
-        tiles = Grid(Window(0, 0, *run.shape), WINDOW)
-        middle = tiles.rows / 2 - 0.5, tiles.columns / 2 - 0.5
-        for tile in sorted(tiles, key=lambda tile: math.dist((tile.grid_row, tile.grid_column), middle)):
-            bands, known = read_points(run.out / "points.tif", tile.core)
-            if known.any():
-                return float(np.median(bands[0][known])), float(np.median(bands[1][known]))
-    raise SatIntervalsError(f"no valid pixel in {', '.join(str(run.out) for run in runs)}: give runs with points")
 
 
 def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
@@ -265,86 +227,3 @@ def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float, grid:
             "choose a coarser --resolution, or runs of one place"
         )
     return cells
-
-
-def _write(
-    writer: OutputWriter,
-    strips: Iterator[tuple[int, np.ndarray]],
-    rows: int,
-    choices: SurfaceChoices,
-    progress: Progress,
-) -> "_Tally":
-    """Write and publish strips without poor cells; return their figures."""
-    tally = _Tally()
-    for row, strip in strips:
-        tally.poor += without_poor_cells(strip, choices.max_width, choices.min_confidence)
-        writer.write(row, strip)
-        tally.add(strip)
-        progress("cells", row + strip.shape[1], rows)
-    progress("files", 0, 1)
-    writer.publish()
-    progress("files", 1, 1)
-    return tally
-
-
-class _Tally:
-    """Count the cells of a surface, and their widths."""
-
-    def __init__(self) -> None:
-        self.poor = self._filled = self._shared = self._disagreeing = 0
-        self._widths = np.zeros(50 * _WIDEST + 1, np.int64)
-
-    def add(self, strip: np.ndarray) -> None:
-        height, lower, upper, *_, agreement = strip
-        self._filled += int(np.isfinite(height).sum())
-        self._shared += int(np.isfinite(agreement).sum())
-        self._disagreeing += int((agreement == 0).sum())
-        width = upper - lower
-        steps = np.minimum(50 * width[np.isfinite(width)], 50 * _WIDEST).astype(np.int64)
-        self._widths += np.bincount(steps, minlength=self._widths.size)
-
-    def report(self, cells: int) -> dict[str, Any]:
-        count = int(self._widths.sum())
-        middle = int(np.searchsorted(np.cumsum(self._widths), (count + 1) // 2))
-        return {
-            "filled": self._filled / cells,
-            "disagreeing": self._disagreeing / self._shared if self._shared else None,
-            "median_half_width": (middle + 0.5) / 100 if count else None,
-            "wide": int(self._widths[int(100 * WIDE) :].sum()) / count if count else None,
-            "poor_cells": self.poor,
-        }
-
-
-def _strips(
-    threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, bounds: str
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield first row and bands of full-width strips from the top; an error stops the running tiles."""
-    ended = threading.Event()
-
-    def tile(window: Window) -> np.ndarray:
-        return fused([cells_of_run(cloud.splat(cells, window, radius, ended), bounds) for cloud in clouds])
-
-    rows, columns = min(_TILE_ROWS, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE_COLUMNS
-    if bounds in LISTED:
-        reaching = max(1.0, math.pi * (radius / cells.resolution) ** 2)
-        of_cell = reaching * max(cloud.points_per_cell(cells.resolution) for cloud in clouds)
-        rows, columns = _smaller(rows, columns, _LISTED_POINTS / of_cell)
-    for row in range(0, cells.rows, rows):
-        height = min(rows, cells.rows - row)
-        windows = (
-            Window(row, column, height, min(columns, cells.columns - column))
-            for column in range(0, cells.columns, columns)
-        )
-        try:
-            tiles = list(threads.map(tile, windows))
-        except BaseException:
-            ended.set()
-            raise
-        yield row, np.concatenate(tiles, axis=2)
-
-
-def _smaller(rows: int, columns: int, cells: float) -> tuple[int, int]:
-    """Return rows and columns of a tile of at most so many cells, halving the longer side."""
-    while rows * columns > max(cells, 1):
-        rows, columns = (rows, -(-columns // 2)) if columns >= rows else (-(-rows // 2), columns)
-    return rows, columns

@@ -3,13 +3,13 @@
 import math
 import threading
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.choices import SurfaceChoices
+from sat_intervals.heights.points import POINT, WINDOW, read_points
 from sat_intervals.kernels.disparity import median
 from sat_intervals.kernels.splat import (
     AGREEING,
@@ -25,19 +25,16 @@ from sat_intervals.kernels.splat import (
     reaching,
     splat,
 )
-from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW, POINTS
-from sat_intervals.raster import Projection, read_layers
+from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW
+from sat_intervals.raster import Projection
 from sat_intervals.raster.identity import watched
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Window
 
-_POINT = {band.name: index for index, band in enumerate(POINTS)}
 # Bounds that need all points of a cell at once.
 LISTED = {"median": MEDIAN, "nearest": NEAREST, "agreeing": AGREEING}
 # Pixels around a point whose median tells outliers.
 _NEAR = 2
-# Side of a window of points in pixels: some tens of megabytes.
-WINDOW = 512
 
 
 class Extent(NamedTuple):
@@ -89,21 +86,6 @@ class Cells:
         )
 
 
-def read_points(path: Path, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Read the bands of ``points.tif`` in a window and the mask of its points.
-
-    Raises
-    ------
-    SatIntervalsError
-        A pixel has some of longitude, latitude and height, but not all.
-    """
-    bands = read_layers(path, window)
-    known = np.isfinite(bands[: _POINT["height"] + 1])
-    if (known != known[0]).any():
-        raise SatIntervalsError(f"{path} is damaged, some pixels have only part of a point: triangulate again")
-    return bands, known[0]
-
-
 class PointCloud:
     """The points of one run that contribute, read by windows, and the map extent of each window.
 
@@ -120,7 +102,7 @@ class PointCloud:
         self._path = run.out / "points.tif"
         self._check_unchanged = watched([self._path])
         self._projection = projection
-        self._choices = choices or SurfaceChoices().for_runs([run])
+        self._choices = choices or SurfaceChoices().for_intervals([run.config.interval])
         self._extents: list[tuple[Window, Extent]] = []
         self.points = self.outliers = self.open = 0
         for tile in Grid(Window(0, 0, *run.shape), WINDOW):
@@ -142,7 +124,7 @@ class PointCloud:
         """Return the mask of points farther than a limit (metres) from the median of the points near them."""
         around = window.grown(_NEAR, _NEAR).clipped(Window(0, 0, *self.run.shape))
         bands, known = read_points(self._path, around)
-        height = np.where(known, bands[_POINT["height"]], 0)
+        height = np.where(known, bands[POINT["height"]], 0)
         base = np.median(height[known]) if known.any() else 0  # float32 then keeps millimetres
         away = np.abs(height - base - median((height - base).astype(np.float32), known, 2 * _NEAR + 1))
         return np.asarray((away > limit)[window.relative_to(around).slices])
@@ -150,7 +132,7 @@ class PointCloud:
     def _scan(self, window: Window) -> None:
         """Count the points of a window and find their extent."""
         bands, known, outliers, open_ended = self._kept(window)
-        longitude, latitude = bands[_POINT["longitude"]], bands[_POINT["latitude"]]
+        longitude, latitude = bands[POINT["longitude"]], bands[POINT["latitude"]]
         self.points += int(known.sum())
         self.outliers += outliers
         self.open += open_ended
@@ -197,7 +179,7 @@ class PointCloud:
             if extent.grown(radius).intersects(place):
                 bands, known, _, _ = self._kept(source)
                 longitude, latitude, height, lower, upper = (
-                    bands[_POINT[name]][known]
+                    bands[POINT[name]][known]
                     for name in ("longitude", "latitude", "height", "height_lower", "height_upper")
                 )
                 confidence = self.run.read_bands(source).confidence

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.heights.dsm import point_near_the_middle, triangulated
 from sat_intervals.heights.location import GroundLattice, Location
 from sat_intervals.heights.point_files import PointFile
 from sat_intervals.heights.point_sight import PointSight
+from sat_intervals.heights.points import point_near_the_middle, triangulated
 from sat_intervals.heights.raster_sight import RasterSight, Scene, Shift
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
 from sat_intervals.heights.sensors import Sensors

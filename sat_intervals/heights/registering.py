@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from sat_intervals.heights.fusion import cells_of_run
-from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud, read_points
+from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
+from sat_intervals.heights.points import read_points
 from sat_intervals.kernels.registration import REACH, Blocks, sampled
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.results import Run

@@ -226,8 +226,10 @@ class Span(NamedTuple):
 
 
 @inlined
-def span_at(ranges, c):
-    """Search range of the pixel in column ``c``."""
+def span_at(ranges, count, size, c):
+    """Search range of the pixel in column ``c``; without ranges all ``count`` candidates, in ``size`` lanes."""
+    if ranges is None:  # kernels are compiled for either form
+        return Span(0, count - 1, 0, size)
     return Span(ranges.first[c], ranges.last[c], ranges.start[c], ranges.stop[c])
 
 
@@ -250,7 +252,9 @@ def volume_starts(cells: Cells, output: Window) -> np.ndarray:
 
 @part
 def enter_cells(candidates, cells, ranges, r):
-    """Set the search ranges of the pixels of a row, and where their walls are."""
+    """Set the search ranges of the pixels of a row, if they have some, and where their walls are."""
+    if ranges is None:
+        return
     i, number = (r + cells.row) // cells.height, cells.first.shape[1]
     for j in range(number):
         first, last = cells.first[i, j], cells.last[i, j]

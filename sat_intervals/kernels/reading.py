@@ -66,7 +66,12 @@ def columns_of(inside, r, down):
 
 @inlined
 def open_curve(curve, opened, span):
-    """Prepare a curve for a pixel: IMPOSSIBLE_COST outside its vectors. ``opened`` are those of the pixel before."""
+    """Prepare a curve for a pixel: IMPOSSIBLE_COST outside its vectors.
+
+    ``opened`` are those of the pixel before, None if every pixel has all of them.
+    """
+    if opened is None:
+        return
     if opened[0] != span.start or opened[1] != span.stop:
         for k in range(0, curve.size, LANES):
             store(curve, k, splat(np.uint16(IMPOSSIBLE_COST)))

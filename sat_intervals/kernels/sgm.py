@@ -44,19 +44,27 @@ class Paths(NamedTuple):
     lowest
         ``(slots,)`` uint16: its minimum.
     spans
-        ``(slots, 2)`` int64: the whole vectors ``[start, stop)`` of the curve that are not all walls.
+        ``(slots, 2)`` int64: the whole vectors ``[start, stop)`` of the curve that are not all walls; None if every
+        pixel searches all of them.
     """
 
     curves: np.ndarray
     lowest: np.ndarray
-    spans: np.ndarray
+    spans: np.ndarray | None
 
 
-def new_paths(columns: int, size: int) -> Paths:
+def new_paths(columns: int, size: int, has_cells: bool) -> Paths:
     """Allocate the paths of a sweep, which all start at their next pixels."""
     slots = 1 + 3 * columns
-    spans = np.tile(np.array([0, size]), (slots, 1))
+    spans = np.tile(np.array([0, size]), (slots, 1)) if has_cells else None
     return Paths(np.zeros((slots, size), np.uint16), np.zeros(slots, np.uint16), spans)
+
+
+@inlined
+def _fill_span(spans, slot, size):
+    """Say that any vector of a curve may be searched."""
+    if spans is not None:
+        spans[slot, 0], spans[slot, 1] = 0, size
 
 
 @inlined
@@ -71,17 +79,17 @@ def _begin(paths, slot, first):
 
 
 @inlined
-def _close(candidates, span, paths, slots):
-    """Wall up what earlier pixels of the paths searched and this one does not."""
-    if candidates.beyond.shape[0] == 1:  # all pixels have one range
+def _wall_up(curves, spans, span, slots):
+    """Set walls where earlier pixels of the paths in ``slots`` have searched and this one does not."""
+    if spans is None:
         return
-    wall, size = splat(np.uint16(WALL)), paths.curves.shape[1]
+    wall, size = splat(np.uint16(WALL)), curves.shape[1]
     for slot in slots:
-        for k in range(paths.spans[slot, 0], span.start, LANES):
-            store(paths.curves, slot * size + k, wall)
-        for k in range(span.stop, paths.spans[slot, 1], LANES):
-            store(paths.curves, slot * size + k, wall)
-        paths.spans[slot, 0], paths.spans[slot, 1] = span.start, span.stop
+        for k in range(spans[slot, 0], span.start, LANES):
+            store(curves, slot * size + k, wall)
+        for k in range(span.stop, spans[slot, 1], LANES):
+            store(curves, slot * size + k, wall)
+        spans[slot, 0], spans[slot, 1] = span.start, span.stop
 
 
 @inlined
@@ -102,7 +110,7 @@ def advance_pixel(candidates, span, penalties, paths, slots, r, c, target):
     ``target`` is an array and an offset: the sum of candidate k goes to ``array[offset + k]``.
     The four paths have names because numba does not unroll a loop over a tuple.
     """
-    curves, lowest, _ = paths
+    curves, lowest, spans = paths
     array, offset = target
     p1, p2, row = penalties
     path_1, path_2, path_3, path_4 = (
@@ -125,13 +133,13 @@ def advance_pixel(candidates, span, penalties, paths, slots, r, c, target):
         store(array, offset + k, add(add(cost_1, cost_2), add(cost_3, cost_4)))
     lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
     lowest[slots[2]], lowest[slots[3]] = smallest(path_3[4]), smallest(path_4[4])
-    _close(candidates, span, paths, slots)
+    _wall_up(curves, spans, span, slots)
 
 
 @inlined
 def _advance_pair(candidates, span, penalties, paths, slots, i, r, c):
     """Advance the paths ``i`` and ``i + 1``, which have ``slots``, by the pixel ``(r, c)``."""
-    curves, lowest, _ = paths
+    curves, lowest, spans = paths
     p1, p2, row = penalties
     path_1, path_2 = _begin(paths, slots[0], span.start), _begin(paths, slots[1], span.start)
     for k in range(span.start, span.stop, LANES):
@@ -141,7 +149,7 @@ def _advance_pair(candidates, span, penalties, paths, slots, i, r, c):
         store(curves, path_1[0] + k, cost_1)
         store(curves, path_2[0] + k, cost_2)
     lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
-    _close(candidates, span, paths, slots)
+    _wall_up(curves, spans, span, slots)
 
 
 @inlined
@@ -176,7 +184,7 @@ def restart(paths, slots):
     for slot in slots:
         paths.curves[slot] = 0
         paths.lowest[slot] = 0
-        paths.spans[slot, 0], paths.spans[slot, 1] = 0, paths.curves.shape[1]
+        _fill_span(paths.spans, slot, paths.curves.shape[1])
 
 
 @inlined
@@ -295,7 +303,7 @@ def _set_wave(paths, slots, wave, states):
         for k in range(1, states.shape[1]):
             lowest = min(lowest, states[n, k])
         paths.lowest[slot] = lowest
-        paths.spans[slot, 0], paths.spans[slot, 1] = 0, states.shape[1]
+        _fill_span(paths.spans, slot, states.shape[1])
 
 
 @part

@@ -124,13 +124,13 @@ class Buffers(NamedTuple):
     Attributes
     ----------
     ranges
-        Those of the pixels of the row.
+        Those of the pixels of the row; None if all pixels search all candidates: kernels are compiled for either form.
     usable
         ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
     possible
         ``(columns,)`` int64: number of possible candidates of each pixel of the row.
     curve, opened
-        ``(size,)`` uint16: buffer of one curve; ``(2,)`` int64: its vectors that are in use.
+        ``(size,)`` uint16: buffer of one curve; ``(2,)`` int64: its vectors that are in use, None if all are.
     inside
         Pixels whose paths are computed; those of the pixels around them come from ``rings``.
     rings
@@ -143,13 +143,13 @@ class Buffers(NamedTuple):
 
     candidates: Candidates
     cells: Cells
-    ranges: Ranges
+    ranges: Ranges | None
     usable: np.ndarray
     possible: np.ndarray
     penalties: Penalties
     paths: Paths
     curve: np.ndarray
-    opened: np.ndarray
+    opened: np.ndarray | None
     inside: Rectangle
     rings: tuple[Ring, ...]
     leaving: Edge
@@ -168,18 +168,19 @@ def prepare(
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
     left = borders.inside if borders else Window(0, 0, 0, 0)
     inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
-    cells, k = cells or one_cell(rows, columns, settings.count), np.arange(size)
+    has_cells, k = cells is not None, np.arange(size)
+    cells = cells or one_cell(rows, columns, settings.count)
     walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
     return Buffers(
         Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
         cells,
-        new_ranges(columns),
+        new_ranges(columns) if has_cells else None,
         np.zeros(columns + settings.count, np.int64),
         np.zeros(columns, np.int64),
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
-        new_paths(columns, size),
+        new_paths(columns, size, has_cells),
         np.zeros(size, np.uint16),
-        np.array([0, size]),
+        np.array([0, size]) if has_cells else None,
         rectangle_of(inside),
         rings[:2] if down else rings[2:],
         Edge(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
@@ -193,14 +194,15 @@ def _enter_row(buffers, gradients, settings, r):
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    candidates, cells, ranges, usable, possible, penalties, paths, _, _, inside, rings, _, down = buffers
+    candidates, cells, ranges, usable, possible, penalties, paths, curve, _, inside, rings, _, down = buffers
     costs, barrier = candidates.costs, candidates.barrier
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
         usable[x + 1] = usable[x] + (costs.right_state[r, x] == 0)
     enter_cells(candidates, cells, ranges, r)
     for c in range(possible.size):
-        inner = usable[c + ranges.last[c] + 1] - usable[c + ranges.first[c]]
+        span = span_at(ranges, settings.count, curve.size, c)
+        inner = usable[c + span.last + 1] - usable[c + span.first]
         possible[c] = inner if costs.left_state[r, c] == 0 else 0
     falling, rising = -r % possible.size, r % possible.size
     enter_row(paths, possible.size, falling, rising, down)
@@ -212,7 +214,7 @@ def _enter_row(buffers, gradients, settings, r):
 @cached
 def trace_wave(buffers, gradients, settings, wave):
     """Advance the paths of one wave through a patch and copy the states that leave it."""
-    candidates, _, ranges, _, possible, penalties, paths, _, _, inside, _, leaving, down = buffers
+    candidates, _, ranges, _, possible, penalties, paths, curve, _, inside, _, leaving, down = buffers
     rows = candidates.costs.left_state.shape[0]
     for step in range(inside.row_stop if down else rows - inside.row):
         r = step if down else rows - 1 - step
@@ -222,18 +224,20 @@ def trace_wave(buffers, gradients, settings, wave):
             if possible[c] == 0:
                 restart(paths, (slots[2 * wave], slots[2 * wave + 1]))
             else:
-                advance_wave(candidates, span_at(ranges, c), penalties, paths, slots, wave, r, c)
+                span = span_at(ranges, settings.count, curve.size, c)
+                advance_wave(candidates, span, penalties, paths, slots, wave, r, c)
         if inside.row <= r < inside.row_stop:
             hand_on(paths, inside, r, falling, rising, wave, down, leaving)
 
 
 @part
-def _enter_output(volume, ranges, output, r):
+def _enter_output(volume, ranges, size, output, r):
     """Set the places of the pixels of a row in the volume."""
     begin = volume.rows[r - output.row]
     for c in range(output.column, output.column_stop):
-        volume.places[c] = begin - ranges.start[c]
-        begin += ranges.stop[c] - ranges.start[c]
+        span = span_at(ranges, size, size, c)
+        volume.places[c] = begin - span.start
+        begin += span.stop - span.start
 
 
 @cached
@@ -243,16 +247,16 @@ def sweep_down(buffers, gradients, settings, output, volume):
     for r in range(output.row_stop):
         falling, rising = _enter_row(buffers, gradients, settings, r)
         if r >= output.row:
-            _enter_output(volume, ranges, output, r)
+            _enter_output(volume, ranges, curve.size, output, r)
         for c in columns_of(inside, r, True):
             slots = path_slots(c, possible.size, falling, rising)
+            span = span_at(ranges, settings.count, curve.size, c)
             if possible[c] == 0:
                 restart(paths, slots)
             elif contains(output, r, c):
-                span, place = span_at(ranges, c), volume.places[c]
-                advance_pixel(candidates, span, penalties, paths, slots, r, c, (volume.sums, place))
+                advance_pixel(candidates, span, penalties, paths, slots, r, c, (volume.sums, volume.places[c]))
             else:
-                advance_pixel(candidates, span_at(ranges, c), penalties, paths, slots, r, c, (curve, 0))
+                advance_pixel(candidates, span, penalties, paths, slots, r, c, (curve, 0))
 
 
 @cached
@@ -264,9 +268,10 @@ def sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
     for r in range(costs.left_state.shape[0] - 1, output.row - 1, -1):
         falling, rising = _enter_row(buffers, gradients, settings, r)
         if r < output.row_stop:
-            _enter_output(volume, ranges, output, r)
+            _enter_output(volume, ranges, curve.size, output, r)
         for c in columns_of(inside, r, False):
-            slots, span = path_slots(c, possible.size, falling, rising), span_at(ranges, c)
+            slots = path_slots(c, possible.size, falling, rising)
+            span = span_at(ranges, settings.count, curve.size, c)
             open_curve(curve, opened, span)
             if possible[c] == 0:
                 restart(paths, slots)

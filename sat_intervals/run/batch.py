@@ -5,7 +5,7 @@ import logging
 import os
 import resource
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -32,6 +32,7 @@ from sat_intervals.store.tiles import finished_run, remove_tiles
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
+Finish = Callable[[PairOfBatch], Mapping[str, Any]]
 
 
 def match_batch(
@@ -43,6 +44,7 @@ def match_batch(
     overwrite: bool = False,
     keep_tiles: bool = False,
     progress: Progress = lambda stage, done, total: None,
+    finish: Finish = lambda pair: {},
 ) -> dict[str, dict[str, Any]]:
     """Match many pairs; a failed pair does not stop the others.
 
@@ -56,6 +58,8 @@ def match_batch(
         Settings of all pairs, see `load_config`; a pair's own settings win. ``cluster`` is shared by all.
     overwrite, keep_tiles, progress
         See `match_pair`.
+    finish
+        What to do with each complete pair at the end, such as its surface model; what it returns is added to its state.
 
     Returns
     -------
@@ -97,6 +101,9 @@ def match_batch(
                 note({pair.name: _failed(error)})
         for name, how in _matched(jobs, connection, keep_tiles, progress):
             note({name: how})
+        for pair in pairs:
+            if (how := _finished(pair, report.states[pair.name], finish)) is not report.states[pair.name]:
+                note({pair.name: how})
     return report.states
 
 
@@ -179,6 +186,17 @@ def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
 
 def _failed(error: Exception) -> dict[str, Any]:
     return {"state": "failed", "error": str(error) or type(error).__name__}
+
+
+def _finished(pair: PairOfBatch, how: dict[str, Any], finish: Finish) -> dict[str, Any]:
+    """Return the state of a pair after its last step."""
+    if how["state"] == "failed":
+        return how
+    try:
+        more = finish(pair)
+        return {**how, **more} if more else how
+    except Exception as error:  # one pair's failure must not stop the others
+        return _failed(error)
 
 
 def _raise_file_limit() -> None:

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.evaluate.dsm import Comparison, Profile, error_map
+from sat_intervals.evaluate.comparison import Comparison
+from sat_intervals.evaluate.dsm import Profile, error_map
 from sat_intervals.show.canvas import DPI, INK, NOTHING, page, plain_logarithm, pointed_ends, say_empty
 from sat_intervals.show.legend import BLUE, ORANGE
 

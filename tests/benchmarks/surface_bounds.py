@@ -1,14 +1,16 @@
-"""The table of docs/heights.md (`make surface-bounds`): coverage and width of the bounds of cells, on exact scenes.
+"""The tables of docs/heights.md (`make surface-bounds`): coverage and width of the bounds of cells, on exact scenes.
 
-Towns, slopes and rough ground, at three base-to-height ratios, are matched with a coverage of .90. Points come from the
-analytic cameras of the scenes. The envelope keeps open intervals, as without a coverage; the others leave them out. The
-truth of a cell is the height of the surface, seen from above, at its centre. Cells near a wall are apart: heights
-within one cell of the centre differ by more than 2.2 px of disparity, and more than the side of the cell.
+Towns, slopes and rough ground, at three base-to-height ratios, are matched with a coverage of .90, as four pairs each,
+which see the ground from other sides. Points come from the analytic cameras of the scenes. The envelope keeps open
+intervals, as without a coverage; the others leave them out. The truth of a cell is the height of the surface, seen from
+above, at its centre. Cells near a wall are apart: heights within one cell of the centre differ by more than 2.2 px of
+disparity, and more than the side of the cell. Matched pairs are kept in `build/surfaces`.
 """
 
 import sys
-import tempfile
+from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import rasterio
@@ -16,20 +18,25 @@ from pyproj import Transformer
 
 from sat_intervals import demo, match_pair
 from sat_intervals.demo import DATUM, PIXEL
+from sat_intervals.evaluate.calibration import Sample, fitted, held_out
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
+from sat_intervals.kernels.conformal import widened
 from sat_intervals.products import POINTS
 from sat_intervals.raster import POINT_FILES, Georeferencing, OutputWriter, north_up, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
-SIZE, SEED = int(sys.argv[1]) if len(sys.argv) > 1 else 360, 5
+BUILD = Path("build/surfaces")
+SIZE, SEED = 300, 5
 VIEWS = {0.3: (-0.2, 0.4), 0.5: (-0.4, 0.6), 0.8: (-0.6, 1.0)}
+# Left views of the further pairs, as shares of the distance between both views.
+FURTHER = (-0.6, -0.1, -0.85)
 KINDS = {"town": 0, "slope": 60, "rough": 10}  # metres of relief
 LONGITUDE, LATITUDE = 1.45, 43.6
 EAST, NORTH = 80_700.0, 111_110.0  # metres in a degree there
 CRS = "EPSG:32631"
-OBJECTS, TERRAIN = demo.OBJECTS, demo._terrain
+OBJECTS, TERRAIN, RANDOM = demo.OBJECTS, demo._terrain, np.random.default_rng
 
 
 def rough(ground, r, c):
@@ -37,18 +44,32 @@ def rough(ground, r, c):
     return TERRAIN(ground, r, c) + 4 + 3 * demo._noise(ground.lattice, r, c, 14, 3)
 
 
-def make_pair(folder, kind, ratio):
-    """Write and match a pair; return its profiles, one for each row."""
-    demo.VIEWS = VIEWS[ratio]
+def views_of(ratio):
+    """Views of the four pairs of a base-to-height ratio."""
+    left, right = VIEWS[ratio]
+    return [(left, right), *((share * (right - left), (1 + share) * (right - left)) for share in FURTHER)]
+
+
+def make_pair(folder, kind, views, number):
+    """Write, match and triangulate a pair with noise of its own, unless done before; return profiles of its rows."""
+
+    def random(seed):
+        return RANDOM([*seed, number] if number and seed[1] == 1 else seed)
+
+    demo.VIEWS = views
     demo.OBJECTS = OBJECTS if kind == "town" else ()
     demo._terrain = rough if kind == "rough" else TERRAIN
-    scene = demo.make_scene(SIZE, SIZE, SEED, relief=KINDS[kind])
-    place = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
-    for name, image in (("left", scene.left), ("right", scene.right)):
-        write_layer(folder / f"{name}.tif", image, 0, place)
-    search = {"minimum": scene.minimum, "maximum": scene.maximum}
-    settings = {"preset": "satellite", "disparity": search, "interval": {"coverage": 0.9}}
-    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    if not (folder / "out" / "points.tif").exists():
+        with mock.patch.object(np.random, "default_rng", random):
+            scene = demo.make_scene(SIZE, SIZE, SEED, relief=KINDS[kind])
+        place = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, image in (("left", scene.left), ("right", scene.right)):
+            write_layer(folder / f"{name}.tif", image, 0, place)
+        search = {"minimum": scene.minimum, "maximum": scene.maximum}
+        settings = {"preset": "satellite", "disparity": search, "interval": {"coverage": 0.9}}
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+        write_points(folder / "out", views)
     return list(demo.profiles(SIZE, SIZE, SEED, 0, 64, KINDS[kind]))
 
 
@@ -70,7 +91,8 @@ def write_points(out, views):
         writer.publish()
 
 
-def truth_of(place, shape, profiles):
+@cache
+def truth_of(place, shape, kind):
     """Height at the centres of cells, and the range of heights within one cell of them; NaN outside the scene."""
     back = Transformer.from_crs(CRS, "EPSG:4326", always_xy=True)
 
@@ -81,54 +103,110 @@ def truth_of(place, shape, profiles):
         height = np.full(shape, np.nan)
         for row in range(SIZE):
             here = (v == row) & (u >= 0) & (u < SIZE)
-            height[here] = np.interp(u[here], *profiles[row][1:3])
+            height[here] = np.interp(u[here], *PROFILES[kind][row][1:3])
         return height
 
     steps = np.linspace(-1, 1, 5)
     return at(0, 0), np.ptp([at(down, across) for down in steps for across in steps], axis=0)
 
 
-def figures(path, truth, walls, pixel):
-    """Coverage of all cells, outside walls and near them; median and mean width in pixels; filled share."""
-    with rasterio.open(path) as dataset:
-        lower, upper = dataset.read((2, 3)).astype(np.float64)
-    known = np.isfinite(truth) & np.isfinite(lower)
-    inside, width, wall = ((lower <= truth) & (truth <= upper))[known], ((upper - lower) / pixel)[known], walls[known]
-    near = inside[wall].mean() if wall.any() else np.nan
-    return inside.mean(), inside[~wall].mean(), near, np.median(width), width.mean(), known.sum()
+def surface_of(outs, path, cell, bounds, kind, pixel, like=None):
+    """Cells of a surface with interval and truth, as a sample of a calibration, and which of them are near walls.
+
+    With ``like``, another surface, on its grid: cells with an interval there.
+    """
+    choices = SurfaceChoices(bounds, keeps_open=bounds == "envelope")
+    make_surface(outs, path, resolution=like or cell * PIXEL, crs=None if like else CRS, choices=choices)
+    with rasterio.open(path) as dataset, rasterio.open(like or path) as first:
+        height, lower, upper = dataset.read((1, 2, 3)).astype(np.float64)
+        truth, range_ = truth_of(dataset.transform, dataset.shape, kind)
+        known = np.isfinite(truth) & np.isfinite(first.read(2))
+    row, column = (4 * places // size for places, size in zip(np.nonzero(known), known.shape, strict=True))
+    sample = Sample(*(values[known] for values in (height, lower, upper, truth)), 4 * row + column)
+    return sample, range_[known] > max(2.2 * pixel, cell * PIXEL)
 
 
-def main():
-    print("| scene | base-to-height | cell | bounds | coverage | without walls | walls | median width | mean width |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    means = {}
-    for kind in KINDS:
-        for ratio, views in VIEWS.items():
-            with tempfile.TemporaryDirectory() as name:
-                folder = Path(name)
-                profiles = make_pair(folder, kind, ratio)
-                write_points(folder / "out", views)
-                pixel = 1 / (views[1] - views[0])
-                for cell in (1, 2, 4):
-                    truth = None
-                    for bounds in BOUNDS:
-                        choices = SurfaceChoices(bounds, keeps_open=bounds == "envelope")
-                        path = folder / "dsm.tif"
-                        make_surface([folder / "out"], path, resolution=cell * PIXEL, crs=CRS, choices=choices)
-                        if truth is None:
-                            with rasterio.open(path) as dataset:
-                                truth, range_ = truth_of(dataset.transform, dataset.shape, profiles)
-                            walls = range_ > max(2.2 * pixel, cell * PIXEL)
-                        row = figures(path, truth, walls, pixel)
-                        means.setdefault((cell, bounds), []).append(row)
-                        print(f"| {kind} | {ratio} | {cell} px | {bounds} | {written(row)} |", flush=True)
-    for (cell, bounds), rows in means.items():
-        print(f"| mean | | {cell} px | {bounds} | {written(np.nanmean(rows, axis=0))} |")
+def figures(sample, walls, pixel, bounds=None):
+    """Coverage of all cells, outside walls and near them; median and mean width in pixels."""
+    lower, upper = (sample.lower, sample.upper) if bounds is None else bounds
+    inside, width = (lower <= sample.reference) & (sample.reference <= upper), (upper - lower) / pixel
+    near = inside[walls].mean() if walls.any() else np.nan
+    return inside.mean(), inside[~walls].mean(), near, np.median(width), width.mean()
+
+
+def calibrated(sample, others):
+    """Bounds with the margins of other samples together."""
+    together = Sample(*(np.concatenate(values) for values in zip(*others, strict=True)))
+    fit = fitted(together, 1.0, 0.9)
+    return widened(sample.height, sample.lower, sample.upper, fit.limits, fit.margins)
+
+
+class Table:
+    """Lines as they come, and their means at the end."""
+
+    def __init__(self, *columns):
+        self._means = {}
+        head = ["scene", "base-to-height", "cell", *columns, "coverage", "without walls", "walls"]
+        head += ["median width", "mean width"]
+        print(f"\n| {' | '.join(head)} |\n|{'---|' * len(head)}")
+
+    def add(self, kind, ratio, cell, label, row):
+        self._means.setdefault((cell, label), []).append(row)
+        print(f"| {kind} | {ratio} | {cell} px | {label} | {written(row)} |", flush=True)
+
+    def end(self):
+        for (cell, label), rows in self._means.items():
+            lowest, highest = (end(row[0] for row in rows) for end in (min, max))
+            ends = f"{lowest:.3f} to {highest:.3f}"
+            print(f"| mean | coverage {ends} | {cell} px | {label} | {written(np.nanmean(rows, axis=0))} |")
 
 
 def written(row):
-    """The figures of a line of the table."""
+    """The figures of a line of a table."""
     return " | ".join([*(f"{share:.3f}" for share in row[:3]), *(f"{width:.2f}" for width in row[3:5])])
 
 
-main()
+def cells_of(kind, ratio, cell, pairs, bounds):
+    """Cells of a scene, from some of its pairs, on the grid of the first one."""
+    outs = [BUILD / f"{kind}_{ratio}_{number}" / "out" for number in range(pairs)]
+    path, like = (BUILD / "several.tif", BUILD / "one.tif") if pairs > 1 else (BUILD / "one.tif", None)
+    return surface_of(outs, path, cell, bounds, kind, 0.5 / ratio, like)
+
+
+def compare_bounds(scenes):
+    table = Table("bounds")
+    for kind, ratio, cell in scenes:
+        for bounds in BOUNDS:
+            table.add(kind, ratio, cell, bounds, figures(*cells_of(kind, ratio, cell, 1, bounds), 0.5 / ratio))
+    table.end()
+
+
+def compare_calibrations(scenes):
+    table = Table("calibrated on")
+    samples = {scene: cells_of(*scene, 1, "median") for scene in scenes}
+    for (kind, ratio, cell), (sample, walls) in samples.items():
+        others = [samples[other, ratio, cell][0] for other in KINDS if other != kind]
+        ways = {"nothing": None, "other blocks": held_out(sample, 1.0, 0.9), "other scenes": calibrated(sample, others)}
+        for label, bounds in ways.items():
+            table.add(kind, ratio, cell, label, figures(sample, walls, 0.5 / ratio, bounds))
+    table.end()
+
+
+def compare_pairs(scenes):
+    table = Table("pairs")
+    for kind, ratio, cell in scenes:
+        for pairs in (1, 2, 4):
+            sample, walls = cells_of(kind, ratio, cell, pairs, "median")
+            for label, bounds in ((f"{pairs}", None), (f"{pairs}, calibrated", held_out(sample, 1.0, 0.9))):
+                table.add(kind, ratio, cell, label, figures(sample, walls, 0.5 / ratio, bounds))
+    table.end()
+
+
+TABLES = {"bounds": compare_bounds, "calibrations": compare_calibrations, "pairs": compare_pairs}
+PROFILES = {}
+for kind in KINDS:
+    for ratio in VIEWS:
+        for number, views in enumerate(views_of(ratio)):
+            PROFILES[kind] = make_pair(BUILD / f"{kind}_{ratio}_{number}", kind, views, number)
+for name in sys.argv[1:] or TABLES:
+    TABLES[name]([(kind, ratio, cell) for kind in KINDS for ratio in VIEWS for cell in (1, 2, 4)])

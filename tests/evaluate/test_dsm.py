@@ -10,30 +10,13 @@ from helpers import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
+from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.errors import RunError
 from sat_intervals.evaluate import dsm
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.match.histogram import Histogram
-from sat_intervals.products import SURFACE
-
-PLACE = Affine(1, 0, 370_000, 0, -1, 4_830_000)
-
-
-def write(path, bands, place=PLACE, crs="EPSG:32631"):
-    bands = np.asarray(bands, np.float32)
-    kind = {"height": bands.shape[1], "width": bands.shape[2], "count": bands.shape[0], "dtype": "float32"}
-    with rasterio.open(path, "w", driver="GTiff", nodata=np.nan, crs=crs, transform=place, **kind) as dataset:
-        dataset.write(bands)
-        if len(bands) == len(SURFACE):
-            dataset.descriptions = [band.name for band in SURFACE]
-    return path
-
-
-def surface(path, height, lower, upper):
-    more = np.zeros((len(SURFACE) - 3, *np.shape(height)))
-    return write(path, np.concatenate([[height, lower, upper], more]))
 
 
 def test_evaluate_surface__worked_example(tmp_path):
@@ -45,8 +28,8 @@ def test_evaluate_surface__worked_example(tmp_path):
     reference = np.array([[10.0, 10, 11, 12]])
     height, lower, upper = [[10.5, 9, 13, 16]], [[9, 8, 10, 15]], [[11, 9.5, 14, 17]]
     report = evaluate_surface(
-        surface(tmp_path / "dsm.tif", height, lower, upper),
-        write(tmp_path / "reference.tif", [reference]),
+        write_surface(tmp_path / "dsm.tif", height, lower, upper),
+        write_raster(tmp_path / "reference.tif", [reference]),
         registers=False,
     )
     everything = report["all"]
@@ -80,12 +63,12 @@ def relief(row, column):
 def test_evaluate_surface__registers_on_relief_and_says_what_it_moved(tmp_path):
     row, column = np.indices((150, 160)).astype(np.float64)
     truth = relief(row, column)
-    model = surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
     # the reference is 3 m too far west, 2 m too far north and 5 m too low; half as coarse
     fine = np.indices((420, 440)) / 2 - 30 + 0.5 / 2 - 0.5
     heights = relief(fine[0] - -2, fine[1] + 3) - 5
     place = Affine(0.5, 0, PLACE.c - 30, 0, -0.5, PLACE.f + 30)
-    reference = write(tmp_path / "reference.tif", [heights], place)
+    reference = write_raster(tmp_path / "reference.tif", [heights], place)
     report = evaluate_surface(model, reference)
     found = report["registration"]
     assert found["is_horizontal"]
@@ -100,13 +83,13 @@ def test_evaluate_surface__registers_on_relief_and_says_what_it_moved(tmp_path):
 
 
 def test_evaluate_surface__by_classes_of_a_raster(tmp_path):
-    model = surface(tmp_path / "dsm.tif", [[1.0, 2, 3, 4]], [[0.0] * 4], [[9.0] * 4])
-    reference = write(tmp_path / "reference.tif", [[[1.0, 1, 1, 1]]])
-    classes = write(tmp_path / "classes.tif", [[[7.0, 7, 2, np.nan]]])
+    model = write_surface(tmp_path / "dsm.tif", [[1.0, 2, 3, 4]], [[0.0] * 4], [[9.0] * 4])
+    reference = write_raster(tmp_path / "reference.tif", [[[1.0, 1, 1, 1]]])
+    classes = write_raster(tmp_path / "classes.tif", [[[7.0, 7, 2, np.nan]]])
     report = evaluate_surface(model, reference, classes, registers=False)
     assert [(kind["class"], kind["count"], kind["bias"]) for kind in report["classes"]] == [(2, 1, 2.0), (7, 2, 0.5)]
     with pytest.raises(SatIntervalsError, match=r"heights.tif has values such as 1.5.*give a raster of classes"):
-        evaluate_surface(model, reference, write(tmp_path / "heights.tif", [[[1.5] * 4]]), registers=False)
+        evaluate_surface(model, reference, write_raster(tmp_path / "heights.tif", [[[1.5] * 4]]), registers=False)
 
 
 @pytest.mark.peer("xdem")
@@ -118,9 +101,9 @@ def test_evaluate_surface__has_the_nmad_and_both_le90_of_peers(tmp_path):
     truth = random.normal(500, 20, (300, 400))
     height = truth + random.standard_t(3, truth.shape) * 0.7 + 0.3
     height[random.random(height.shape) < 0.2] = np.nan
-    model = surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
-    ours = evaluate_surface(model, write(tmp_path / "reference.tif", [truth]), registers=False)["all"]
-    alone = xdem.DEM(str(write(tmp_path / "alone.tif", [height])))
+    model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
+    ours = evaluate_surface(model, write_raster(tmp_path / "reference.tif", [truth]), registers=False)["all"]
+    alone = xdem.DEM(str(write_raster(tmp_path / "alone.tif", [height])))
     difference = alone - xdem.DEM(str(tmp_path / "reference.tif"))
     values = difference.data.compressed()
     assert ours["count"] == values.size
@@ -136,10 +119,12 @@ def test_evaluate_surface__moves_the_reference_as_xdem_does(tmp_path):
 
     row, column = np.indices((150, 160)).astype(np.float64)
     truth = relief(row, column)
-    model = surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
-    reference = write(tmp_path / "reference.tif", [relief(row + 2, column + 3) - 5])
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
+    reference = write_raster(tmp_path / "reference.tif", [relief(row + 2, column + 3) - 5])
     ours = evaluate_surface(model, reference)["registration"]["shift"]
-    fit = xdem.coreg.NuthKaab().fit(xdem.DEM(str(write(tmp_path / "alone.tif", [truth]))), xdem.DEM(str(reference)))
+    fit = xdem.coreg.NuthKaab().fit(
+        xdem.DEM(str(write_raster(tmp_path / "alone.tif", [truth]))), xdem.DEM(str(reference))
+    )
     theirs = [fit.meta["outputs"]["affine"][name] for name in ("shift_x", "shift_y", "shift_z")]
     np.testing.assert_allclose(ours, theirs, atol=0.1)
 
@@ -148,11 +133,11 @@ def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkey
     random = np.random.default_rng(0)
     height = random.normal(50, 3, (23, 31))
     height[random.random(height.shape) < 0.1] = np.nan
-    model = surface(tmp_path / "dsm.tif", height, height - 1, height + 2)
+    model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 2)
     # Twice as fine and one metre further out: each of the four heights in a cell is judged by the cell's interval.
     fine = random.normal(50, 3, (50, 66))
     place = Affine(0.5, 0, PLACE.c - 1, 0, -0.5, PLACE.f + 1)
-    reference = write(tmp_path / "reference.tif", [fine], place)
+    reference = write_raster(tmp_path / "reference.tif", [fine], place)
     truth, height = fine[2:-2, 2:-2].astype(np.float32), np.repeat(np.repeat(height, 2, axis=0), 2, axis=1)
     known = np.isfinite(height)
     whole = evaluate_surface(model, reference, registers=False)
@@ -160,7 +145,7 @@ def test_evaluate_surface__reference_of_another_grid_and_strips(tmp_path, monkey
     inside = ((height - 1 <= truth) & (truth <= height + 2))[known]
     assert whole["all"]["coverage"] == pytest.approx(inside.mean(), abs=2e-3)
     assert whole["all"]["median"] == pytest.approx(np.median((height - truth)[known]), abs=0.01)
-    monkeypatch.setattr("sat_intervals.evaluate.dsm._TILE", 14**2)
+    monkeypatch.setattr("sat_intervals.evaluate.comparison._TILE", 14**2)
     assert evaluate_surface(model, reference, registers=False) == whole
 
 
@@ -168,9 +153,9 @@ def test_evaluate_surface__slope_is_that_of_the_references_own_grid(tmp_path):
     # A plane that rises 0.1 a metre, 5.7 degrees, known every 8 m, under cells of 1 m.
     coarse = 0.1 * 8 * np.broadcast_to(np.arange(12.0), (10, 12))
     height = np.broadcast_to(0.1 * (np.arange(96.0) - 3.5), (80, 96))
-    model = surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
+    model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
     place = Affine(8, 0, PLACE.c, 0, -8, PLACE.f)
-    report = evaluate_surface(model, write(tmp_path / "reference.tif", [coarse], place), registers=False)
+    report = evaluate_surface(model, write_raster(tmp_path / "reference.tif", [coarse], place), registers=False)
     counts = [kind["count"] for kind in report["slope"]]
     assert counts[0] == 10 * 80  # beside the reference's outermost centres, where it is flat
     assert counts[1] == 86 * 80
@@ -178,8 +163,8 @@ def test_evaluate_surface__slope_is_that_of_the_references_own_grid(tmp_path):
 
 
 def test_evaluate_surface__takes_scale_and_offset_of_the_reference(tmp_path):
-    model = surface(tmp_path / "dsm.tif", [[100.5, 101]], [[100.0, 100]], [[102.0, 102]])
-    reference = write(tmp_path / "reference.tif", [[[15.0, 10]]])
+    model = write_surface(tmp_path / "dsm.tif", [[100.5, 101]], [[100.0, 100]], [[102.0, 102]])
+    reference = write_raster(tmp_path / "reference.tif", [[[15.0, 10]]])
     with rasterio.open(reference, "r+") as dataset:
         dataset.scales, dataset.offsets = (0.1,), (100.0,)
     report = evaluate_surface(model, reference, registers=False)["all"]
@@ -197,8 +182,8 @@ def test_histogram__deviation_is_the_median_distance_from_the_median(values):
 
 
 def test_evaluate_command__of_a_surface(tmp_path):
-    model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
-    reference = write(tmp_path / "reference.tif", [[[1.5, 9]]])
+    model = write_surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
+    reference = write_raster(tmp_path / "reference.tif", [[[1.5, 9]]])
     result = invoke("evaluate", "--dsm", model, "--reference", reference)
     assert result.exit_code == 0
     assert result.stdout.splitlines()[2].split() == [
@@ -213,8 +198,8 @@ def test_evaluate_command__of_a_surface(tmp_path):
 def test_evaluate_command__writes_figures_and_pictures(tmp_path):
     row, column = np.indices((60, 70)).astype(np.float64)
     truth = relief(row, column)
-    model = surface(tmp_path / "dsm.tif", truth + 0.1, truth - 0.5, truth + 0.5)
-    words = "evaluate", "--dsm", model, "--reference", write(tmp_path / "reference.tif", [truth])
+    model = write_surface(tmp_path / "dsm.tif", truth + 0.1, truth - 0.5, truth + 0.5)
+    words = "evaluate", "--dsm", model, "--reference", write_raster(tmp_path / "reference.tif", [truth])
     result = invoke(*words, "--pictures", tmp_path, "--no-register")
     assert result.exit_code == 0, result.output
     written = [tmp_path / f"dsm-{name}" for name in ("accuracy.json", "accuracy.md", "reliability.png", "errors.png",
@@ -242,24 +227,24 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
 
 
 def test_evaluate_surface__ends_where_a_file_is_replaced_meanwhile(tmp_path, monkeypatch):
-    model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
-    reference = write(tmp_path / "reference.tif", [[[1.5, 2]]])
-    compared = dsm._compared
+    model = write_surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
+    reference = write_raster(tmp_path / "reference.tif", [[[1.5, 2]]])
+    compared = dsm.compared
 
     def replaced_after(*arguments):
-        write(reference, [[[1.5, 9]]])
+        write_raster(reference, [[[1.5, 9]]])
         return compared(*arguments)
 
-    monkeypatch.setattr(dsm, "_compared", replaced_after)
+    monkeypatch.setattr(dsm, "compared", replaced_after)
     with pytest.raises(RunError, match=r"reference.tif was replaced or changed while it was read: rerun"):
         evaluate_surface(model, reference, registers=False)
 
 
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
-    model = surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
-    away = write(tmp_path / "away.tif", [[[1.5, 9]]], Affine(1, 0, 5, 0, -1, 5))
-    feet = write(tmp_path / "feet.tif", [[[3000.0, 3003]]])
-    nowhere = write(tmp_path / "nowhere.tif", [[[1.5, 9]]], crs=None)
+    model = write_surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
+    away = write_raster(tmp_path / "away.tif", [[[1.5, 9]]], Affine(1, 0, 5, 0, -1, 5))
+    feet = write_raster(tmp_path / "feet.tif", [[[3000.0, 3003]]])
+    nowhere = write_raster(tmp_path / "nowhere.tif", [[[1.5, 9]]], crs=None)
     for words, message in (
         ([], "Missing argument 'OUT...'"),
         (["--dsm", model], "--dsm and --reference go together"),

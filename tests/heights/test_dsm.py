@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from pyproj import Transformer
-from rasterio.transform import Affine
+from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
+from sat_intervals.config import load_height_calibration
 from sat_intervals.errors import RunError
-from sat_intervals.heights import dsm
+from sat_intervals.heights import cells
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
@@ -142,7 +143,7 @@ def test_make_surface__ends_where_points_are_replaced_meanwhile(tmp_path, monkey
     x, y = np.meshgrid(np.arange(20.0), -np.arange(60.0))
     out = write_points(tmp_path / "a", x, y, 10 + 0 * x)
     other = write_points(tmp_path / "b", x, y, 99 + 0 * x)
-    monkeypatch.setattr(dsm, "_TILE_ROWS", 16)
+    monkeypatch.setattr(cells, "_TILE_ROWS", 16)
 
     def replace(stage, done, total):
         if stage == "cells" and done < total:
@@ -161,7 +162,7 @@ def test_make_surface__keeps_the_surface_whose_grid_it_takes(tmp_path):
         surface_of([out], tmp_path, resolution=tmp_path / "dsm.tif", crs=None)
 
 
-def test_make_surface__several_runs_are_intersected_where_they_meet(tmp_path):
+def test_make_surface__of_several_runs_is_their_mean_where_they_meet(tmp_path):
     # Three cells 10 m apart. One run says 9 to 12 in each, the other 10 to 13, 29 to 32, and nothing.
     one = write_points(tmp_path / "a", [0.5, 10.5, 20.5], [-0.5] * 3, [10.0] * 3, confidence=1.0)
     two = write_points(tmp_path / "b", [0.5, 10.5, 20.5], [-0.5] * 3, [11.0, 30.0, np.nan], confidence=0.0)
@@ -169,13 +170,23 @@ def test_make_surface__several_runs_are_intersected_where_they_meet(tmp_path):
         surface, place, report = surface_of(outs, tmp_path, radius=0.6)
         i, j = cell_of(place, LEFT, TOP)
         cells = surface[:, i, [j, j + 10, j + 20]]
-        assert_allclose(cells[BAND["height_lower"]], [10, 9, 9], atol=1e-4)
-        assert_allclose(cells[BAND["height_upper"]], [12, 32, 12], atol=1e-4)
+        assert_allclose(cells[BAND["height_lower"]], [9.5, 9, 9], atol=1e-4)
+        assert_allclose(cells[BAND["height_upper"]], [12.5, 32, 12], atol=1e-4)
         assert_allclose(cells[BAND["height"]], [10.5, 20, 10], atol=1e-4)
         assert_allclose(cells[BAND["confidence"]], [0.5, 0.5, 1.0], atol=1e-4)
         assert_array_equal(cells[BAND["count"]], [2, 2, 1])
         assert_array_equal(cells[BAND["agreement"]], [1, 0, np.nan])
         assert report["disagreeing"] == 0.5
+
+
+def test_make_surface__of_several_runs_follows_the_narrow_intervals(tmp_path):
+    # 9 to 12 around 10, weight 1 / 9; 10.5 to 11.5 around 11, weight 1. Middle (10.5 / 9 + 11) / (10 / 9) = 10.95;
+    # width sqrt(2 / (10 / 9)) = 1.3416; height (10 / 9 + 11) / (10 / 9) = 10.9.
+    one = write_points(tmp_path / "a", [0.5], [-0.5], [10.0])
+    two = write_points(tmp_path / "b", [0.5], [-0.5], [11.0], lower=0.5, upper=0.5)
+    surface, place, _ = surface_of([one, two], tmp_path, radius=0.6)
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(surface[:3, i, j], [10.9, 10.95 - 1.3416 / 2, 10.95 + 1.3416 / 2], atol=1e-4)
 
 
 def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
@@ -184,8 +195,8 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
     out = write_points(tmp_path / "a", x, -y, random.normal(100, 5, x.shape))
     whole, place, _ = surface_of([out], tmp_path)
     monkeypatch.setattr("sat_intervals.heights.point_cloud.WINDOW", 7)
-    monkeypatch.setattr("sat_intervals.heights.dsm._TILE_ROWS", 20)
-    monkeypatch.setattr("sat_intervals.heights.dsm._TILE_COLUMNS", 25)
+    monkeypatch.setattr("sat_intervals.heights.cells._TILE_ROWS", 20)
+    monkeypatch.setattr("sat_intervals.heights.cells._TILE_COLUMNS", 25)
     tiled, same_place, _ = surface_of([out], tmp_path)
     assert place == same_place
     assert_allclose(tiled, whole, atol=1e-4)
@@ -248,7 +259,7 @@ def test_make_surface__heights_do_not_depend_on_the_bounds(tmp_path, bounds, mon
     assert (narrow[1:3][[0, 1]] >= wide[[1, 1]])[0][np.isfinite(wide[0])].all()
     assert (narrow[1] <= narrow[0])[np.isfinite(wide[0])].all()
     assert (narrow[2] <= wide[2])[np.isfinite(wide[0])].all()
-    monkeypatch.setattr("sat_intervals.heights.dsm._LISTED_POINTS", 100)  # small tiles
+    monkeypatch.setattr("sat_intervals.heights.cells._LISTED_POINTS", 100)  # small tiles
     tiled, _, _ = surface_of([out], tmp_path, choices=SurfaceChoices(bounds=bounds))
     assert_allclose(tiled, narrow, atol=1e-4)
 
@@ -289,6 +300,44 @@ def test_make_surface__poor_cells_are_no_data(tmp_path):
     assert np.isfinite(surface[3]).sum() == 1
 
 
+CALIBRATION = """\
+name: city
+coverage: 0.8
+surface: {CELL: 1 m, PAIRS: '1', INTERVAL: median, RADIUS: 0.6 m, COVERAGE: '0.9', OPEN_POINTS: left out}
+classes:
+- {below: 5.0, margin: 0.75, cells: 100}
+- {below: null, margin: -4.0, cells: 100}
+"""
+
+
+def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tmp_path):
+    # Heights 10, bounds 1 below and 2, 9 above: 8.25 to 12.75; 10 (not past the height) to 15.
+    out = write_points(tmp_path / "a", [0.5, 4.5], [-0.5] * 2, [10.0] * 2, upper=[[2, 9]])
+    file = tmp_path / "heights.yaml"
+    file.write_text(CALIBRATION)
+    words = ["dsm", str(with_coverage(out)), "--resolution", "1", "--radius", "0.6", "--calibration", str(file)]
+    result = invoke(*words, "--max-width", "6")
+    assert result.exit_code == 0, result.stderr
+    assert "by --bounds median, calibration city" in result.stdout
+    with rasterio.open(out / "dsm.tif") as dataset:
+        (surface, place), tags = (dataset.read(), dataset.transform), dataset.tags()
+    i, j = cell_of(place, LEFT, TOP)
+    assert_allclose(surface[:3, i, [j, j + 4]].T, [(10, 8.25, 12.75), (10, 10, 15)], atol=1e-5)
+    assert (tags["COVERAGE"], tags["HEIGHTS"]) == ("0.8", "above the WGS 84 ellipsoid")
+    assert tags["CALIBRATION"] == f"city {load_height_calibration(file).sha256}"
+    for changes, message in (
+        (["--resolution", "2"], "belongs to other surfaces, CELL is 1 m there and 2 m here: make one with"),
+        (["--bounds", "mean"], "INTERVAL is median there and mean here"),
+        (["--radius", "1"], "RADIUS is 0.6 m there and 1 m here"),
+        (["--outliers", "9"], "OUTLIERS is null there and 9 m here"),
+        (["--calibration", str(tmp_path / "none.yaml")], "No such file or directory: make one with"),
+    ):
+        result = invoke(*words, *changes)
+        assert result.exit_code == 2, result.output
+        assert message in result.stderr
+        assert result.stderr.count("\n") == 1
+
+
 def test_make_surface__takes_the_grid_of_a_raster(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 4.5], [-0.5, -0.5], [10.0, 20.0])
     like = tmp_path / "like.tif"
@@ -315,7 +364,7 @@ def test_make_surface__of_a_run_without_intervals_has_heights_alone(tmp_path, bo
     assert report["without_intervals"] == [str(plain)]
     other = write_points(tmp_path / "b", [0.5], [-0.5], [11.0])
     surface, place, _ = surface_of([plain, other], tmp_path, radius=0.6, choices=SurfaceChoices(bounds=bounds))
-    assert_allclose(surface[:4, i, j], [10.5, 10, 13, 2])
+    assert_allclose(surface[:4, i, j], [11, 10, 13, 2])
     assert np.isnan(surface[1:3, i, j + 4]).all()
     assert np.isnan(surface[BAND["agreement"]]).all()
 
@@ -393,14 +442,6 @@ def test_make_surface__file_says_what_it_is(tmp_path):
         tags = dataset.tags()
     assert (tags["INTERVAL"], tags["RADIUS"]) == ("envelope", "1 m")
     assert tags["HEIGHTS"] == "above the WGS 84 ellipsoid"
-
-
-def write_geoid(path, height):
-    """A geoid at one height over the whole area."""
-    kind = {"height": 4, "width": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(path, "w", driver="GTiff", transform=Affine(1, 0, 0, 0, -1, 46), **kind) as grid:
-        grid.write(np.full((1, 4, 4), height, np.float32))
-    return path
 
 
 def test_make_surface__heights_count_from_a_geoid(tmp_path):

@@ -8,10 +8,11 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import rasterio
-from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras
+from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, sensor_words
 from finished import write_run
 from helpers import invoke
 from rasterio.transform import Affine
+from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.demo import DATUM, PIXEL, VIEWS
@@ -30,11 +31,6 @@ pytestmark = [
 
 ROWS, COLUMNS, AROUND = 150, 190, 60
 MAP = Projection("EPSG:32631")
-OPTIONS = ("--left-model", "--right-model", "--left-grid", "--right-grid")
-
-
-def given(files):
-    return [word for pair in zip(OPTIONS, files, strict=True) for word in pair]
 
 
 def write_heights(path, heights, finer=1, crs="EPSG:4326"):
@@ -199,13 +195,6 @@ def test_make_truth__does_not_depend_on_tiles_or_the_search_range(tmp_path, monk
     assert np.isfinite(whole).mean() > 0.9
 
 
-def write_geoid(path, height):
-    kind = {"height": 4, "width": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(path, "w", driver="GTiff", transform=Affine(1, 0, 0, 0, -1, 46), **kind) as grid:
-        grid.write(np.full((1, 4, 4), height, np.float32))
-    return path
-
-
 def test_make_truth__adds_the_geoid(tmp_path):
     out, files, disparity = run_of(tmp_path, seen_of(hills, VIEWS[0]))
     reference = write_heights(tmp_path / "above.tif", on_ground(lambda r, c: hills(r, c) - 47.5, 2), 2)
@@ -309,13 +298,13 @@ def relief(tmp_path_factory):
 
 def test_reference_command__writes_a_truth_for_evaluate_and_calibrate(relief):
     out, files, reference = relief
-    result = invoke("reference", out, "--heights", reference, "--ellipsoid", *given(files))
+    result = invoke("reference", out, "--heights", reference, "--ellipsoid", *sensor_words(files))
     assert result.exit_code == 0, result.output
     assert "reference moved: easting" in result.output
     assert f"{ROWS * COLUMNS} pixels with a true disparity (100.0 %), 0.0 % of them outside" in result.output
     assert result.output.splitlines()[-1] == str(out / "truth.tif")
     figures = json.loads(
-        invoke("reference", out, "--heights", reference, "--ellipsoid", *given(files), "--json").stdout
+        invoke("reference", out, "--heights", reference, "--ellipsoid", *sensor_words(files), "--json").stdout
     )
     assert (figures["pixels"], figures["share"], figures["outside_range"]) == (ROWS * COLUMNS, 1.0, 0.0)
     assert max(map(abs, figures["registration"]["shift"])) < 0.1
@@ -364,11 +353,11 @@ def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
         ([*ones], swapped, "models and grids of left and right are swapped"),
         ([*ones, "--output", reference], files, "was not made by sat-intervals"),
     ):
-        result = invoke("reference", out, *words, *given(cameras_given))
+        result = invoke("reference", out, *words, *sensor_words(cameras_given))
         assert result.exit_code == 2, result.output
         assert message in result.stderr, (words, result.stderr)
         assert result.stderr.count("\n") == 1
-    result = invoke("reference", out, "--points", few, "--ellipsoid", "--no-register", *given(files))
+    result = invoke("reference", out, "--points", few, "--ellipsoid", "--no-register", *sensor_words(files))
     assert result.exit_code == 0, result.output
     assert "10 pixels with a true disparity" in result.output
 
@@ -398,7 +387,17 @@ def test_reference_command__replaces_only_a_truth_of_its_own(relief, tmp_path, n
     else:
         shutil.copy(out / name, mine)
     before = mine.read_bytes()
-    words = "reference", out, "--heights", reference, "--ellipsoid", "--no-register", "--output", mine, *given(files)
+    words = (
+        "reference",
+        out,
+        "--heights",
+        reference,
+        "--ellipsoid",
+        "--no-register",
+        "--output",
+        mine,
+        *sensor_words(files),
+    )
     assert f"{name} exists and was not made by sat-intervals" in invoke(*words).stderr
     assert mine.read_bytes() == before
     mine.unlink()
@@ -409,7 +408,7 @@ def test_reference_command__needs_points_of_the_run_to_register(relief, tmp_path
     _, files, reference = relief
     bands = np.ones((4, 40, 50), np.float32)
     out = write_run(tmp_path, bands, np.full((40, 50), OCCLUSION, np.uint16))
-    result = invoke("reference", out, "--heights", reference, "--ellipsoid", *given(files))
+    result = invoke("reference", out, "--heights", reference, "--ellipsoid", *sensor_words(files))
     assert result.exit_code == 2
     assert "has no points.tif: run sat-intervals triangulate on it first" in result.stderr
 
@@ -417,7 +416,7 @@ def test_reference_command__needs_points_of_the_run_to_register(relief, tmp_path
 def test_reference_command__a_surface_gives_the_disparities_of_its_run_back(shared_data, tmp_path):
     # a surface of the run itself is no truth, but must come back
     folder, out = shared_data / "dsm_picanteo", tmp_path / "out"
-    files = given(folder / name for name in ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif"))
+    files = sensor_words(folder / name for name in ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif"))
     pair = folder / "left.tif", folder / "right.tif"
     for step in (
         ("match", *pair, out, "--disparity", -35, 18, "--quiet"),

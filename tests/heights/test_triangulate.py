@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import rasterio
-from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid
+from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid, sensor_words
 from finished import MAXIMUM, MINIMUM, write_run
 from helpers import invoke, write_pair
 from rasterio.transform import Affine
@@ -197,18 +197,13 @@ def test_lattice__equals_shareloc(shared_data):
 
 
 FILES = ("left.geom", "right.geom", "left_grid.tif", "right_grid.tif")
-OPTIONS = ("--left-model", "--right-model", "--left-grid", "--right-grid")
-
-
-def given(files):
-    return [word for pair in zip(OPTIONS, files, strict=True) for word in pair]
 
 
 def test_commands__a_real_pair_to_a_surface_like_that_of_a_peer(shared_data, tmp_path):
     folder, out = shared_data / "dsm_picanteo", tmp_path / "out"
     steps = [
         ("match", folder / "left.tif", folder / "right.tif", out, "--disparity", -35, 18, "--quiet"),
-        ("triangulate", out, *given(folder / name for name in FILES)),
+        ("triangulate", out, *sensor_words(folder / name for name in FILES)),
         ("dsm", out, "--resolution", 1),
     ]
     for step in steps:
@@ -277,7 +272,7 @@ def test_triangulate_command__what_it_cannot_use_gets_one_line(level_run, tmp_pa
         ({3: descending}, "rows of {descending} are in descending order: give a grid in ascending order"),
     ]
     for changed, message in cases:
-        result = invoke("triangulate", out, *given(changed.get(place, file) for place, file in enumerate(files)))
+        result = invoke("triangulate", out, *sensor_words(changed.get(place, file) for place, file in enumerate(files)))
         assert result.exit_code == 2, result.output
         assert message.format(descending=descending) in result.output
         assert result.output.count("\n") == 1
@@ -293,11 +288,11 @@ def upside_down(file):
 def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_path):
     out, files = level_run
     shifted = grid(tmp_path / "shifted.tif", 40, 50, offset=1.5)
-    result = invoke("triangulate", out, *given([*files[:3], shifted]), "--quiet")
+    result = invoke("triangulate", out, *sensor_words([*files[:3], shifted]), "--quiet")
     assert result.exit_code == 0, result.output
     assert "warning: lines of sight miss each other by 0." in result.stderr
     assert result.stdout == ""
-    assert invoke("triangulate", out, *given(files)).stderr == ""
+    assert invoke("triangulate", out, *sensor_words(files)).stderr == ""
 
 
 def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path):
@@ -307,7 +302,7 @@ def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_
         positions = file.read()
         positions[:, 2, 2] = np.nan  # of epipolar row and column 0, a node of the lattice
         file.write(positions)
-    result = invoke("triangulate", out, *given(files))
+    result = invoke("triangulate", out, *sensor_words(files))
     assert result.exit_code == 0, result.output
     points = read(out / "points.tif")[BAND["height"]]
     lost = np.isnan(points)
@@ -358,7 +353,7 @@ def test_triangulate__keeps_foreign_points(level_run):
 
 def test_triangulate_command__needs_a_run(tmp_path):
     files = cameras(tmp_path, 40, 50)
-    result = invoke("triangulate", tmp_path, *given(files))
+    result = invoke("triangulate", tmp_path, *sensor_words(files))
     assert result.exit_code == 2
     assert "give the folder of a finished run" in result.output
 
@@ -367,14 +362,19 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     scene = make_scene(120, 150, seed=4)
     write_pair(tmp_path, scene)
     files = cameras(tmp_path, *scene.truth.shape)
-    options = ["--left-model", "--right-model", "--left-grid", "--right-grid"]
-    sensors = [str(word) for pair in zip(options, files, strict=True) for word in pair]
+    sensors = list(map(str, sensor_words(files)))
     images = [str(tmp_path / name) for name in ("left.tif", "right.tif")]
     search = ["--disparity", str(scene.minimum), str(scene.maximum)]
     out, steps = tmp_path / "one", tmp_path / "steps"
     command = ["surface", *images, str(out), *sensors, *search, "--resolution", "1"]
     wrong = invoke(*command[:-1], "-1")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
+    (tmp_path / "heights.yaml").write_text(
+        "{name: city, coverage: 0.9, surface: {CELL: 9 m}, classes: [{below: null, margin: 1.0, cells: 99}]}"
+    )
+    wrong = invoke(*command, "--height-calibration", tmp_path / "heights.yaml")
+    assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
+    assert "calibration city belongs to other surfaces, CELL is 9 m there and 1 m here" in wrong.stderr
     monkeypatch.setattr("sat_intervals.heights.dsm.PointCloud", None)  # an error of the last step
     assert invoke(*command).exit_code == 1
     monkeypatch.undo()
@@ -394,3 +394,43 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert np.array_equal(read(out / "dsm.tif"), read(steps / "dsm.tif"), equal_nan=True)
     other = invoke(*command, "--preset", "satellite")
     assert (other.exit_code, "already holds another run" in other.stderr) == (2, True)
+
+
+def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
+    scene = make_scene(120, 150, seed=4)
+    write_pair(tmp_path, scene)
+    files = cameras(tmp_path, *scene.truth.shape)
+    columns = "name,left,right,minimum,maximum,left_model,right_model,left_grid,right_grid,resolution"
+    images = f"left.tif,right.tif,{scene.minimum},{scene.maximum}"
+    sensors = ",".join(file.name for file in files)
+    pairs, out = tmp_path / "pairs.csv", tmp_path / "out"
+
+    def batch(*rows):
+        pairs.write_text("\n".join([columns, *rows]) + "\n")
+        return invoke("batch", pairs, out, "--quiet")
+
+    for row, message in (
+        (f"a,{images},{sensors},", "row 1 lacks resolution: a surface needs left_model"),
+        (f"a,{images},,,,,1", "row 1 lacks left_model and right_model and left_grid and right_grid: a surface needs"),
+        (f"a,{images},{sensors},wide", "resolution is 'wide', needed: a number"),
+        (f"a,{images},{sensors},-1", "resolution is -1 m: give one above 0"),
+        (f"a,{images},no.tif,{sensors.partition(',')[2]},1", "no.tif"),
+    ):
+        result = batch(row)
+        assert (result.exit_code, result.stderr.count("\n"), out.exists()) == (2, 1, False), result.output
+        assert message in result.stderr
+    both = f"a,{images},{sensors},1", f"b,{images},,,,,"
+    assert batch(*both).exit_code == 0
+    report = json.loads((out / "batch.json").read_text())
+    assert report["a"]["surface"]["crs"] == "EPSG:32631"
+    assert "surface" not in report["b"]
+    assert not (out / "b" / "dsm.tif").exists()
+    assert batch(f"a,{images},{sensors},2").exit_code == 0
+    assert read(out / "a" / "dsm.tif").shape[1] < 60  # made again
+    (out / "a" / "points.tif").write_bytes(b"mine")
+    (out / "a" / "points.json").unlink()
+    result = batch(f"a,{images},{sensors},1", f"b,{images},{sensors},1")
+    assert result.exit_code == 1
+    assert "a: " in result.stderr
+    assert "points.tif exists and was not made by triangulate" in result.stderr
+    assert (out / "b" / "dsm.tif").exists()

@@ -1,0 +1,214 @@
+"""Calibrate the intervals of a surface model in metres, against reference heights.
+
+Intervals of pixels know neither what the cells of a surface mix nor how models and grids err. The margins are those of
+split-conformal prediction, by class of width. Expected figures are those of blocks of ground that were held out.
+"""
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.config import HeightCalibration, WidthClass, surface_key
+from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.evaluate.comparison import (
+    Comparison,
+    check_common,
+    compared,
+    moved_by,
+    open_comparison,
+    registered,
+    tiles,
+)
+from sat_intervals.kernels.conformal import least_number, margins, widened
+from sat_intervals.raster import read_tags
+from sat_intervals.raster.identity import watched
+
+# Heights that are used: a sample, if there are more.
+_MOST = 1 << 20
+# Classes with the same number of cells, fewer with few cells; blocks along each side of the ground.
+_CLASSES, _BLOCKS = (8, 4, 2, 1), 4
+# Metres: a larger median difference is another datum, not an error.
+_DATUM = 10.0
+
+
+class Sample(NamedTuple):
+    """Cells with a height, perhaps an interval, and a reference: ``(n,)`` metres, and the block of ground of each."""
+
+    height: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    reference: np.ndarray
+    block: np.ndarray
+
+    @property
+    def width(self) -> np.ndarray:
+        """Return the widths of the intervals."""
+        return np.asarray(self.upper - self.lower)
+
+    def of(self, chosen: np.ndarray) -> "Sample":
+        """Return a part."""
+        return Sample(*(values[chosen] for values in self))
+
+
+class Margins(NamedTuple):
+    """Widths between classes, margins of classes, and their numbers of cells."""
+
+    limits: np.ndarray
+    margins: np.ndarray
+    cells: np.ndarray
+
+
+def calibrate_surface(
+    surface: str | Path, reference: str | Path, name: str, *, coverage: float | None = None, registers: bool = True
+) -> HeightCalibration:
+    """Find the margins with which the intervals of a surface model contain a share of reference heights.
+
+    Parameters
+    ----------
+    surface, reference, registers
+        As in `evaluate_surface`. The surface has intervals and was made without a calibration or largest width.
+    name
+        For people.
+    coverage
+        The share; by default the coverage of the surface's runs.
+
+    Returns
+    -------
+    Its provenance has the files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks
+    of ground with the margins of the other blocks (None with too few cells): coverage, median and mean width in metres;
+    ``lowest``, the smallest coverage of a block (None with too few cells in each).
+
+    Raises
+    ------
+    SatIntervalsError
+        A file cannot be used, both do not overlap, seem to have different datums, or have too few cells in common.
+    """
+    check_unchanged = watched([surface, reference])
+    given = open_comparison(surface, reference)
+    tags = read_tags(given.surface)
+    coverage = _checked_coverage(given.surface, tags, coverage)
+    found = registered(given) if registers else None
+    moved = moved_by(given, found and found.report())
+    sample, cells_of_height = _sample(moved)
+    check_unchanged()
+    _check_datum(given, sample, moved.shift[2])
+    sample = sample.of(np.isfinite(sample.width))
+    fit = fitted(sample, cells_of_height, coverage)
+    if fit is None:
+        raise SatIntervalsError(
+            f"{round(sample.height.size * cells_of_height)} cells of {given.surface} have an interval and a height in "
+            f"{given.reference}, {least_number(coverage)} are needed for coverage {coverage:g}: give a larger reference"
+        )
+    limits = [float(limit) for limit in fit.limits]
+    classes = tuple(
+        WidthClass(below=limit, margin=float(margin), cells=round(float(cells)))
+        for limit, margin, cells in zip([*limits, None], fit.margins, fit.cells, strict=True)
+    )
+    provenance = {
+        "software": f"sat-intervals {version('sat-intervals')}",
+        "surface": str(given.surface),
+        "reference": str(given.reference),
+        "shift": None if found is None else [round(float(value), 3) for value in moved.shift],
+        "before": _figures(sample, sample.lower, sample.upper),
+        "expected": _expected(sample, cells_of_height, coverage),
+    }
+    key = surface_key(tags, given.cell)
+    return HeightCalibration(name=name, coverage=coverage, surface=key, classes=classes, provenance=provenance)
+
+
+def _checked_coverage(surface: Path, tags: Mapping[str, str], coverage: float | None) -> float:
+    """Return the coverage to reach; raise if it or the surface cannot be used."""
+    for tag, option in (("CALIBRATION", "--calibration"), ("MAX_WIDTH", "--max-width")):
+        if tag in tags:
+            raise SatIntervalsError(f"{surface} was made with {option}: make it without, then calibrate it")
+    if coverage is None and "COVERAGE" not in tags:
+        raise SatIntervalsError(f"{surface} has no coverage, its runs were matched without one: give --coverage")
+    coverage = float(tags["COVERAGE"]) if coverage is None else coverage
+    if not COVERAGES[0] <= coverage <= COVERAGES[-1]:
+        raise SatIntervalsError(f"coverage is {coverage:g}, allowed: {COVERAGES[0]} to {COVERAGES[-1]}")
+    return coverage
+
+
+def _sample(given: Comparison) -> tuple[Sample, float]:
+    """Return heights spread over both, at most some `_MOST`, and the number of cells that one stands for."""
+    heights = given.finer**2
+    stride = -(-given.shape[0] * given.shape[1] * heights // _MOST)
+    parts, places = [], []
+    for window in tiles(given):
+        cells = compared(given, window)
+        row, column = (place[::stride] // given.finer for place in np.nonzero(cells.known))
+        parts.append([values[::stride] for values in cells[:4]])
+        places.append([row + window.row, column + window.column])
+    row, column = (_part(np.concatenate(values)) for values in zip(*places, strict=True))
+    height, lower, upper, truth = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return Sample(height, lower, upper, truth, _BLOCKS * row + column), min(1.0, stride / heights)
+
+
+def _part(place: np.ndarray) -> np.ndarray:
+    """Return in which of `_BLOCKS` parts of their range numbers are."""
+    if not place.size:
+        return place
+    first, count = int(place.min()), int(np.ptp(place)) + 1
+    return np.asarray(_BLOCKS * (place - first) // count)
+
+
+def _check_datum(given: Comparison, sample: Sample, up: float) -> None:
+    """Raise without a common height, or if the heights differ by as much as two datums do."""
+    median = float(np.median(sample.height - sample.reference)) + up if sample.height.size else None
+    check_common(given, sample.height.size, median)
+    if median is not None and abs(median) > _DATUM:
+        raise SatIntervalsError(
+            f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as those above "
+            "a geoid and the ellipsoid do: make the surface with --geoid, or convert the reference"
+        )
+
+
+def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins | None:
+    """Return margins by classes of width, of one class with few cells; None with too few for that."""
+    scores = np.maximum(sample.lower - sample.reference, sample.reference - sample.upper)
+    width = sample.width
+    for count in _CLASSES if width.size else ():
+        # between centimetres, so that rounding does not part intervals of one width
+        limits = np.unique(np.round(np.round(np.quantile(width, np.arange(1, count) / count), 2) + 0.005, 3))
+        limits = limits[limits < width.max()]
+        kinds = np.searchsorted(limits, width, side="right")
+        cells = cells_of_height * np.bincount(kinds, minlength=limits.size + 1)
+        if cells.min() >= least_number(coverage):
+            found = margins(scores, kinds, cells.size, coverage)
+            return Margins(limits, np.ceil(1000 * found) / 1000, cells)  # millimetres
+    return None
+
+
+def held_out(sample: Sample, cells_of_height: float, coverage: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return bounds with the margins of the other blocks of ground; None if those of a block have too few cells."""
+    lower, upper = np.full((2, sample.height.size), np.nan)
+    for block in np.unique(sample.block):
+        own = sample.block == block
+        fit = fitted(sample.of(~own), cells_of_height, coverage)
+        if fit is None:
+            return None
+        here = sample.of(own)
+        lower[own], upper[own] = widened(here.height, here.lower, here.upper, fit.limits, fit.margins)
+    return lower, upper
+
+
+def _expected(sample: Sample, cells_of_height: float, coverage: float) -> dict[str, float | None] | None:
+    """Return figures of bounds that were held out, and the smallest coverage of a block with enough cells."""
+    bounds = held_out(sample, cells_of_height, coverage)
+    if bounds is None:
+        return None
+    inside = (bounds[0] <= sample.reference) & (sample.reference <= bounds[1])
+    blocks = [inside[sample.block == block] for block in np.unique(sample.block)]
+    of_blocks = [float(one.mean()) for one in blocks if one.size * cells_of_height >= least_number(coverage)]
+    return _figures(sample, *bounds) | {"lowest": round(min(of_blocks), 4) if of_blocks else None}
+
+
+def _figures(sample: Sample, lower: np.ndarray, upper: np.ndarray) -> dict[str, float]:
+    """Return coverage, median and mean width of intervals."""
+    inside, width = (lower <= sample.reference) & (sample.reference <= upper), upper - lower
+    figures = {"coverage": inside.mean(), "median_width": np.median(width), "mean_width": width.mean()}
+    return {name: round(float(value), 4) for name, value in figures.items()}

@@ -1,0 +1,165 @@
+"""Compare a surface model with reference heights: open both, register the reference, read cells tile by tile."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.evaluate.accuracy import LARGEST
+from sat_intervals.kernels.registration import REACH, Blocks, Registration, register
+from sat_intervals.raster import (
+    Georeferencing,
+    check_reference,
+    is_surface,
+    read_heights,
+    read_layers,
+    read_place,
+    resolution_of,
+)
+from sat_intervals.tiling import Grid, Window
+
+# Heights compared at a time, some hundred bytes each.
+_TILE = 1 << 20
+# Blocks of each side that register, their sides in cells, and points of a block.
+_BLOCKS, _SMALLEST, _LARGEST_BLOCK, _POINTS = 8, 16, 256, 1000
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A surface model and its reference.
+
+    Attributes
+    ----------
+    surface, reference
+        The files.
+    shape, place
+        Size and georeferencing of the surface.
+    finer
+        Heights of the reference along a cell.
+    shift
+        Metres by which the reference is moved: easting, northing, height.
+    """
+
+    surface: Path
+    reference: Path
+    shape: tuple[int, int]
+    place: Georeferencing
+    finer: int
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def cell(self) -> float:
+        """Return the side of a cell in metres."""
+        assert self.place.pixel_size is not None
+        return self.place.pixel_size[0]
+
+    def heights(self, window: Window, finer: int = 1, *, smooth: bool = False) -> np.ndarray:
+        """Read the moved reference in a window of cells, which may reach beyond the surface, ``finer`` per side."""
+        east, north, up = self.shift
+        part = self.place.shifted(window).moved(-east, -north).refined(finer)
+        shape = finer * window.height, finer * window.width
+        smooth = smooth or (east, north) != (0.0, 0.0)
+        return np.asarray(read_heights(self.reference, part, shape, Window(0, 0, *shape), smooth=smooth) + up)
+
+
+def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
+    """Open a surface model and its reference.
+
+    Raises
+    ------
+    SatIntervalsError
+        A file cannot be read or used.
+    """
+    surface, reference = Path(surface), Path(reference)
+    shape, place = read_place(surface)
+    if not is_surface(surface):
+        raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: is it the --reference?")
+    read_place(reference)
+    check_reference(reference, surface)
+    assert place.pixel_size is not None
+    finer = max(1, round(place.pixel_size[0] / resolution_of(reference, place)))
+    return Comparison(surface, reference, shape, place, finer)
+
+
+def moved_by(given: Comparison, registration: dict[str, Any] | None) -> Comparison:
+    """Return a comparison with the reference moved by the registration of a report."""
+    return given if registration is None else replace(given, shift=tuple(registration["shift"]))
+
+
+def check_common(given: Comparison, count: int, median: float | None) -> None:
+    """Raise without a common height, or if they differ too much; ``median`` is that of height - reference."""
+    if not count or median is None:
+        raise SatIntervalsError(
+            f"no cell of {given.surface} has a height in {given.reference}: give a reference of the same place"
+        )
+    if abs(median) >= LARGEST:
+        raise SatIntervalsError(
+            f"the heights of {given.surface} and {given.reference} differ by {LARGEST} m or more in the median: check "
+            "that both are metres above the same datum"
+        )
+
+
+def tiles(given: Comparison) -> Iterator[Window]:
+    """Yield square tiles: windows of whole rows would read the blocks of a fine reference many times."""
+    side = max(1, int(_TILE**0.5) // given.finer)
+    return (tile.core for tile in Grid(Window(0, 0, *given.shape), side))
+
+
+class ComparedCells(NamedTuple):
+    """Heights of a tile that both the surface and its reference have, in metres.
+
+    Attributes
+    ----------
+    height, lower, upper, reference
+        ``(n,)`` heights, NaN bounds for a cell without an interval; a cell counts once for each reference height.
+    known
+        Mask of the reference heights of the tile that they are.
+    """
+
+    height: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    reference: np.ndarray
+    known: np.ndarray
+
+
+def compared(given: Comparison, window: Window) -> ComparedCells:
+    """Read the cells of a tile and the reference there."""
+    finer = given.finer
+    height, lower, upper = (
+        np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
+        for band in read_layers(given.surface, window)[:3].astype(np.float64)
+    )
+    reference = given.heights(window, finer)
+    known = np.isfinite(reference) & np.isfinite(height)
+    return ComparedCells(height[known], lower[known], upper[known], reference[known], known)
+
+
+def registered(given: Comparison) -> Registration | None:
+    """Return the shift from the reference to the surface; None with too few heights."""
+    side = min(_LARGEST_BLOCK, max(_SMALLEST, min(given.shape) // _BLOCKS))
+    grid = Grid(Window(0, 0, *given.shape), side)
+    size = side + 2 * (REACH + 1)
+    surfaces: list[np.ndarray] = []
+    parts: list[tuple[np.ndarray, ...]] = []
+    rows, columns = (range(0, count, -(-count // _BLOCKS)) for count in (grid.rows, grid.columns))
+    for core in (grid.tile(row, column).core for row in rows for column in columns):
+        height = read_layers(given.surface, core)[0].astype(np.float64)
+        row, column = np.nonzero(np.isfinite(height))
+        if not row.size:
+            continue
+        chosen = slice(None, None, -(-row.size // _POINTS))
+        row, column = row[chosen], column[chosen]
+        around = Window(core.row - REACH - 1, core.column - REACH - 1, size, size)
+        surface = given.heights(around, smooth=True)
+        if np.isfinite(surface).any():
+            places = (column + REACH + 1.0, row + REACH + 1.0, height[row, column])
+            parts.append((np.full(row.size, len(surfaces)), *places))
+            surfaces.append(surface.astype(np.float32))
+    if not parts:
+        return None
+    block, x, y, heights = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return register(Blocks(np.stack(surfaces), given.cell, block, x, y, heights, 1))
