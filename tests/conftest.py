@@ -50,9 +50,15 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
     return report
 
 
-# Settings that need different machine code: a worker compiles for the first, another one for the next two.
+# Settings that need different machine code: a worker compiles for the first, another one for the others.
 LEAST = {"cross_check": None, "median": None, "regularization": None}
-VARIANTS = ({}, {"sgm": {"penalty": "negative", "alpha": 1, "gamma": 40}} | LEAST, {"preset": "satellite"} | LEAST)
+SEARCH = {"minimum": 0, "maximum": 9}
+VARIANTS = (
+    {},
+    {"sgm": {"penalty": "negative", "alpha": 1, "gamma": 40}} | LEAST,
+    {"preset": "satellite"} | LEAST,
+    {"disparity": SEARCH | {"local": True}} | LEAST,
+)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -67,7 +73,7 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
         except FileExistsError:  # another worker compiles these
             continue
         try:
-            compile_kernels(load_config({"disparity": {"minimum": 0, "maximum": 9}} | settings))
+            compile_kernels(load_config({"disparity": SEARCH} | settings))
         finally:
             (shared / f"kernels{number}" / "done").touch()
     wait_until(lambda: len(list(shared.glob("kernels*/done"))) == len(VARIANTS), "kernels", seconds=600)

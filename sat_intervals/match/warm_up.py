@@ -5,6 +5,7 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.match.borders import borders_of, trace_area
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import cost_areas
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.match.patch import Frame, frame_area, match_patch, patch_windows
@@ -14,17 +15,19 @@ from sat_intervals.tiling import View, Window
 
 def compile_kernels(config: Config) -> None:
     """Compile every kernel that the settings need, by matching a few random pixels."""
-    random = np.random.default_rng(0)
+    random, search = np.random.default_rng(0), config.disparity
     frame = Frame.of_whole(Window(0, 0, 4, 4))
-    windows = patch_windows(frame, config)
+    ends = (np.full((1, 1), end, np.int16) for end in (search.minimum, search.maximum))
+    ranges = LocalRanges(*ends, 4, 4) if search.is_local else None
+    windows = patch_windows(frame, config, ranges)
     images = (random.random((window.height, window.width), np.float32) for window in windows)
     left, right = (
         View(window, pixels, np.zeros(pixels.shape, np.uint8)) for window, pixels in zip(windows, images, strict=True)
     )
     statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
     views = left, right
-    patch = match_patch(views, frame, config, statistics)
+    patch = match_patch(views, frame, config, statistics, ranges)
     if config.hands_states_on:
-        (cost,) = cost_areas(views, [frame_area(frame, config)], config, statistics)
-        trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config)
+        (cost,) = cost_areas(views, [frame_area(frame, config, ranges)], config, statistics)
+        trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config, ranges)
     list(postprocess_strips([RawRows.of(patch.raw, patch.right)], ConfidenceScale(0.0, 1.0), config))

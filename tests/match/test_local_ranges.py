@@ -5,7 +5,9 @@ import pytest
 
 from sat_intervals import SatIntervalsError, load_config
 from sat_intervals.demo import make_scene
+from sat_intervals.kernels.sweeps import sweep_down, sweep_up, trace_wave
 from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.match.whole import match_whole
 from sat_intervals.tiling import Window
 
@@ -80,3 +82,13 @@ def test_match_whole__a_cell_that_misses_the_truth_is_not_more_confident(images)
 def test_load_config__accurate_cross_checking_does_not_know_local_ranges():
     with pytest.raises(SatIntervalsError, match="local ranges, which cross_check"):
         load_config({"disparity": {"local": True}, "cross_check": {"method": "accurate"}})
+
+
+def test_compile_kernels__leaves_nothing_to_compile_for_local_ranges(images):
+    config = load_config(SEARCH | {"disparity": SEARCH["disparity"] | {"local": True}})
+    kernels = trace_wave, sweep_down, sweep_up
+    compile_kernels(config)
+    compiled = [len(kernel.signatures) for kernel in kernels]
+    cells = ranges(np.full((6, 10), -14), np.full((6, 10), 27))
+    match_whole(*images, config, ranges=cells)
+    assert [len(kernel.signatures) for kernel in kernels] == compiled
