@@ -55,9 +55,8 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
         volume += _NETWORK_BYTES * (patch + config.disparity.count)
     paths = 2 * 3 * (patch + config.disparity.count) * lanes
     together = tiles_together(config, size)
-    if (
-        config.hands_states_on
-    ):  # of four wavefronts: two lines of two paths, of three neighbours and of tiles in a block
+    if config.hands_states_on:
+        # of four wavefronts: two lines of two paths, of three neighbours and of tiles in a block
         paths += (1 + accurate) * 4 * (3 + together) * 8 * together * size * lanes
     if together > 1:
         paths += _VIEW_BYTES * together * size * (together * size + config.disparity.count)

@@ -169,15 +169,16 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
-    """Return a function that raises if a file was replaced or changed since; None and remote files are ignored.
+    """Return a function that raises if a file was made, replaced or changed since; None and remote files are ignored.
 
-    Call it between reading several times from files and publishing what was made of them.
+    Call it between reading several times from files and publishing what was made of them. Of rasters, see
+    `watched_rasters`.
     """
     before = {str(file): stamp_of(str(file)) for file in files if file is not None}
 
     def check() -> None:
         for file, stamp in before.items():
-            if stamp is not None and stamp_of(file) != stamp:
+            if stamp_of(file) != stamp:
                 raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
 
     return check

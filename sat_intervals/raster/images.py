@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from rasterio.io import DatasetReader
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.identity import stamp_of
+from sat_intervals.raster.identity import stamp_of, watched
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
@@ -244,3 +244,9 @@ def other_files(name: str) -> list[str]:
             if os.path.isfile(file) or (file.endswith((".vrt", ".VRT")) and not os.path.exists(file))
         ]
     return sorted(seen)
+
+
+def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:
+    """Return what `watched` returns, for rasters and their `other_files`."""
+    names = [str(file) for file in files if file is not None]
+    return watched(file for name in names for file in (name, *other_files(name)))

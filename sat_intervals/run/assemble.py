@@ -20,7 +20,8 @@ from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
 from sat_intervals.run.copying import assemble_files
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
-from sat_intervals.run.quality import checked_scale, quality_of, warnings_of
+from sat_intervals.run.quality import quality_of, warnings_of
+from sat_intervals.run.scale import checked_scale
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
 from sat_intervals.run.strips import finish_strips, parts_of
@@ -71,8 +72,10 @@ def assemble(
     SatIntervalsError
         No pixel could be matched.
     """
-    region, place = job.store.grid.region, job.left.georeferencing.shifted(job.store.grid.region)
-    files, records = run_files(job.config.products.compression), job.store.records()
+    region = job.store.grid.region
+    place = job.left.georeferencing.shifted(region)
+    files = run_files(job.config.products.compression)
+    records = job.store.records()
     scale = checked_scale(job, records)
     with _resumable(), OutputWriter(job.out, files, region.height, region.width, place, _tags(job.config)) as writer:
         with logged_stage(seconds, "bands"):
@@ -154,6 +157,14 @@ def _calibration(config: Config) -> dict[str, Any] | None:
     return {"name": calibration.name, "sha256": calibration.sha256, **levels.model_dump()}
 
 
+def _counts(config: Config, parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the counts of all pixels from the records of the parts."""
+    tally = Tally(config.disparity.count, config.disparity.minimum)
+    for part in parts:
+        tally.merge(part.get("counts", {}))
+    return tally.report()
+
+
 def _report(
     job: Job,
     records: Records,
@@ -163,11 +174,11 @@ def _report(
     files: dict[str, dict[str, int]],
 ) -> dict[str, Any]:
     """Return the content of run.json."""
-    grid, config, statistics = job.store.grid, job.config, job.statistics()
-    tally = Tally(config.disparity.count, config.disparity.minimum)
-    for part in parts:
-        tally.merge(part.get("counts", {}))
-    counts, quality = tally.report(), quality_of(job, records)
+    grid = job.store.grid
+    config = job.config
+    statistics = job.statistics()
+    counts = _counts(config, parts)
+    quality = quality_of(job, records)
     return {
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "settings": config.model_dump(mode="json"),

@@ -10,10 +10,9 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Part, run_files
 from sat_intervals.run.job import Job
-from sat_intervals.run.strips import codecs_of, on_worker, rows_of_levels
+from sat_intervals.run.strips import codecs_of, on_worker, parts_of, rows_of_levels
 from sat_intervals.run.workers import Task, Threads, Workers, reason
 from sat_intervals.store.parts import PartKey
-from sat_intervals.store.tiles import DamagedTilesError
 
 # Threads of this process that copy parts which workers cannot copy: one reads while another writes.
 _THREADS = 2
@@ -49,38 +48,38 @@ def assemble_files(
         A file cannot be written, or a part not be read.
     """
     files = run_files(job.config.products.compression)
-    damage: dict[str, None] = {}
-    copied, total = 0, len(files) * len(records)
+    total = len(files) * len(records)
+    copied: list[str | None] = []  # of each copied part None, or its name if it is damaged
+    with _copiers(job, workers) as copiers:
 
-    def copy_parts(path: Path, parts: Sequence[tuple[int, Part]]) -> None:
-        nonlocal copied
-        for outcome in there.outcomes(_tasks(job, path, parts)):
-            if outcome is not None and outcome.error is not None:
-                if isinstance(outcome.error, (OSError, SatIntervalsError)):
-                    raise outcome.error
-                raise RunError(
-                    f"a part of {path} could not be copied: {reason(outcome.error)}; rerun the same command: it resumes"
-                ) from outcome.error
-            if outcome is not None:
-                copied += 1
-                damage.update({outcome.result: None} if outcome.result else {})
-            progress("files", copied, total)
+        def copy_parts(path: Path, parts: Sequence[tuple[int, Part]]) -> None:
+            for outcome in copiers.outcomes(_tasks(job, path, parts)):
+                if outcome is not None and outcome.error is not None:
+                    if isinstance(outcome.error, (OSError, SatIntervalsError)):
+                        raise outcome.error
+                    raise RunError(
+                        f"a part of {path} could not be copied: {reason(outcome.error)}; rerun the same command: it "
+                        "resumes"
+                    ) from outcome.error
+                if outcome is not None:
+                    copied.append(outcome.result)
+                progress("files", len(copied), total)
 
-    progress("files", 0, total)
-    with _copiers(job, workers) as there:
+        progress("files", 0, total)
         for file in files:
             levels = [
                 [_part(file.kind, (level, row), records[level, row]) for row in range(count)]
                 for level, count in enumerate(rows_of_levels(job))
             ]
             writer.assemble(file.name, levels, copy_parts)
-    if damage:
-        raise DamagedTilesError("; ".join(damage))
+    if damaged := [name for name in copied if name is not None]:
+        raise parts_of(job).damaged(damaged)
 
 
 @contextmanager
 def _copiers(job: Job, workers: Workers | None) -> Iterator[Workers]:
-    if workers is not None and job.store.elsewhere is None:
+    """Yield the workers if they reach the folder of the run, else threads of this process."""
+    if isinstance(workers, Threads) or (workers is not None and job.store.elsewhere is None):
         yield workers
     else:
         with closing(Threads(_THREADS)) as threads:
@@ -94,7 +93,7 @@ def _part(kind: str, key: PartKey, record: Mapping[str, Any]) -> Part:
 def _tasks(job: Job, path: Path, parts: Sequence[tuple[int, Part]]) -> Iterator[Task]:
     codecs, retries = codecs_of(job), job.config.cluster.retries
     for offset, part in parts:
-        place = path, offset
+        place = path.absolute(), offset  # workers have other working folders
         yield Task(part.source, copy_part, (job, codecs, *part.source, (part.length, part.checksum), place), retries)
 
 
@@ -106,13 +105,12 @@ def copy_part(
     file: tuple[int, int],
     place: tuple[Path, int],
 ) -> str | None:
-    """Write a part with a size and checksum into a file at an offset; return what is wrong if it is damaged."""
+    """Write a part with a size and checksum into a file at an offset; return its name if it is damaged or missing."""
     path, offset = place
     with on_worker(job, codecs) as parts:
-        try:
-            content = parts.read(key, kind, file)
-        except DamagedTilesError as error:
-            return str(error)
+        content = parts.read(key, kind, file)
+        if content is None:
+            return parts.label(key, kind)
         # not for reading: NFS would write whole pages, over bytes of the neighbours
         with open(os.open(path, os.O_WRONLY), "wb") as stream:
             stream.seek(offset)

@@ -1,6 +1,6 @@
 """Prepare a pair for matching: open and check its images, folder, tiles and store."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
@@ -37,9 +37,8 @@ from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, h
 from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.run.workers import parse_memory
 from sat_intervals.store.before import inputs_before, search_before
-from sat_intervals.store.folder import LocalFolder, folder_at
+from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
-from sat_intervals.store.removal import PARTS
 from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run
 from sat_intervals.tiling import Grid, Tile, Window
 
@@ -76,8 +75,8 @@ class Job:
         Digest of the local search ranges, None without them.
     local
         The local search ranges; not on workers, which read them from the store.
-    has_looks
-        Whether tiles are looked at for the quality of the pair, which a report tells.
+    has_files
+        Whether files and a report are made of the tiles; `calibrate` only measures them.
     """
 
     left: Image
@@ -91,7 +90,7 @@ class Job:
     found: Found | None = None
     grid: str | None = None
     local: LocalRanges | None = None
-    has_looks: bool = True
+    has_files: bool = True
 
     @property
     def manifest(self) -> dict[str, Any]:
@@ -128,11 +127,42 @@ class Job:
         check_output(self.out, overwrite)
         restore(self.out, RUN_FILES)
         self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
-        if self.waiting():
-            self.store.steps.check_space(handed_bytes(self.store.grid, self.config))
         if self.found or self.local:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
             self.store.write_search(search, _origin(self.inputs))
+        if waiting := self.waiting():  # otherwise strips check the space before anything else
+            self.store.steps.check_space(handed_bytes(self.store.grid, self.config))
+            if self.has_files:
+                self.check_space(waiting, 1)
+
+    def check_space(self, tiles: Sequence[Tile], share: float) -> None:
+        """Raise if local disks have no room for what a run has yet to write.
+
+        Parameters
+        ----------
+        tiles
+            The tiles that are not done.
+        share
+            Share of the parts of the files that are not done.
+
+        Raises
+        ------
+        OutputError
+            Gives free and needed space.
+        """
+        region = self.store.grid.region
+        files = run_files(self.config.products.compression)
+        final = file_bytes(files, region.height, region.width)
+        before = sum(map(self.store.bytes_of, tiles)) + round(share * part_bytes(files, region.height, region.width))
+        if tiles:
+            before += self.store.steps.missing_bytes(handed_bytes(self.store.grid, self.config))
+        if self.store.elsewhere is None:
+            check_space(self.out, before + final, "tiles, files and their parts")
+            return
+        check_space(self.out, final, "files")
+        place = self.store.folder.place("")
+        if isinstance(place, Path):
+            check_space(place, before, "tiles and parts of files")
 
     def check_inputs(self) -> None:
         """Raise if an input changed since the start of the run, or this process has other weights.
@@ -208,14 +238,15 @@ def prepare(
     ``pair`` distinguishes otherwise equal pairs of a batch in an external store. ``find`` finds a search range that is
     not given; one that an interrupted run has found is taken over.
     """
-    config, out = resolved(load_config(config)), Path(out)
+    config = resolved(load_config(config))
+    out = Path(out)
     requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
     if not config.disparity.is_auto:
         check_tiles(fitted_to_jobs(config), region)
     check_output(out, overwrite)
-    home, elsewhere = out / "tiles", None
+    home = out / "tiles"
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
     before = None if overwrite else _found_before(home, config.cluster.store, inputs)
     config, found, local = searched(config, left, lambda: before or _find(find, left, right, files))
@@ -225,31 +256,26 @@ def prepare(
     check_tiles(config, region)
     read = [*files, config.disparity.grid, inputs["weights"]["path"] if "weights" in inputs else None]
     run = digest(_manifest(config, inputs, region, marked))
-    if config.cluster.store and folder_at(config.cluster.store) != folder_at(home):
-        name = "-".join(filter(None, (pair, run)))
-        elsewhere = str(folder_at(config.cluster.store).inside(name))
-    _check_space(out, config, region, has_parts=elsewhere is None)
+    elsewhere = _elsewhere(config.cluster.store, home, "-".join(filter(None, (pair, run))))
     # folders of runs in a local store: their names end with a digest
     stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
     check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
     if overwrite:
         check_replaceable(out)
     grid = Grid(region, config.tiles.size)
+    count = config.disparity.count
+    most = config.largest_ambiguity
     levels = config.subpixel_levels
     has_seams = config.tiles.overlap != "exact"
-    count, most = config.disparity.count, config.largest_ambiguity
     store = Store(home.absolute(), grid, count, most, levels, has_seams, run, elsewhere)
     return Job(left, right, config, store, out, inputs, files, requested, found, marked, local)
 
 
-def _check_space(out: Path, config: Config, region: Window, *, has_parts: bool) -> None:
-    """Raise if the disk has no room for the files, and for the parts that are not there yet if it has them, too."""
-    files, needed = run_files(config.products.compression), 0
-    if has_parts:
-        there = sum(LocalFolder(out / "tiles" / PARTS).sizes().values())
-        needed = max(0, part_bytes(files, region.height, region.width) - there)
-    needed += file_bytes(files, region.height, region.width)
-    check_space(out, needed, "files and their parts" if has_parts else "files")
+def _elsewhere(store: str | None, home: Path, name: str) -> str | None:
+    """Return the folder of a run in the store that the user names, None if its tiles are at home."""
+    if not store or folder_at(store) == folder_at(home):
+        return None
+    return str(folder_at(store).inside(name))
 
 
 def _find(find: Search | None, left: Image, right: Image, files: dict[str, dict[str, Any]]) -> Found:
@@ -278,7 +304,8 @@ def _version() -> str:
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
-    settings, levels = config.model_dump(mode="json", exclude=_NOT_OF_TILES), config.cuts
+    settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
+    levels = config.cuts
     if levels is not None:
         settings["interval"] = {"high": levels.high, "low": levels.low, "steps": config.bound_steps}
     return {
@@ -335,7 +362,8 @@ def checked_region(left: Image, window: Window | None) -> Window:
 
 def check_tiles(config: Config, region: Window) -> None:
     """Raise if tiles and strips do not fit in the memory of this machine or of a job; schedulers have their own."""
-    rows, memory = min(BLOCK, region.height), _job_bytes(config)
+    rows = min(BLOCK, region.height)
+    memory = _job_bytes(config)
     if memory is not None:
         check_strips(rows, region.width, config, memory, config.cluster.cores)
     if config.cluster.kind not in ("threads", "processes"):

@@ -29,12 +29,11 @@ from sat_intervals.match.postprocess import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, open_image
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster import Image, open_image, watched_rasters
 from sat_intervals.results import Layer
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
-from sat_intervals.run.quality import checked_scale
+from sat_intervals.run.scale import checked_scale
 from sat_intervals.run.workers import Workers, connected
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
@@ -123,7 +122,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
         Tiles failed.
     """
     found: list[Measured] = []
-    check_unchanged = watched(subject.truth.image.path for subject in subjects)
+    check_unchanged = watched_rasters(subject.truth.image.path for subject in subjects)
     levels = ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     scratch = Path(tempfile.mkdtemp(prefix=".calibrate-", dir=folder))
@@ -174,7 +173,7 @@ def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) ->
     """Prepare the job that matches a subject at two levels; open its store."""
     config = _at_levels(subject.config, float(levels[0]), float(levels[1]), None)
     job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name)
-    job = replace(job, has_looks=False)
+    job = replace(job, has_files=False)
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin()
     stack.callback(job.store.remove)

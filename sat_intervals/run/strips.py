@@ -21,12 +21,9 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     BLOCK,
     RUN_FILES,
-    check_space,
     codec_versions,
     compressed,
     factors,
-    file_bytes,
-    part_bytes,
     run_files,
 )
 from sat_intervals.run.job import Job
@@ -86,12 +83,16 @@ def finish_strips(
     RunError
         A strip failed.
     """
-    parts, counts, height = parts_of(job), rows_of_levels(job), job.store.grid.region.height
+    parts = parts_of(job)
+    counts = rows_of_levels(job)
+    height = job.store.grid.region.height
     keys = [(level, row) for level in reversed(range(len(counts))) for row in range(counts[level])]
     done = set(parts.done())
     waiting = [key for key in keys if key not in done]
-    _check_space(job, len(waiting) / len(keys))
-    damage: list[str] = []
+    job.check_space([], len(waiting) / len(keys))
+    parts.begin()
+    tiles: list[str] = []  # what is wrong with tiles
+    damaged: list[str] = []  # names of parts
 
     def tasks() -> Iterator[Task | None]:
         while waiting:
@@ -107,26 +108,18 @@ def finish_strips(
         if outcome is not None and outcome.error is not None:
             _fail(job, outcome.label, outcome.error)
         if outcome is not None and outcome.result is not None:
-            damage.append(outcome.result)  # the other strips are finished before the tiles are matched again
+            # the other strips are finished before the tiles are matched again
+            (damaged if outcome.label[0] else tiles).append(outcome.result)
         elif outcome is not None:
             done.add(outcome.label)
         progress("bands", min(height, BLOCK * sum(level == 0 for level, _ in done)), height)
-    if not damage:
-        progress("bands", height, height)
-        finished = parts.done()
-        damage = [f"part {level}_{row} is missing in {parts.folder}" for level, row in set(keys) - finished.keys()]
-    if damage:
-        raise DamagedTilesError(damage[0])
+    if tiles:
+        raise DamagedTilesError(tiles[0])
+    finished = parts.done()
+    if damaged := damaged or [parts.label(key) for key in sorted(set(keys) - finished.keys())]:
+        raise parts.damaged(damaged)
+    progress("bands", height, height)
     return finished, workers
-
-
-def _check_space(job: Job, share: float) -> None:
-    """Raise if a local disk has no room for a share of the parts, and for the files if they are there, too."""
-    files, region, place = run_files(job.config.products.compression), job.store.grid.region, job.store.folder.place("")
-    if isinstance(place, Path):
-        needed = round(share * part_bytes(files, region.height, region.width))
-        needed += file_bytes(files, region.height, region.width) if job.store.elsewhere is None else 0
-        check_space(place, needed, "files and their parts")
 
 
 def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
@@ -171,6 +164,7 @@ def finish_strip(
 
     ``records`` are those of the tiles of its rows and their halo.
     """
+    # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
     with on_worker(job, codecs) as parts, computing(job.config.cluster):
         (first, last), (top, bottom) = _rows(job, key[1]), _rows(job, key[1], halo(job.config))
         shape, search = (last - first, job.store.grid.region.width), job.config.disparity
@@ -191,17 +185,17 @@ def finish_strip(
 
 
 def reduce_rows(job: Job, codecs: Mapping[str, Any], key: PartKey, below: Sequence[PartKey]) -> str | None:
-    """Make a row of blocks of an overview from parts of the level below; see `finish_strip`."""
+    """Make a row of blocks of an overview from parts of the level below; return the name of one that is damaged."""
     with on_worker(job, codecs) as parts:
         halves = []
         for part in below:
             record = parts.record(part)
             if record is None:
-                return f"part {part[0]}_{part[1]} is missing in {parts.folder}"
-            try:
-                halves.append(_half(parts.read(part, _HALF, record["files"][_HALF]), record["half"]))
-            except DamagedTilesError as error:
-                return str(error)
+                return parts.label(part)
+            content = parts.read(part, _HALF, record["files"][_HALF])
+            if content is None:
+                return parts.label(part, _HALF)
+            halves.append(_half(content, record["half"]))
         rasters = [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)]
         _write(job, parts, key, rasters, {})
     return None

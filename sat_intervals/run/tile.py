@@ -114,12 +114,14 @@ def _match_tile(
                 borders = [_borders(job, tile, view, handed, ranges) for view in range(len(costs))]
             patch = match_costed(views, frame, costs, job.config, borders, ranges)
         del costs, borders
+        with timed(seconds, "write"):
+            products = _tile_products(patch, tile, job)
+        looks = [look._asdict() for look in _looks(views, tile, job)]
     usable = {side: int((view.state == 0).sum()) for side, view in zip(("left", "right"), views, strict=True)}
     if handed:
         handed[LAST][_place(tile)] = patch.leaving
     with timed(seconds, "write"):
-        files = job.store.write_arrays(tile, _tile_products(patch, tile, job), job.manifest)
-    looks = [look._asdict() for look in _looks(views, tile, job)]
+        files = job.store.write_arrays(tile, products, job.manifest)
     job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files, "looks": looks})
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
@@ -128,7 +130,7 @@ def _looks(views: Views, tile: Tile, job: Job) -> list[Look]:
     """Look at the quality of the pair in some of the tiles, unless the search for its range did so."""
     grid, search = job.store.grid, job.config.disparity
     steps = -(-grid.rows // _LOOKS), -(-grid.columns // _LOOKS)
-    if job.found or not job.has_looks or tile.grid_row % steps[0] or tile.grid_column % steps[1]:
+    if job.found or not job.has_files or tile.grid_row % steps[0] or tile.grid_column % steps[1]:
         return []
     return look_in_tile(views, tile.core, search.minimum, search.maximum)
 

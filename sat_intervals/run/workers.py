@@ -73,7 +73,7 @@ def readers(settings: Cluster) -> int:
 
 
 def computing(settings: Cluster) -> AbstractContextManager[Any]:
-    """Return a context for kernels, in which are never more threads than without `readers`."""
+    """Return a context for the kernels of a tile or strip: no more threads are in it at once than without `readers`."""
     return _turns(_cores(settings)) if readers(settings) else nullcontext()
 
 

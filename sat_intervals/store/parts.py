@@ -5,9 +5,7 @@ record is intact and its contents have these sizes. The names of parts have a di
 such as the median and the versions of the codecs: parts of other settings are no parts of a run.
 """
 
-import re
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +21,6 @@ PartKey = tuple[int, int]
 
 # Digits of a name that are the same for all runs of a folder.
 _OWNER_DIGITS = 8
-# Records of strips, with the digest of what made them.
-_STRIP = re.compile(r"([0-9a-f]{32})_0_\d+\.json")
 
 
 @dataclass(frozen=True)
@@ -68,11 +64,22 @@ class Parts:
                 found[level, row] = record
         return found
 
+    @property
+    def _current(self) -> str:
+        """Return the name of the file that says which parts are being made: there may be some of other settings."""
+        return f"{PARTS}/{self._owner}_current"
+
+    def begin(self) -> None:
+        """Note that the parts of this run are being made, for `strips_done`."""
+        self.folder.write(self._current, self._run)
+        if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
+            self.folder.delete(self._current)
+
     def strips_done(self) -> int:
-        """Return the number of finished strips, whatever made them; with several settings the largest number."""
-        records = filter(None, map(_STRIP.fullmatch, self.folder.inside(PARTS).sizes()))
-        made_by = Counter(record[1] for record in records if record[1].startswith(self._owner))
-        return max(made_by.values(), default=0)
+        """Return the number of finished strips of the owner's run that began last, whatever the settings."""
+        run = self.folder.read(self._current)
+        names = self.folder.inside(PARTS).sizes()
+        return sum(name.startswith(f"{run}_0_") and name.endswith(".json") for name in names)
 
     def record(self, key: PartKey) -> dict[str, Any] | None:
         """Return the record of a part; None if it is missing or damaged."""
@@ -93,13 +100,11 @@ class Parts:
             self.folder.delete_all([*names], [PARTS])
             self.folder.delete_if_empty()
 
-    def read(self, key: PartKey, kind: str, file: Sequence[int]) -> bytes:
-        """Read a content with this size and checksum.
+    def read(self, key: PartKey, kind: str, file: Sequence[int]) -> bytes | None:
+        """Read a content with this size and checksum; None if it is missing or damaged: the part is no longer done.
 
         Raises
         ------
-        DamagedTilesError
-            It is missing or damaged; the part is no longer done.
         RunError
             It cannot be read.
         """
@@ -113,10 +118,19 @@ class Parts:
             ) from error
         if content is None or checksum(content) != list(file):
             self.folder.delete(f"{PARTS}/{name}.json")
-            raise DamagedTilesError(
-                f"the part {name}_{kind} in {self.folder} is damaged: rerun the same command: it makes it again"
-            )
+            return None
         return content
+
+    def label(self, key: PartKey, kind: str = "") -> str:
+        """Return how messages name a part, or one of its contents."""
+        return "_".join([*map(str, key), *filter(None, [kind])])
+
+    def damaged(self, labels: Iterable[str]) -> DamagedTilesError:
+        """Return the error for parts that must be made again."""
+        return DamagedTilesError(
+            f"parts {', '.join(labels)} in {self.folder} are damaged or missing: rerun the same command: it makes them "
+            "again"
+        )
 
     def drop(self) -> None:
         """Delete the parts of all runs of the owner, such as those of earlier settings; call it after publishing."""

@@ -15,7 +15,7 @@ NORMALIZATION, SEARCH = "normalization.json", "range.json"
 _GROUP = f"{ARRAYS}/zarr.json"
 _OF_RUN = re.compile(
     rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
-    rf"|{PARTS}/[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)"
+    rf"|{PARTS}/(?:[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)|[0-9a-f]{{8}}_current)"
 )
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"

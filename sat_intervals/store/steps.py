@@ -64,6 +64,11 @@ class Steps:
         names = (f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes())
         self.folder.delete_all([name for name in names if is_of_tile(name)], [COSTS])
 
+    def missing_bytes(self, needed: int) -> int:
+        """Return the bytes that a run has yet to write of those that it needs for its steps."""
+        there = sum(sum(self.folder.inside(kind).sizes().values()) for kind in (BORDERS, COSTS)) if needed else 0
+        return max(0, needed - there)
+
     def check_space(self, needed: int) -> None:
         """Raise if the disk has no room for the bytes that a run needs for its steps and does not have yet.
 
@@ -72,7 +77,7 @@ class Steps:
         StoreError
             Gives free and needed space.
         """
-        needed -= sum(sum(self.folder.inside(kind).sizes().values()) for kind in (BORDERS, COSTS)) if needed else 0
+        needed = self.missing_bytes(needed)
         free = self.folder.free_bytes()
         if free is not None and free < needed:
             raise StoreError(

@@ -262,11 +262,14 @@ class Store:
         reasons, done = self.folder.read_all(FAILURES), self.done()
         return {name: _reason(reasons[name]) for name in sorted(reasons) if name not in done}
 
+    def bytes_of(self, tile: Tile) -> int:
+        """Return the size of a tile's products, at most."""
+        return self._arrays.bytes_of(tile)
+
     def check_space(self, tile: Tile) -> None:
         """Raise an OSError if the disk has no room for the products of a tile; call it before matching."""
-        needed = self._arrays.bytes_of(tile)
         free = self.folder.free_bytes()
-        if free is not None and free < needed:
+        if free is not None and free < self.bytes_of(tile):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
 
     def records(self) -> dict[str, dict[str, Any]]:

@@ -132,7 +132,8 @@ class TileArrays:
             with two levels ``lower_low`` and ``upper_low``; optionally ``right_cost`` and ``right_winner``; ``seams``
             (SIDES, own line or ring, winner and bounds, size); ``histogram``.
         """
-        height, shards = arrays["winner"].shape[0], {}
+        height = arrays["winner"].shape[0]
+        shards = {}
         for dtype, planes in _planes(self.levels).items():
             shards[dtype] = self._pieces(np.stack([arrays[name].view(dtype) for name in planes]), self.grid.size)
         rank = np.full((height, self._reach), _UNSEEN)
@@ -163,7 +164,9 @@ class TileArrays:
         """
         together = math.gcd(self.grid.size, _ROWS_TOGETHER)
         pieces: list[bytes] = []
-        index, place, height = [], 0, array.shape[-2]
+        index: list[int] = []
+        place = 0
+        height = array.shape[-2]
         for row in range(0, self.grid.size, together):
             rows = array[..., row : row + together, :]
             more = [(0, 0)] * (array.ndim - 2) + [(0, together - rows.shape[-2]), (0, width - array.shape[-1])]
@@ -265,7 +268,8 @@ def _descriptions(
         ).metadata
 
     size, height, width = grid.size, grid.rows * grid.size, grid.columns * grid.size
-    together, reach = math.gcd(size, _ROWS_TOGETHER), _reach(grid, count)
+    together = math.gcd(size, _ROWS_TOGETHER)
+    reach = _reach(grid, count)
     for dtype, planes in _planes(levels).items():
         planes_together = len(planes)
         describe(
@@ -276,7 +280,8 @@ def _descriptions(
             dtype,
         )
     describe(_RIGHT, (height, grid.columns * reach), (size, reach), (together, reach), np.uint32, _UNSEEN)
-    lines, counts = (len(SIDES), 2, 5 if levels == 2 else 3, size), ambiguities + 1
+    lines = len(SIDES), 2, 5 if levels == 2 else 3, size
+    counts = ambiguities + 1
     if has_seams:
         describe("seams", (grid.rows, grid.columns, *lines), None, (1, 1, *lines), _TABLES["seams"], NO_DISPARITY)
     describe("histogram", (grid.rows, grid.columns, counts), None, (1, 1, counts), _TABLES["histogram"])
@@ -300,7 +305,7 @@ def checksum(content: bytes | memoryview) -> list[int]:
 
 
 class _CheckedStore(WrapperStore[Store]):
-    """A zarr store that checks the checksum of a file on its first read, and again if a local file has changed."""
+    """A zarr store that checks all that it reads: whole files, or whole pieces of shards."""
 
     def __init__(self, store: Store, checksums: Checksums) -> None:
         super().__init__(store)
@@ -330,7 +335,8 @@ def _is_intact(content: bytes, byte_range: ByteRequest | None, checksums: Sequen
         assert isinstance(byte_range, SuffixByteRequest)  # for the index
         first, last = size - byte_range.suffix, size
     starts = accumulate(pieces[::2], initial=0)
-    place, view = 0, memoryview(content)
+    place = 0
+    view = memoryview(content)
     for start, length, crc in zip(starts, pieces[::2], pieces[1::2], strict=False):
         if first <= start < last:
             if checksum(view[place : place + length]) != [length, crc]:
