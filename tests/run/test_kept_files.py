@@ -31,6 +31,7 @@ from sat_intervals.raster import (
     other_files,
     publishing,
     put_back,
+    watched_rasters,
     write_layer,
 )
 from sat_intervals.raster.identity import ChangedInputError, identity
@@ -163,6 +164,17 @@ def test_other_files__are_those_of_the_sources_of_a_virtual_raster_too(pair):
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(folder / "mask.tif", "r+") as file:
         file.write_mask(np.full((80, 100), 255, np.uint8))
     assert other_files(str(folder / "mask.vrt")) == [str(folder / "mask.tif"), str(folder / "mask.tif.msk")]
+
+
+@pytest.mark.parametrize("name", ["mask.tif", "points.tif"])
+def test_watched_rasters__sees_a_changed_source_and_a_new_file(pair, name):
+    folder, _ = pair
+    check = watched_rasters([folder / "mask.vrt", folder / "points.tif", None, "http://127.0.0.1:1/image.tif"])
+    check()
+    with (folder / name).open("ab") as file:
+        file.write(b"more")
+    with pytest.raises(ChangedInputError, match=rf"{name} was replaced or changed while it was read"):
+        check()
 
 
 def test_match_pair__goes_on_where_an_input_is_touched_and_not_changed(pair):

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import tracemalloc
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +28,7 @@ from sat_intervals.run.job import check_tiles, prepare
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.status import read_status
 from sat_intervals.store.local import LocalFolder
-from sat_intervals.store.tiles import DamagedTilesError
+from sat_intervals.store.tiles import DamagedTilesError, Store
 from sat_intervals.tiling import Window
 
 # Four strips, two rows of the first overview and one of the second.
@@ -113,7 +114,7 @@ def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, mon
     assert hashes(out) == hashes(tall[0] / "kept")
 
 
-@pytest.mark.parametrize("by", ["workers", "command"])
+@pytest.mark.parametrize("by", ["workers", "workers of a store", "command"])
 def test_assemble_files__gives_the_same_bytes_whoever_copies(tall, tmp_path, monkeypatch, by):
     threads, outcomes = [], copying.Threads.outcomes
 
@@ -122,15 +123,38 @@ def test_assemble_files__gives_the_same_bytes_whoever_copies(tall, tmp_path, mon
             threads.append((pool._count, outcome.label))
             yield outcome
 
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
     monkeypatch.setattr(copying.Threads, "outcomes", counted)
-    # a store of its own may be out of the workers' reach
-    store = {} if by == "workers" else {"store": str(tmp_path / "store")}
+    store = {"store": str(tmp_path / "store")} if by == "workers of a store" else {}
+    if by == "command":  # all parts are there, so no workers are started
+        with monkeypatch.context() as patch:
+            patch.setattr(OutputWriter, "assemble", stop)
+            with pytest.raises(KeyboardInterrupt):
+                matched(tall, with_tiles(tall, tmp_path / "out"))
     done = []
     matched(tall, tmp_path / "out", cluster=store | {"workers": 3}, progress=lambda *how: done.append(how))
     copied = [count for count, label in threads if isinstance(label[-1], str)]
-    assert copied == 2 * PARTS * [3 if by == "workers" else 2]
+    assert copied == 2 * PARTS * [2 if by == "command" else 3]
     assert [how for how in done if how[0] == "files"][:-2] == [("files", n, 2 * PARTS) for n in range(2 * PARTS + 1)]
     assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
+
+
+@pytest.mark.parametrize("store", [None, "s3://bucket/run"])
+def test_copiers__are_workers_that_reach_the_folder(store):
+    job, workers = SimpleNamespace(store=SimpleNamespace(elsewhere=store)), SimpleNamespace()
+    with copying._copiers(job, workers) as copiers:
+        assert (copiers is workers) == (store is None), "other processes may not reach the folder of a run with a store"
+    with closing(copying.Threads(1)) as threads, copying._copiers(job, threads) as copiers:
+        assert copiers is threads
+
+
+def test_tasks__give_workers_of_other_folders_absolute_paths(tall):
+    folder, settings = tall
+    job = prepare(folder / "left.tif", folder / "right.tif", folder / "new", settings)
+    (task,) = copying._tasks(job, Path("out/strips"), [(7, copying.Part([1], 2, ((0, 0), "validity")))])
+    assert task.arguments[-1] == (Path.cwd() / "out/strips", 7)
 
 
 @pytest.mark.parametrize("how", ["gone", "bit"])
@@ -148,7 +172,9 @@ def test_assemble_files__makes_all_damaged_parts_again_at_once(tall, tmp_path, m
     monkeypatch.setattr("sat_intervals.run.assemble.assemble_files", damaged)
     matched(tall, out)
     (warning,) = [record.getMessage() for record in caplog.records if "trying this now" in record.getMessage()]
-    assert all(name in warning for name in ("0_1_intervals", "0_3_validity", "1_0_validity"))
+    names, _, message = warning.partition(f" in {out}/tiles ")
+    assert sorted(names.removeprefix("parts ").split(", ")) == ["0_1_intervals", "0_3_validity", "1_0_validity"]
+    assert message == "are damaged or missing: rerun the same command: it makes them again; trying this now"
     assert hashes(out) == hashes(tall[0] / "kept")
 
 
@@ -300,11 +326,52 @@ def test_check_tiles__refuses_strips_that_do_not_fit(monkeypatch):
         check_tiles(config.model_copy(update={"cluster": jobs}), wide)
 
 
-@pytest.mark.parametrize(("compression", "needed"), [("deflate", "90.0"), ("none", "162.0")])
-def test_prepare__refuses_a_disk_without_room_for_parts_and_files(tmp_path, monkeypatch, compression, needed):
+@pytest.mark.parametrize(("compression", "needed"), [("deflate", "154.4"), ("none", "226.4")])
+def test_begin__refuses_a_disk_without_room_for_tiles_parts_and_files(tmp_path, monkeypatch, compression, needed):
+    job = wide_job(tmp_path, compression)
     monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=80 * 10**6))
-    with pytest.raises(OutputError, match=f"has 80.0 MB free, files and their parts may need {needed} MB"):
-        wide_job(tmp_path, compression)
+    with pytest.raises(OutputError, match=f"has 80.0 MB free, tiles, files and their parts may need {needed} MB"):
+        job.begin()
+    replace(job, has_files=False).begin()  # tiles check their own space
+
+
+def test_finish_strips__needs_room_for_missing_parts_only(tall, tmp_path, monkeypatch):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    def room(out: Path, free: float, **sections) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=round(free)))
+            matched(tall, out, **sections)
+
+    out, pixels = with_tiles(tall, tmp_path / "out"), HEIGHT * WIDTH
+    # for each pixel 12 bytes of files, 18 of parts
+    with pytest.raises(RunError, match=r"has 5.7 MB free, tiles, files and their parts may need 5.8 MB"):
+        room(out, 29.9 * pixels)
+    with monkeypatch.context() as patch:
+        patch.setattr(OutputWriter, "assemble", stop)
+        with pytest.raises(KeyboardInterrupt):
+            room(out, 30.1 * pixels)
+    (out / "tiles" / "parts" / next(iter(parts(out, "*_2_0.json")))).unlink()
+    with pytest.raises(RunError, match=r"has 2.4 MB free, tiles, files and their parts may need 2.8 MB"):
+        room(out, 12.5 * pixels)
+    room(out, 15 * pixels)
+    assert hashes(out) == hashes(tall[0] / "kept")
+
+
+def test_match_pair__cleans_up_on_a_full_disk(tall, tmp_path, monkeypatch):
+    def stop(store):
+        raise KeyboardInterrupt
+
+    out = with_tiles(tall, tmp_path / "out")
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", stop)
+        with pytest.raises(KeyboardInterrupt):
+            matched(tall, out)
+    assert (out / "tiles").exists()
+    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=0))
+    matched(tall, out)
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
 
 # ---- What stays -------------------------------------------------------------------------------------------------
@@ -351,6 +418,10 @@ def test_status__counts_strips(tall, tmp_path, monkeypatch):
         matched(tall, out)
     result = invoke("status", out)
     assert "5 of 5 tiles done, 0 failed, 0 left, 1 of 4 strips done; no run is active" in result.output
+    monkeypatch.setattr(strips, "finish_strip", lambda *arguments: "not made")
+    with pytest.raises(DamagedTilesError):
+        matched(tall, out, median=None)
+    assert read_status(out / "tiles").strips_done == 0, "strips of other settings"
 
 
 class Second:
