@@ -24,7 +24,7 @@ from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.scale import checked_scale
 from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
-from sat_intervals.run.strips import finish_strips, parts_of
+from sat_intervals.run.strips import finish_strips
 from sat_intervals.run.workers import Workers, reason
 from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, replaceable_files
 
@@ -104,7 +104,7 @@ def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_til
     mark_replaced(home)
     if keep_tiles:  # otherwise the parts are removed with them
         try:
-            parts_of(job).drop()
+            job.parts().drop()
         except OSError as error:  # the run is complete
             _LOG.warning("parts of the files stay in %s: %s", job.store.folder, reason(error))
 

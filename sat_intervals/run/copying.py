@@ -10,7 +10,8 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Part, run_files
 from sat_intervals.run.job import Job
-from sat_intervals.run.strips import codecs_of, on_worker, parts_of, rows_of_levels
+from sat_intervals.run.parts import codecs_of, rows_of_levels
+from sat_intervals.run.strips import on_worker
 from sat_intervals.run.workers import Task, Threads, Workers, reason
 from sat_intervals.store.parts import PartKey
 
@@ -69,11 +70,11 @@ def assemble_files(
         for file in files:
             levels = [
                 [_part(file.kind, (level, row), records[level, row]) for row in range(count)]
-                for level, count in enumerate(rows_of_levels(job))
+                for level, count in enumerate(rows_of_levels(job.store.grid.region))
             ]
             writer.assemble(file.name, levels, copy_parts)
     if damaged := [name for name in copied if name is not None]:
-        raise parts_of(job).damaged(damaged)
+        raise job.parts().damaged(damaged)
 
 
 @contextmanager
@@ -91,7 +92,7 @@ def _part(kind: str, key: PartKey, record: Mapping[str, Any]) -> Part:
 
 
 def _tasks(job: Job, path: Path, parts: Sequence[tuple[int, Part]]) -> Iterator[Task]:
-    codecs, retries = codecs_of(job), job.config.cluster.retries
+    codecs, retries = codecs_of(job.config), job.config.cluster.retries
     for offset, part in parts:
         place = path.absolute(), offset  # workers have other working folders
         yield Task(part.source, copy_part, (job, codecs, *part.source, (part.length, part.checksum), place), retries)

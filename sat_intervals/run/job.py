@@ -34,11 +34,13 @@ from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.inputs import check_weights, describe_inputs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
+from sat_intervals.run.parts import codecs_of, parts_of, rows_of_levels
 from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.run.workers import parse_memory
 from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
+from sat_intervals.store.parts import Parts
 from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run
 from sat_intervals.tiling import Grid, Tile, Window
 
@@ -130,20 +132,24 @@ class Job:
         if self.found or self.local:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
             self.store.write_search(search, _origin(self.inputs))
-        if waiting := self.waiting():  # otherwise strips check the space before anything else
+        if waiting := self.waiting():
             self.store.steps.check_space(handed_bytes(self.store.grid, self.config))
-            if self.has_files:
-                self.check_space(waiting, 1)
+        if self.has_files:
+            self.check_space(waiting, len(self.parts().done()))
 
-    def check_space(self, tiles: Sequence[Tile], share: float) -> None:
+    def parts(self, codecs: Mapping[str, Any] | None = None) -> Parts:
+        """Return the parts of the files; ``codecs`` are those that make them, by default those of this process."""
+        return parts_of(self.store, self.name, codecs or codecs_of(self.config))
+
+    def check_space(self, tiles: Sequence[Tile], parts: int) -> None:
         """Raise if local disks have no room for what a run has yet to write.
 
         Parameters
         ----------
         tiles
             The tiles that are not done.
-        share
-            Share of the parts of the files that are not done.
+        parts
+            Number of parts of the files that are done.
 
         Raises
         ------
@@ -153,6 +159,7 @@ class Job:
         region = self.store.grid.region
         files = run_files(self.config.products.compression)
         final = file_bytes(files, region.height, region.width)
+        share = 1 - parts / sum(rows_of_levels(region))
         before = sum(map(self.store.bytes_of, tiles)) + round(share * part_bytes(files, region.height, region.width))
         if tiles:
             before += self.store.steps.missing_bytes(handed_bytes(self.store.grid, self.config))

@@ -4,58 +4,27 @@ A strip is one row of blocks. It is computed in pieces, so memory depends on the
 overview is made of two rows of the level below it, so the parts form a binary tree.
 """
 
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BytesIO
-from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.match import postprocess
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.progress import Progress
-from sat_intervals.raster import (
-    BLOCK,
-    RUN_FILES,
-    codec_versions,
-    compressed,
-    factors,
-    run_files,
-)
+from sat_intervals.raster import BLOCK, RUN_FILES, compressed, run_files
 from sat_intervals.run.job import Job
+from sat_intervals.run.parts import codecs_of, rows_of_levels
 from sat_intervals.run.statistics import Tally
 from sat_intervals.run.workers import Task, Workers, check_not_full, computing, reason
-from sat_intervals.store.manifest import digest
-from sat_intervals.store.parts import PartKey, Parts, parts_in
+from sat_intervals.store.parts import PartKey, Parts
 from sat_intervals.store.tiles import DamagedTilesError, Records
 
 # Pixels for the next level, not compressed: every second row and column of all files.
 _HALF = "half"
-# What finishes rows decides their bytes, too.
-_CODE = zlib.crc32(Path(postprocess.__file__).read_bytes())
-# Increase when parts change.
-_LAYOUT = 1
-
-
-def parts_of(job: Job, codecs: Mapping[str, Any] | None = None) -> Parts:
-    """Return the parts of a run; ``codecs`` are the versions of the codecs, by default those of this process."""
-    made_by = {"run": job.name, "codecs": codecs or codecs_of(job), "layout": _LAYOUT}
-    return parts_in(job.store, digest(made_by))
-
-
-def codecs_of(job: Job) -> dict[str, Any]:
-    """Return what decides the bytes of parts, in this process."""
-    return codec_versions(job.config.products.compression) | {"code": _CODE}
-
-
-def rows_of_levels(job: Job) -> list[int]:
-    """Return the number of rows of blocks of each level."""
-    region = job.store.grid.region
-    return [-(-region.height // (factor * BLOCK)) for factor in factors(region.height, region.width)]
 
 
 def finish_strips(
@@ -83,13 +52,14 @@ def finish_strips(
     RunError
         A strip failed.
     """
-    parts = parts_of(job)
-    counts = rows_of_levels(job)
-    height = job.store.grid.region.height
+    parts = job.parts()
+    region = job.store.grid.region
+    counts = rows_of_levels(region)
+    height = region.height
     keys = [(level, row) for level in reversed(range(len(counts))) for row in range(counts[level])]
     done = set(parts.done())
     waiting = [key for key in keys if key not in done]
-    job.check_space([], len(waiting) / len(keys))
+    job.check_space([], len(done))
     parts.begin()
     tiles: list[str] = []  # what is wrong with tiles
     damaged: list[str] = []  # names of parts
@@ -129,7 +99,7 @@ def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
 
 
 def _task(job: Job, key: PartKey, counts: Sequence[int], scale: ConfidenceScale, records: Records) -> Task:
-    codecs, retries = codecs_of(job), job.config.cluster.retries
+    codecs, retries = codecs_of(job.config), job.config.cluster.retries
     if key[0]:
         return Task(key, reduce_rows, (job, codecs, key, _below(key, counts)), retries)
     top, bottom = _rows(job, key[1], halo(job.config))
@@ -219,7 +189,7 @@ def _write(job: Job, parts: Parts, key: PartKey, rasters: Sequence[np.ndarray], 
         blocks[file.kind], files[file.kind] = made.sizes, parts.write(key, file.kind, made.content)
         del made
     halves = [raster[:, ::2, ::2] for raster in rasters]
-    if key[0] + 1 < len(rows_of_levels(job)):
+    if key[0] + 1 < len(rows_of_levels(job.store.grid.region)):
         content = BytesIO()
         content.writelines(band.tobytes() for half in halves for band in half)
         files[_HALF] = parts.write(key, _HALF, content.getvalue())
@@ -234,12 +204,13 @@ def on_worker(job: Job, codecs: Mapping[str, Any]) -> Iterator[Parts]:
             job.store.check(job.manifest)
         except OSError as error:
             raise RunError(f"{job.store.folder} cannot be read: {reason(error)}") from error
-        if codecs_of(job) != codecs:
+        here = codecs_of(job.config)
+        if here != codecs:
             raise RunError(
-                f"this worker compresses with {codecs_of(job)}, the command with {dict(codecs)}: install the same "
+                f"this worker compresses with {here}, the command with {dict(codecs)}: install the same "
                 "version of rasterio for all"
             )
-        yield parts_of(job, codecs)
+        yield job.parts(codecs)
     except SatIntervalsError as error:
         error.__cause__ = error.__context__ = None  # errors of GDAL cannot be pickled
         raise

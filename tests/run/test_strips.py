@@ -297,7 +297,7 @@ def test_strip_bytes__bounds_what_writing_a_strip_takes(tmp_path, compression):
     rasters = noise.astype(np.float32) / 8, noise[:1].astype(np.uint16)
     bands = sum(raster.nbytes for raster in rasters)
     del noise
-    parts = strips.parts_of(job)
+    parts = job.parts()
     parts.folder.make("parts")
     tracemalloc.start()
     strips._write(job, parts, (0, 0), rasters, {})
@@ -335,7 +335,7 @@ def test_begin__refuses_a_disk_without_room_for_tiles_parts_and_files(tmp_path, 
     replace(job, has_files=False).begin()  # tiles check their own space
 
 
-def test_finish_strips__needs_room_for_missing_parts_only(tall, tmp_path, monkeypatch):
+def test_check_space__counts_missing_parts_only(tall, tmp_path, monkeypatch):
     def stop(*arguments):
         raise KeyboardInterrupt
 
@@ -346,14 +346,14 @@ def test_finish_strips__needs_room_for_missing_parts_only(tall, tmp_path, monkey
 
     out, pixels = with_tiles(tall, tmp_path / "out"), HEIGHT * WIDTH
     # for each pixel 12 bytes of files, 18 of parts
-    with pytest.raises(RunError, match=r"has 5.7 MB free, tiles, files and their parts may need 5.8 MB"):
+    with pytest.raises(OutputError, match=r"has 5.7 MB free, tiles, files and their parts may need 5.8 MB"):
         room(out, 29.9 * pixels)
     with monkeypatch.context() as patch:
         patch.setattr(OutputWriter, "assemble", stop)
         with pytest.raises(KeyboardInterrupt):
             room(out, 30.1 * pixels)
     (out / "tiles" / "parts" / next(iter(parts(out, "*_2_0.json")))).unlink()
-    with pytest.raises(RunError, match=r"has 2.4 MB free, tiles, files and their parts may need 2.8 MB"):
+    with pytest.raises(OutputError, match=r"has 2.4 MB free, tiles, files and their parts may need 2.8 MB"):
         room(out, 12.5 * pixels)
     room(out, 15 * pixels)
     assert hashes(out) == hashes(tall[0] / "kept")
