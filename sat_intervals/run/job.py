@@ -160,7 +160,7 @@ class Job:
         files = run_files(self.config.products.compression)
         final = file_bytes(files, region.height, region.width)
         share = 1 - parts / sum(rows_of_levels(region))
-        before = sum(map(self.store.bytes_of, tiles)) + round(share * part_bytes(files, region.height, region.width))
+        before = self.store.stored_bytes(tiles) + round(share * part_bytes(files, region.height, region.width))
         if tiles:
             before += self.store.steps.missing_bytes(handed_bytes(self.store.grid, self.config))
         if self.store.elsewhere is None:

@@ -11,7 +11,7 @@ import errno
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +36,7 @@ from sat_intervals.store.removal import (
     is_of_run,
 )
 from sat_intervals.store.steps import Steps
-from sat_intervals.store.zarr_arrays import Checksums, DamagedFileError, TileArrays
+from sat_intervals.store.zarr_arrays import STORED_BYTES, Checksums, DamagedFileError, TileArrays
 from sat_intervals.tiling import Grid, Tile
 
 Records = Mapping[str, Mapping[str, Any]]
@@ -262,14 +262,14 @@ class Store:
         reasons, done = self.folder.read_all(FAILURES), self.done()
         return {name: _reason(reasons[name]) for name in sorted(reasons) if name not in done}
 
-    def bytes_of(self, tile: Tile) -> int:
-        """Return the size of a tile's products, at most."""
-        return self._arrays.bytes_of(tile)
+    def stored_bytes(self, tiles: Iterable[Tile]) -> int:
+        """Return the size of the products of tiles, compressed."""
+        return (STORED_BYTES + 2 * self.levels) * sum(tile.core.height * tile.core.width for tile in tiles)
 
     def check_space(self, tile: Tile) -> None:
         """Raise an OSError if the disk has no room for the products of a tile; call it before matching."""
         free = self.folder.free_bytes()
-        if free is not None and free < self.bytes_of(tile):
+        if free is not None and free < self._arrays.bytes_of(tile):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
 
     def records(self) -> dict[str, dict[str, Any]]:
