@@ -77,6 +77,8 @@ def show_heights(calibration: "HeightCalibration") -> None:
     if found["shift"] is not None:
         east, north, up = found["shift"]
         click.echo(f"reference moved: easting {east:+.2f} m, northing {north:+.2f} m, height {up:+.2f} m")
+    for line in found["warnings"]:
+        click.echo(line)
     keys = {
         "coverage": "coverage",
         "lowest": "lowest",

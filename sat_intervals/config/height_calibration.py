@@ -46,6 +46,9 @@ class HeightCalibration(CalibrationFile):
         For people.
     coverage
         Share of true heights inside the widened intervals.
+    registered
+        Whether the reference was moved to the surface first. Then the margins do not include a constant shift, such as
+        an error of the models' position.
     surface
         What surfaces the margins belong to, see `surface_key`.
     classes
@@ -56,6 +59,7 @@ class HeightCalibration(CalibrationFile):
 
     name: str
     coverage: float = Field(gt=0, lt=1)
+    registered: bool
     surface: dict[str, str]
     classes: tuple[WidthClass, ...] = Field(strict=False, min_length=1)
     provenance: dict[str, Any] = Field(default_factory=dict)

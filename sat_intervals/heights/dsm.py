@@ -161,7 +161,8 @@ def surface_tags(
         return tags
     calibration.check_surface(surface_key(tags, cell))
     tags.pop("ALPHA", None)
-    return tags | {"COVERAGE": f"{calibration.coverage:g}", "CALIBRATION": f"{calibration.name} {calibration.sha256}"}
+    tags |= {"COVERAGE": f"{calibration.coverage:g}", "CALIBRATION": f"{calibration.name} {calibration.sha256}"}
+    return tags | {"REGISTERED": "yes" if calibration.registered else "no"}
 
 
 def _check_lengths(resolution: float, radius: float) -> None:

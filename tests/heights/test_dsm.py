@@ -303,6 +303,7 @@ def test_make_surface__poor_cells_are_no_data(tmp_path):
 CALIBRATION = """\
 name: city
 coverage: 0.8
+registered: true
 surface: {CELL: 1 m, PAIRS: '1', INTERVAL: median, RADIUS: 0.6 m, COVERAGE: '0.9', OPEN_POINTS: left out}
 classes:
 - {below: 5.0, margin: 0.75, cells: 100}
@@ -325,6 +326,12 @@ def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tm
     assert_allclose(surface[:3, i, [j, j + 4]].T, [(10, 8.25, 12.75), (10, 10, 15)], atol=1e-5)
     assert (tags["COVERAGE"], tags["HEIGHTS"]) == ("0.8", "above the WGS 84 ellipsoid")
     assert tags["CALIBRATION"] == f"city {load_height_calibration(file).sha256}"
+    assert tags["REGISTERED"] == "yes"
+    file.write_text(CALIBRATION.replace("registered: true", "registered: false"))
+    assert invoke(*words).exit_code == 0
+    with rasterio.open(out / "dsm.tif") as dataset:
+        assert dataset.tags()["REGISTERED"] == "no"
+        assert dataset.tags()["CALIBRATION"] != tags["CALIBRATION"]
     for changes, message in (
         (["--resolution", "2"], "belongs to other surfaces, CELL is 1 m there and 2 m here: make one with"),
         (["--bounds", "mean"], "INTERVAL is median there and mean here"),

@@ -370,7 +370,8 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     wrong = invoke(*command[:-1], "-1")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
     (tmp_path / "heights.yaml").write_text(
-        "{name: city, coverage: 0.9, surface: {CELL: 9 m}, classes: [{below: null, margin: 1.0, cells: 99}]}"
+        "{name: city, coverage: 0.9, registered: true, surface: {CELL: 9 m}, "
+        "classes: [{below: null, margin: 1.0, cells: 99}]}"
     )
     wrong = invoke(*command, "--height-calibration", tmp_path / "heights.yaml")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
