@@ -9,7 +9,7 @@ import click
 
 from sat_intervals.cli.calibrate_dsm import Heights, height_options, show_heights
 from sat_intervals.cli.judging import tolerance_option
-from sat_intervals.cli.matching import Settings, settings_options
+from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def calibrate(
     name: str | None,
     tune: bool,
     heights: Heights | None,
-    settings: Settings,
+    settings: SettingsArguments,
     as_json: bool,
     quiet: bool,
     **judging: Any,
@@ -120,7 +120,7 @@ def calibrate(
 class _Judging:
     """Options that decide how pairs are matched and compared with their truth."""
 
-    settings: Settings
+    settings: SettingsArguments
     tolerance: float
     remove_bias: bool
     by_group: bool
@@ -222,7 +222,7 @@ def _write(output: Path, head: str, content: dict[str, Any]) -> None:
 
 
 def _calibrate_heights(
-    heights: Heights, output: Path, name: str | None, settings: Settings, as_json: bool, quiet: bool
+    heights: Heights, output: Path, name: str | None, settings: SettingsArguments, as_json: bool, quiet: bool
 ) -> None:
     """Calibrate the intervals of a surface model, and write and print their margins."""
     from sat_intervals.evaluate.calibration import calibrate_surface

@@ -11,7 +11,7 @@ import click
 from sat_intervals.cli.options import Command, with_options
 
 if TYPE_CHECKING:
-    from sat_intervals.cli.matching import Settings
+    from sat_intervals.cli.matching import SettingsArguments
     from sat_intervals.config import HeightCalibration
 
 _FILE = click.Path(path_type=Path)
@@ -25,7 +25,7 @@ class Heights:
     reference: Path
     registers: bool
 
-    def check_alone(self, pairs: Sequence[Path], settings: "Settings", options: Mapping[str, Any]) -> None:
+    def check_alone(self, pairs: Sequence[Path], settings: "SettingsArguments", options: Mapping[str, Any]) -> None:
         """Raise if there are pairs to calibrate too, or options for them."""
         if pairs:
             raise click.UsageError(f"{pairs[0]} is a pair and --dsm a surface model: calibrate one of them at a time.")
