@@ -153,16 +153,18 @@ def _coarser(given: Comparison) -> float:
 def _sample(given: Comparison) -> tuple[Sample, float]:
     """Return the heights of both, `_MOST` at most by chance, and the number of cells that one stands for."""
     random = np.random.default_rng(0)
-    parts, common, share = [np.empty((6, 0))], 0, 1.0
+    parts, common, gathered, share = [np.empty((6, 0))], 0, 0, 1.0
     for window in tiles(given):
         cells = compared(given, window)
         row, column = (place // given.finer for place in np.nonzero(cells.known))
         values = np.stack([*cells[:4], row + window.row, column + window.column])
         common += row.size
         parts.append(values[:, random.random(row.size) < share])
-        while sum(part.shape[1] for part in parts) > _MOST:
+        gathered += parts[-1].shape[1]
+        while gathered > _MOST:
             share /= 2
             parts = [part[:, random.random(part.shape[1]) < 0.5] for part in parts]
+            gathered = sum(part.shape[1] for part in parts)
     height, lower, upper, truth, row, column = np.concatenate(parts, axis=1)
     cells_of_all = common / (given.finer * _coarser(given)) ** 2
     block = _BLOCKS * _part(row) + _part(column)
