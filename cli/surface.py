@@ -51,11 +51,12 @@ def surface(
 
     config = settings.load()
     with Console(run.quiet or as_json) as console:
+        from sat_intervals.config import resolved
         from sat_intervals.heights.dsm import make_surface
         from sat_intervals.heights.triangulate import triangulate
         from sat_intervals.run.before import report_before
 
-        _check(out, cells, sensor_files, settings.file, config.interval)
+        _check(out, cells, sensor_files, settings.file, resolved(config).interval)
         left, right = pair.open()
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:

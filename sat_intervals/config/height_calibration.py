@@ -14,7 +14,8 @@ from sat_intervals.config.sections import ConfigError
 
 _MAKE_ONE = "make one with sat-intervals calibrate --dsm"
 # Tags of a surface that its intervals depend on.
-_OF_INTERVALS = ("INTERVAL", "RADIUS", "COVERAGE", "ALPHA", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE")
+_OF_MATCHING = "COVERAGE", "ALPHA", "DISPARITY_CALIBRATION"
+_OF_INTERVALS = *_OF_MATCHING, "INTERVAL", "RADIUS", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE"
 # Metres.
 _LARGEST = 10_000.0
 
