@@ -413,7 +413,6 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
         (f"a,{images},{sensors},", "row 1 lacks resolution: a surface needs left_model"),
         (f"a,{images},,,,,1", "row 1 lacks left_model and right_model and left_grid and right_grid: a surface needs"),
         (f"a,{images},{sensors},wide", "resolution is 'wide', needed: a number"),
-        (f"a,{images},out/a/run.json,{sensors.partition(',')[2]},1", "would be written"),
     ):
         result = batch(row)
         assert (result.exit_code, result.stderr.count("\n"), out.exists()) == (2, 1, False), result.output
@@ -424,6 +423,8 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert report["a"]["surface"]["crs"] == "EPSG:32631"
     assert "surface" not in report["b"]
     assert not (out / "b" / "dsm.tif").exists()
+    result = batch(f"a,{images},out/a/intervals.tif,{sensors.partition(',')[2]},1")
+    assert (result.exit_code, "intervals.tif would be written" in result.stderr) == (2, True)
     assert batch(f"a,{images},{sensors},2").exit_code == 0
     assert read(out / "a" / "dsm.tif").shape[1] < 60  # made again
     (out / "a" / "points.tif").write_bytes(b"mine")
