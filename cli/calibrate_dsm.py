@@ -77,4 +77,4 @@ def _show(calibration: "HeightCalibration") -> None:
     rows = [
         [name, *("-" if one.get(key) is None else f"{one[key]:.3f}" for key in keys)] for name, one in figures.items()
     ]
-    show(["", *keys.values()], rows, "intervals before, and of each block of ground by the margins of the others")
+    show(["", *keys.values()], rows, "coverage and widths: before, and expected on ground that was held out")
