@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.matching import Run, Settings, run_options, settings_options
+from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import json_option, path, say_json
 from sat_intervals.cli.triangulate import point_warnings
 
@@ -15,7 +15,7 @@ from sat_intervals.cli.triangulate import point_warnings
 @json_option
 @settings_options
 @run_options
-def batch(pairs: Path, out: Path, as_json: bool, settings: Settings, run: Run) -> None:
+def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, run: RunArguments) -> None:
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as

@@ -9,7 +9,7 @@ import click
 from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
 from sat_intervals.cli.calibration_files import checked_folder, write
 from sat_intervals.cli.judging import tolerance_option
-from sat_intervals.cli.matching import Settings, settings_options
+from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     SurfaceAndReference,
     json_option,
@@ -63,7 +63,7 @@ def calibrate(
     name: str | None,
     tune: bool,
     surface: SurfaceAndReference | None,
-    settings: Settings,
+    settings: SettingsArguments,
     as_json: bool,
     quiet: bool,
     **judging: Any,
@@ -123,7 +123,7 @@ def calibrate(
 class _Judging:
     """Options that decide how pairs are matched and compared with their truth."""
 
-    settings: Settings
+    settings: SettingsArguments
     tolerance: float
     remove_bias: bool
     by_group: bool

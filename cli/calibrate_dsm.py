@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.calibration_files import checked_folder, write
-from sat_intervals.cli.matching import Settings
+from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.cli.options import SurfaceAndReference, say_json
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ _HEIGHTS = """\
 """
 
 
-def check_alone(pairs: Sequence[Path], settings: Settings, options: Mapping[str, Any]) -> None:
+def check_alone(pairs: Sequence[Path], settings: SettingsArguments, options: Mapping[str, Any]) -> None:
     """Raise if there are pairs to calibrate too, or options for them."""
     if pairs:
         raise click.UsageError(f"{pairs[0]} is a pair and --dsm a surface model: calibrate one of them at a time.")

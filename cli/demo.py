@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.matching import Run, Settings, local_option, run_options, settings_options
+from sat_intervals.cli.matching import RunArguments, SettingsArguments, local_option, run_options, settings_options
 from sat_intervals.cli.options import json_option, path, say_json
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ def demo(
     relief: float,
     local_range: bool,
     as_json: bool,
-    settings: Settings,
-    run: Run,
+    settings: SettingsArguments,
+    run: RunArguments,
 ) -> None:
     """Make a procedural satellite scene, match it and print how often the interval contains the truth.
 

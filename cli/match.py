@@ -4,7 +4,14 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.matching import Pair, Run, Settings, pair_options, run_options, search_options
+from sat_intervals.cli.matching import (
+    PairArguments,
+    RunArguments,
+    SettingsArguments,
+    pair_options,
+    run_options,
+    search_options,
+)
 from sat_intervals.cli.options import json_option, path, say_json
 
 
@@ -15,7 +22,9 @@ from sat_intervals.cli.options import json_option, path, say_json
 @click.option("--dry-run", is_flag=True, help="Print the job script of the cluster; submit nothing.")
 @json_option
 @run_options
-def match(pair: Pair, out: Path, settings: Settings, dry_run: bool, as_json: bool, run: Run) -> None:
+def match(
+    pair: PairArguments, out: Path, settings: SettingsArguments, dry_run: bool, as_json: bool, run: RunArguments
+) -> None:
     """Match the epipolar images LEFT and RIGHT and write to the folder OUT.
 
     \b

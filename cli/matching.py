@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Pair:
+class PairArguments:
     """Two epipolar images, the options that say how to read them, and the region of the left one to match."""
 
     left: str
@@ -48,7 +48,7 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Settings:
+class SettingsArguments:
     """A file of settings, and the sections of the command line, which win over it; names of the options given."""
 
     file: Path | None
@@ -63,7 +63,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Run:
+class RunArguments:
     """How a run treats the tiles and files of its folder, and what it prints."""
 
     keep_tiles: bool
@@ -108,14 +108,14 @@ _OF_IMAGES = ("left_mask", "right_mask", "nodata", "left_nodata", "right_nodata"
 
 
 def pair_options(command: Command) -> Command:
-    """Add the arguments LEFT and RIGHT, and options to read them; the command gets ``pair``, a `Pair`."""
+    """Add the arguments LEFT and RIGHT, and options to read them; the command gets ``pair``, a `PairArguments`."""
 
     @wraps(command)
     def with_pair(*, left: str, right: str, window: tuple[int, int, int, int] | None, **others: Any) -> Any:
         from sat_intervals.tiling import Window
 
         of_images = {name: others.pop(name) for name in _OF_IMAGES}
-        return command(pair=Pair(left, right, of_images, Window(*window) if window else None), **others)
+        return command(pair=PairArguments(left, right, of_images, Window(*window) if window else None), **others)
 
     return with_options(
         with_pair,
@@ -198,7 +198,7 @@ _PLACES = {
 
 
 def settings_options(command: Command) -> Command:
-    """Add options for settings; the command gets ``settings``, a `Settings`."""
+    """Add options for settings; the command gets ``settings``, a `SettingsArguments`."""
 
     @wraps(command)
     def with_settings(*, config_file: Path | None, preset: str | None, cluster: str | None, **others: Any) -> Any:
@@ -212,7 +212,7 @@ def settings_options(command: Command) -> Command:
             is_address = "://" in cluster
             chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
             sections["cluster"] = sections.get("cluster", {}) | chosen
-        return command(settings=Settings(config_file, sections, names), **others)
+        return command(settings=SettingsArguments(config_file, sections, names), **others)
 
     return with_options(with_settings, *_SETTINGS_OPTIONS)
 
@@ -223,7 +223,7 @@ def search_options(command: Command) -> Command:
     @wraps(command)
     def with_search(
         *,
-        settings: Settings,
+        settings: SettingsArguments,
         disparity: tuple[int, int] | None,
         local_range: bool,
         range_grid: str | None,
@@ -241,11 +241,11 @@ def search_options(command: Command) -> Command:
 
 
 def run_options(command: Command) -> Command:
-    """Add options of commands that match pairs; the command gets ``run``, a `Run`."""
+    """Add options of commands that match pairs; the command gets ``run``, a `RunArguments`."""
 
     @wraps(command)
     def with_run(*, keep_tiles: bool, overwrite: bool, strict: bool, quiet: bool, **others: Any) -> Any:
-        return command(run=Run(keep_tiles, overwrite, strict, quiet), **others)
+        return command(run=RunArguments(keep_tiles, overwrite, strict, quiet), **others)
 
     return with_options(
         with_run,

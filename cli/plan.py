@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sat_intervals.cli.matching import Pair, Settings, pair_options, search_options
+from sat_intervals.cli.matching import PairArguments, SettingsArguments, pair_options, search_options
 from sat_intervals.cli.options import json_option, log_options, say_json
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 )
 @json_option
 @log_options
-def plan(pair: Pair, settings: Settings, memory: str | None, as_json: bool) -> None:
+def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, as_json: bool) -> None:
     """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, from a small window matched at the centre.
 
     Options and settings are those of match.

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.matching import Pair, pair_options
+from sat_intervals.cli.matching import PairArguments, pair_options
 from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
 
 # Bars of the histogram that are printed, each of several bins.
@@ -18,7 +18,7 @@ _BARS = 8
 @json_option
 @quiet_option
 @log_options
-def search_range(pair: Pair, output: Path | None, as_json: bool, quiet: bool) -> None:
+def search_range(pair: PairArguments, output: Path | None, as_json: bool, quiet: bool) -> None:
     """Find the search range of the epipolar images LEFT and RIGHT, as match does without --disparity.
 
     Prints the range and its evidence; --output keeps the ranges of the cells. --window has no effect: a range is always

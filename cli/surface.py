@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.dsm import calibration_option, cell_options, say_surface
-from sat_intervals.cli.matching import Pair, Run, Settings, pair_options, run_options, search_options
+from sat_intervals.cli.matching import (
+    PairArguments,
+    RunArguments,
+    SettingsArguments,
+    pair_options,
+    run_options,
+    search_options,
+)
 from sat_intervals.cli.options import json_option, path, say_json, sensor_options
 from sat_intervals.cli.triangulate import point_warnings, say_points
 
@@ -28,13 +35,13 @@ if TYPE_CHECKING:
 @json_option
 @run_options
 def surface(
-    pair: Pair,
+    pair: PairArguments,
     out: Path,
     sensor_files: tuple[Path, Path, Path, Path],
     cells: dict[str, Any],
     as_json: bool,
-    settings: Settings,
-    run: Run,
+    settings: SettingsArguments,
+    run: RunArguments,
 ) -> None:
     """Match the epipolar images LEFT and RIGHT, triangulate the run, and write its surface model to OUT/dsm.tif.
 

@@ -241,7 +241,8 @@ def new_ranges(columns: int) -> Ranges:
 def volume_starts(cells: Cells, output: Window) -> np.ndarray:
     """Where each row of pixels begins in a volume that holds the vectors ``[start, stop)`` of every pixel.
 
-    Returns ``(rows + 1,)`` int64; the last is the size of the volume.
+    Returns ``(rows + 1,)`` int64; the last is the size of the volume. Vectors are those of `enter_cells`: kernels write
+    there without a check.
     """
     row, column = cells.row + output.row, cells.column + output.column
     vectors = cells.last // LANES + 1 - cells.first // LANES

@@ -12,9 +12,10 @@ from sat_intervals.products import IMPOSSIBLE_COST
 
 @inlined
 def alpha_cut(curve, span, limit):
-    """First and last index whose cost is at most ``limit = lowest + floor((1 - alpha) * span)`` (paper eq. 5 to 7).
+    """First and last index whose cost is at most ``limit`` (paper eq. 5 to 7).
 
-    The vectors of ``span`` have costs above every limit at other candidates; at least one cost is at most ``limit``.
+    It is ``lowest + floor((1 - alpha) * cost_span)``. The vectors of ``span`` have costs above every limit at other
+    candidates; at least one cost is at most ``limit``.
     Vectors take 19 ns for 64 disparities and 38 ns for 128, single costs 70 and 129 ns.
     """
     first = span.start

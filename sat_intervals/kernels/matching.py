@@ -11,7 +11,7 @@ from sat_intervals.kernels.cost import Cells, Costs, padded_to_lanes, volume_sta
 from sat_intervals.kernels.penalties import Gradients
 from sat_intervals.kernels.reading import RightPixels, rectangle_of
 from sat_intervals.kernels.sgm import WAVEFRONTS, Borders, Edge
-from sat_intervals.kernels.sweeps import Settings, Volume, prepare, sweep_down, sweep_up, trace_wave
+from sat_intervals.kernels.sweeps import Settings, Volume, new_buffers, sweep_down, sweep_up, trace_wave
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.tiling import Window
 
@@ -88,7 +88,7 @@ class Matched(NamedTuple):
 def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     """Run both sweeps; return what they match and the volume (finished curves only with ``keep``)."""
     size = padded_to_lanes(settings.count)
-    buffers = prepare(costs, gradients, settings, borders, cells)
+    buffers = new_buffers(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
     of_low = shape if settings.low >= 0 else (0, 0)
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
@@ -110,7 +110,7 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     right = RightPixels(cores, np.arange(size, dtype=np.uint16), cost, np.zeros(cost.shape, np.uint16))
     if settings.regularized:
         sweep_down(buffers, gradients, settings, wanted, volume)
-        buffers = prepare(costs, gradients, settings, borders, cells, down=False)
+        buffers = new_buffers(costs, gradients, settings, borders, cells, down=False)
     sweep_up(buffers, gradients, settings, wanted, volume, raw, right, keep)
     cost = cost[:, : core.width + settings.count - 1]
     winner = right.best[:, : cost.shape[1]].astype(np.int16) + np.int16(settings.minimum)
@@ -133,7 +133,7 @@ def trace(
     Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
     """
     down, wave = WAVEFRONTS[wavefront]
-    buffers = prepare(costs, gradients, settings, borders, cells, down)
+    buffers = new_buffers(costs, gradients, settings, borders, cells, down)
     trace_wave(buffers, gradients, settings, wave)
     return buffers.leaving
 

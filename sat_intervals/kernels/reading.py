@@ -144,18 +144,18 @@ def update_right(curve, span, right, r, c):
 
 
 @part
-def search_flags(costs, r, c, first, last, possible):
+def search_flags(costs, r, c, span, possible):
     """Validity flags of a pixel without all candidates; the left and the right image set separate flags."""
     flags = 0
     if costs.left_state[r, c] != 0:
         flags |= LEFT_WINDOW
     usable, masked = 0, False
-    for x in range(c + first, c + last + 1):
+    for x in range(c + span.first, c + span.last + 1):
         usable += costs.right_state[r, x] == 0
         masked |= costs.right_state[r, x] & MASKED != 0
     if usable == 0:
         flags |= RIGHT_MASKED if masked else NO_CANDIDATE
-    elif 0 < possible < last + 1 - first:
+    elif 0 < possible < span.last + 1 - span.first:
         flags |= RANGE_INCOMPLETE
     return flags
 
@@ -166,7 +166,6 @@ def read_curve(curve, span, lowest, settings):
 
     Bounds are disparities, or steps with sub-pixel cuts; NO_DISPARITY for a level that is off.
     """
-    least, most = span.first, span.last
     k = _winner(curve, span, lowest)
     shift, refined = vfit(curve, k, settings.count) if settings.refine else (0.0, False)
     high = low = NO_DISPARITY, NO_DISPARITY
@@ -176,11 +175,11 @@ def read_curve(curve, span, lowest, settings):
         first, last = _interval(curve, span, lowest, settings.cut_level, settings.refine)
         high = settings.minimum + first, settings.minimum + last
     # An empty table counts nothing. In a branch, numba would count references at every pixel: 4 to 7 % slower.
-    stop = most + 1 if settings.weights.size else least
-    amount = ambiguity(curve, least, stop, lowest, settings.weights)
-    count = stop - least
+    stop = span.last + 1 if settings.weights.size else span.first
+    amount = ambiguity(curve, span.first, stop, lowest, settings.weights)
+    count = stop - span.first
     if 0 < count < settings.total:
-        if _distrusts(k, least, most, settings):
+        if _distrusts(k, span, settings):
             amount += settings.weights[0] * (settings.total - count)
         else:
             amount += amount * (settings.total - count) // count
@@ -188,10 +187,10 @@ def read_curve(curve, span, lowest, settings):
 
 
 @inlined
-def _distrusts(k, least, most, settings):
+def _distrusts(k, span, settings):
     """Whether a winner stands at an end of its cell's range that is no end of the whole range, or next to it.
 
     The true disparity may then be among the candidates of the whole range that were not searched: they are ambiguous.
     """
-    first, last = settings.offset + least, settings.offset + most
-    return (k <= least + 1 and first > 0) or (k >= most - 1 and last < settings.total - 1)
+    first, last = settings.offset + span.first, settings.offset + span.last
+    return (k <= span.first + 1 and first > 0) or (k >= span.last - 1 and last < settings.total - 1)

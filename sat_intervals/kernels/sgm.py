@@ -62,7 +62,7 @@ def new_paths(columns: int, size: int, has_cells: bool) -> Paths:
 
 @inlined
 def _fill_span(spans, slot, size):
-    """Say that any vector of a curve may be searched."""
+    """Mark all vectors of a curve as in use."""
     if spans is not None:
         spans[slot, 0], spans[slot, 1] = 0, size
 

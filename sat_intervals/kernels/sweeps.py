@@ -156,7 +156,7 @@ class Buffers(NamedTuple):
     down: bool
 
 
-def prepare(
+def new_buffers(
     costs: Costs,
     gradients: Gradients | None,
     settings: Settings,
@@ -168,7 +168,8 @@ def prepare(
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
     left = borders.inside if borders else Window(0, 0, 0, 0)
     inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
-    has_cells, k = cells is not None, np.arange(size)
+    has_cells = cells is not None
+    k = np.arange(size)
     cells = cells or one_cell(rows, columns, settings.count)
     walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
     return Buffers(
@@ -281,7 +282,7 @@ def sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
                 continue
             i, j, place = r - output.row, c - output.column, volume.places[c]
             if possible[c] < span.last + 1 - span.first:
-                validity[i, j] = search_flags(costs, r, c, span.first, span.last, possible[c])
+                validity[i, j] = search_flags(costs, r, c, span, possible[c])
             if possible[c] == 0:
                 if keep:
                     volume.sums[place + span.start : place + span.stop] = IMPOSSIBLE_COST

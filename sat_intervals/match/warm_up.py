@@ -15,10 +15,11 @@ from sat_intervals.tiling import View, Window
 
 def compile_kernels(config: Config) -> None:
     """Compile every kernel that the settings need, by matching a few random pixels."""
-    random, search = np.random.default_rng(0), config.disparity
+    random = np.random.default_rng(0)
+    search = config.disparity
     frame = Frame.of_whole(Window(0, 0, 4, 4))
-    ends = (np.full((1, 1), end, np.int16) for end in (search.minimum, search.maximum))
-    ranges = LocalRanges(*ends, 4, 4) if search.is_local else None
+    ends = np.array([search.minimum, search.maximum], np.int16).reshape(2, 1, 1)
+    ranges = LocalRanges(ends[0], ends[1], 4, 4) if search.is_local else None
     windows = patch_windows(frame, config, ranges)
     images = (random.random((window.height, window.width), np.float32) for window in windows)
     left, right = (

@@ -94,12 +94,13 @@ def plan(
     left, right = checked_pair(left, right, config)
     config, _, _ = searched(config, left, lambda: find_here(left, right, progress))
     checked_pair(left, right, config)
-    config = fitted_to_jobs(config) if memory is None else fitted(config, memory)
+    waiting = readers(config.cluster) * waiting_bytes(config)
+    config = fitted_to_jobs(config) if memory is None else fitted(config, memory - waiting)
     workers = workers or tiles_at_once(config.cluster)
     region = checked_region(left, window)
     strip = min(BLOCK, region.height), region.width
     if memory is not None:
-        check_strips(*strip, config, memory)
+        check_strips(*strip, config, memory - waiting)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
     # Compiled once a machine: a part of the first plan, not of the run.
@@ -114,9 +115,9 @@ def plan(
         tiles=len(grid),
         workers=workers,
         extra_work=extra,
-        worker_bytes=PROCESS_BYTES + task,
+        worker_bytes=PROCESS_BYTES + waiting + task,
         together=together,
-        together_bytes=PROCESS_BYTES + together * task + readers(config.cluster) * waiting_bytes(config),
+        together_bytes=PROCESS_BYTES + waiting + together * task,
         disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels)
         + part_bytes(files, region.height, region.width)
         + file_bytes(files, region.height, region.width)

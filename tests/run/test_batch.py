@@ -460,6 +460,27 @@ def test_plan__prints_what_a_run_will_take(images):
     assert "but 100 MB are given" in refused.stderr
 
 
+def test_plan__of_tiles_in_a_bucket_counts_the_one_that_waits(images):
+    words = (
+        "plan",
+        images / "left1.tif",
+        images / "right1.tif",
+        "--disparity",
+        -18,
+        40,
+        "--workers",
+        1,
+        "--tile-size",
+        1024,
+    )
+    found = [json.loads(invoke(*words, "--json", *more).stdout) for more in ((), ("--store", "memory://plan"))]
+    assert found[1]["worker_bytes"] == found[1]["together_bytes"] > found[0]["worker_bytes"]
+    limited = invoke(*words, "--store", "memory://plan", "--memory", "500MB")
+    assert limited.exit_code == 0, limited.output
+    assert "smaller than set, to fit" in limited.stdout
+    assert "fits in 500 MB" in limited.stdout
+
+
 def test_plan__counts_the_jobs_of_a_batch_system_and_reads_images_as_match_does(images, tmp_path):
     bands = tmp_path / "bands.tif"
     with rasterio.open(images / "left1.tif") as file, rasterio.open(bands, "w", **file.profile | {"count": 2}) as copy:

@@ -12,7 +12,7 @@ from helpers import PLACE, invoke, write_pair
 
 from sat_intervals import SatIntervalsError, match_pair, open_image
 from sat_intervals.cli.calibrate import _Judging, _subjects
-from sat_intervals.cli.matching import Settings
+from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
@@ -151,7 +151,7 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
 def test_measure_subjects__ends_where_a_truth_is_replaced_meanwhile(scene, tmp_path):
     for name in ("left.tif", "right.tif", "truth.tif", "meta.json"):
         (tmp_path / name).write_bytes((scene / name).read_bytes())
-    subjects = _subjects((tmp_path,), (), _Judging(Settings(None, {}), 0.0, False, False))
+    subjects = _subjects((tmp_path,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
 
     def replace(stage, done, total):
         if stage == "tiles":
@@ -232,7 +232,7 @@ def test_calibrate__a_run_is_matched_again_on_this_machine(scene, tmp_path):
     settings = settings_with(scene) | {"cluster": {"workers": 2, "store": str(tmp_path / "store")}}
     match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     for given in ({}, {"cluster": {"workers": 1}}):
-        (subject,) = _subjects((tmp_path / "out",), (), _Judging(Settings(None, given), 0.0, False, False))
+        (subject,) = _subjects((tmp_path / "out",), (), _Judging(SettingsArguments(None, given), 0.0, False, False))
         assert subject.config.cluster == Cluster(**given.get("cluster", {}))
 
 
