@@ -221,7 +221,10 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
     assert json.loads(written[0].read_text())["all"]["median"] == pytest.approx(0.1)
     assert "| all cells | 4200 | 0.100 |" in written[1].read_text()
     assert all(path.stat().st_size > 5000 for path in written[2:])
-    assert invoke(*words, "--pictures", tmp_path).exit_code == 0  # its own files are replaced
+    again = invoke(*words, "--pictures", tmp_path, "--quiet")  # its own files are replaced
+    assert again.exit_code == 0
+    assert "all cells" in again.stdout
+    assert "dsm-accuracy" not in again.stdout
     for line, message in (((0, 0, 1, 1), "does not cross"), ((PLACE.c, PLACE.f, PLACE.c + 70, PLACE.f - 60), "")):
         result = invoke(*words, "--pictures", tmp_path, "--line", *line)
         assert result.exit_code == (2 if message else 0)
