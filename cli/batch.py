@@ -6,6 +6,7 @@ import click
 
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import json_option, path, say_json
+from sat_intervals.cli.triangulate import point_warnings
 
 
 @click.command(short_help="Match many pairs; a rerun does what is missing.")
@@ -44,6 +45,9 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     if as_json:
         say_json(report)
     console.batch_summary(report)
+    of_points = [f"{name}: {line}" for name, end in report.items() for line in point_warnings(end.get("points", {}))]
+    for line in of_points:
+        click.echo(line, err=True)
     done = ("done", "done before")
     failed = {name: end.get("error", end["state"]) for name, end in report.items() if end["state"] not in done}
     if failed:
@@ -53,4 +57,4 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
         raise RunError(
             f"{len(failed)} of {len(report)} pairs failed; rerun the same command: it does what is missing:\n{lines}"
         )
-    run.check_strict([line for end in report.values() for line in end.get("warnings", ())])
+    run.check_strict([*(line for end in report.values() for line in end.get("warnings", ())), *of_points])

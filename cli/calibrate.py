@@ -1,16 +1,24 @@
 """``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.calibrate_dsm import Heights, height_options, show_heights
+from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
+from sat_intervals.cli.calibration_files import checked_folder, write
 from sat_intervals.cli.judging import tolerance_option
 from sat_intervals.cli.matching import SettingsArguments, settings_options
-from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
+from sat_intervals.cli.options import (
+    SurfaceAndReference,
+    json_option,
+    log_options,
+    path,
+    quiet_option,
+    reference_options,
+    say_json,
+)
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -28,12 +36,6 @@ _SETTINGS = """\
 # Settings with their calibration, found by sat-intervals calibrate --tune.
 # Use them with: sat-intervals match LEFT RIGHT OUT --disparity MIN MAX --config FILE
 """
-_HEIGHTS = """\
-# Calibration of heights: metres that widen the intervals of a surface model, found by sat-intervals calibrate --dsm.
-# Use it with: sat-intervals dsm OUT --calibration FILE, with the options that the surface was made with.
-# `below`: end of a class of interval widths; `margin`: both bounds move outwards by it, inwards if negative (metres).
-"""
-_HEADS = _CALIBRATION, _SETTINGS, _HEIGHTS
 
 
 @click.command(short_help="Find the levels that reach a coverage, on pairs with known truth.")
@@ -49,7 +51,7 @@ _HEADS = _CALIBRATION, _SETTINGS, _HEIGHTS
 @click.option(
     "--tune", is_flag=True, help="Compare presets and penalties; write the best as settings for match --config."
 )
-@height_options
+@reference_options("Calibrate this surface model against --reference, instead of pairs.")
 @json_option
 @settings_options
 @quiet_option
@@ -60,7 +62,7 @@ def calibrate(
     truth: tuple[Path, ...],
     name: str | None,
     tune: bool,
-    heights: Heights | None,
+    surface: SurfaceAndReference | None,
     settings: SettingsArguments,
     as_json: bool,
     quiet: bool,
@@ -82,9 +84,10 @@ def calibrate(
     With --dsm: find the metres that the intervals of a surface model need to contain its coverage, or --coverage, of
     the heights of --reference. Use them with: dsm --calibration FILE.
     """
-    if heights is not None:
-        heights.check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
-        _calibrate_heights(heights, output, name, settings, as_json, quiet)
+    if surface is not None:
+        check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
+        coverage = settings.sections.get("interval", {}).get("coverage")
+        calibrate_heights(surface, output, name, coverage, as_json, quiet)
         return
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
@@ -100,7 +103,7 @@ def calibrate(
     inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
     described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
     check_not_replaced([*inputs, *described, *truth, settings.file], [output])
-    folder = _checked_folder(output)
+    folder = checked_folder(output)
     check_subjects(subjects)
     with Console(quiet or as_json) as console:
         if tune:
@@ -192,53 +195,9 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
     )
 
 
-def _checked_folder(output: Path) -> Path:
-    """Return the folder of a file, where tiles are kept meanwhile; raise if it cannot be written."""
-    from sat_intervals.errors import SatIntervalsError, check_regular
-
-    check_regular(output)
-    folder = output.absolute().parent
-    if output.is_dir() or not os.access(folder, os.W_OK):
-        raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")
-    if output.exists() and not output.read_bytes().startswith(
-        tuple(head.partition("\n")[0].encode() for head in _HEADS)
-    ):
-        raise SatIntervalsError(f"{output} exists and was not made by sat-intervals calibrate: move it away")
-    return folder
-
-
 def write_calibration(output: Path, calibration: "Calibration") -> None:
     """Write a calibration with an explanation."""
-    _write(output, _CALIBRATION, calibration.model_dump(mode="json"))
-
-
-def _write(output: Path, head: str, content: dict[str, Any]) -> None:
-    import yaml
-
-    from sat_intervals.raster import whole_file
-
-    with whole_file(output) as new:
-        new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
-
-
-def _calibrate_heights(
-    heights: Heights, output: Path, name: str | None, settings: SettingsArguments, as_json: bool, quiet: bool
-) -> None:
-    """Calibrate the intervals of a surface model, and write and print their margins."""
-    from sat_intervals.evaluate.calibration import calibrate_surface
-    from sat_intervals.raster.identity import check_not_replaced
-
-    check_not_replaced([heights.dsm, heights.reference], [output])
-    _checked_folder(output)
-    coverage = settings.sections.get("interval", {}).get("coverage")
-    files = heights.dsm, heights.reference
-    calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=heights.registers)
-    _write(output, _HEIGHTS, calibration.model_dump(mode="json"))
-    if as_json:
-        say_json(calibration.model_dump(mode="json"))
-    elif not quiet:
-        show_heights(calibration)
-        click.echo(str(output))
+    write(output, _CALIBRATION, calibration.model_dump(mode="json"))
 
 
 def _tune(
@@ -265,5 +224,5 @@ def _tune(
         say_json([{"name": one.name, "kept": one.kept, "good": one.good, **one.figures} for one in found])
     elif not console.quiet:
         show_tuned(found, best)
-    _write(output, _SETTINGS, settings_of(best, name or best.name))
+    write(output, _SETTINGS, settings_of(best, name or best.name))
     console.say(str(output))

@@ -1,65 +1,55 @@
-"""Calibrate the intervals of a surface model: the options of ``sat-intervals calibrate --dsm``, and what it prints."""
+"""Calibrate the intervals of a surface model: ``sat-intervals calibrate --dsm``."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import Command, with_options
+from sat_intervals.cli.calibration_files import checked_folder, write
+from sat_intervals.cli.matching import SettingsArguments
+from sat_intervals.cli.options import SurfaceAndReference, say_json
 
 if TYPE_CHECKING:
-    from sat_intervals.cli.matching import SettingsArguments
     from sat_intervals.config import HeightCalibration
 
-_FILE = click.Path(path_type=Path)
+_HEIGHTS = """\
+# Calibration of heights: metres that widen the intervals of a surface model, found by sat-intervals calibrate --dsm.
+# Use it with: sat-intervals dsm OUT --calibration FILE, with the options that the surface was made with.
+# `below`: end of a class of interval widths; `margin`: both bounds move outwards by it, inwards if negative (metres).
+"""
 
 
-@dataclass(frozen=True)
-class Heights:
-    """A surface model to calibrate, its reference, and whether the reference is moved to it."""
-
-    dsm: Path
-    reference: Path
-    registers: bool
-
-    def check_alone(self, pairs: Sequence[Path], settings: "SettingsArguments", options: Mapping[str, Any]) -> None:
-        """Raise if there are pairs to calibrate too, or options for them."""
-        if pairs:
-            raise click.UsageError(f"{pairs[0]} is a pair and --dsm a surface model: calibrate one of them at a time.")
-        sections = settings.sections
-        given = {name: value for name, value in sections.items() if name != "interval"} | {"config": settings.file}
-        given |= {"calibration": sections.get("interval", {}).get("calibration"), **options}
-        for name, value in given.items():
-            if value:
-                option = {"tiles": "tile-size", "cluster": "workers"}.get(name, name.replace("_", "-"))
-                raise click.UsageError(f"--{option} applies to pairs, not to --dsm: leave it out.")
+def check_alone(pairs: Sequence[Path], settings: SettingsArguments, options: Mapping[str, Any]) -> None:
+    """Raise if there are pairs to calibrate too, or options for them."""
+    if pairs:
+        raise click.UsageError(f"{pairs[0]} is a pair and --dsm a surface model: calibrate one of them at a time.")
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
+    for option in (*settings.options, *given):
+        if option != "--coverage":
+            raise click.UsageError(f"{option} applies to pairs, not to --dsm: leave it out.")
 
 
-_OPTIONS = (
-    click.option("--dsm", type=_FILE, help="Calibrate this surface model against --reference, instead of pairs."),
-    click.option("--reference", type=_FILE, help="With --dsm: reference heights above the same datum, in any CRS."),
-    click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
-)
+def calibrate_heights(
+    surface: SurfaceAndReference, output: Path, name: str | None, coverage: float | None, as_json: bool, quiet: bool
+) -> None:
+    """Calibrate the intervals of a surface model, and write and print their margins."""
+    from sat_intervals.evaluate.calibration import calibrate_surface
+    from sat_intervals.raster.identity import check_not_replaced
+
+    files = surface.dsm, surface.reference
+    check_not_replaced(files, [output])
+    checked_folder(output)
+    calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=surface.registers)
+    write(output, _HEIGHTS, calibration.model_dump(mode="json"))
+    if as_json:
+        say_json(calibration.model_dump(mode="json"))
+    elif not quiet:
+        _show(calibration)
+        click.echo(str(output))
 
 
-def height_options(command: Command) -> Command:
-    """Add options for a surface model; the command gets ``heights``, None without one."""
-
-    @wraps(command)
-    def with_heights(*, dsm: Path | None, reference: Path | None, no_register: bool, **others: Any) -> Any:
-        if bool(dsm) != bool(reference):
-            raise click.UsageError("--dsm and --reference go together: give both.")
-        if no_register and not dsm:
-            raise click.UsageError("--no-register goes with --dsm: leave it out.")
-        return command(heights=Heights(dsm, reference, not no_register) if dsm and reference else None, **others)
-
-    return with_options(with_heights, *_OPTIONS)
-
-
-def show_heights(calibration: "HeightCalibration") -> None:
+def _show(calibration: "HeightCalibration") -> None:
     """Print the margins of each class, and what to expect."""
     from sat_intervals.cli.tables import show
 
@@ -77,6 +67,8 @@ def show_heights(calibration: "HeightCalibration") -> None:
     if found["shift"] is not None:
         east, north, up = found["shift"]
         click.echo(f"reference moved: easting {east:+.2f} m, northing {north:+.2f} m, height {up:+.2f} m")
+    for line in found["warnings"]:
+        click.echo(line)
     keys = {
         "coverage": "coverage",
         "lowest": "lowest",
@@ -87,4 +79,4 @@ def show_heights(calibration: "HeightCalibration") -> None:
     rows = [
         [name, *("-" if one.get(key) is None else f"{one[key]:.3f}" for key in keys)] for name, one in figures.items()
     ]
-    show(["", *keys.values()], rows, "expected: figures of blocks of ground that were held out")
+    show(["", *keys.values()], rows, "coverage and widths: before, and expected on ground that was held out")

@@ -128,13 +128,19 @@ class Console:
             self.say(f"next: sat-intervals {then} {quote(str(out))}")
 
     def batch_summary(self, report: dict[str, dict[str, Any]]) -> None:
-        """Print the table at the end of a batch: the state of each pair."""
-        table = Table("pair", "state", "valid", "median width", box=None, pad_edge=False)
+        """Print the table at the end of a batch: the state of each pair, and its surface if any pair has one."""
+        surfaces = {name: end["surface"] for name, end in report.items() if "surface" in end}
+        of_surfaces = ("filled", "median half width") if surfaces else ()
+        table = Table("pair", "state", "valid", "median width", *of_surfaces, box=None, pad_edge=False)
         for name, end in report.items():
             counts = end.get("counts")
             width = counts and counts["median_interval_width"]
             valid = _share(counts["valid"], counts["pixels"]) if counts else ""
-            table.add_row(name, end["state"], valid, f"{width:.2f} px" if width is not None else "")
+            row = [name, end["state"], valid, f"{width:.2f} px" if width is not None else ""]
+            if name in surfaces:
+                half = surfaces[name]["median_half_width"]
+                row += [f"{100 * surfaces[name]['filled']:.1f} %", f"+-{half:.2f} m" if half is not None else ""]
+            table.add_row(*row)
         self._terminal.print(table)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
+from sat_intervals.cli.options import Command, json_option, log_options, path, quiet_option, say_json, with_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -49,7 +49,7 @@ _CELL_OPTIONS = (
 )
 
 
-def cell_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def cell_options(command: Command) -> Command:
     """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`.
 
     A `calibration_option` goes with it.
@@ -71,12 +71,10 @@ def cell_options(command: Callable[..., Any]) -> Callable[..., Any]:
         cells |= {"resolution": like or cells["resolution"], "choices": SurfaceChoices(**choices)}
         return command(cells=cells, **given)
 
-    for option in reversed(_CELL_OPTIONS):
-        with_cells = option(with_cells)
-    return with_cells
+    return with_options(with_cells, *_CELL_OPTIONS)
 
 
-def calibration_option(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def calibration_option(*names: str) -> Callable[[Command], Command]:
     """Return an option for the calibration that `cell_options` reads."""
     return click.option(
         *names,

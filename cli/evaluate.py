@@ -79,7 +79,7 @@ def evaluate(
             "--tolerance": judging.tolerance,
         }  # fmt: skip
         surface.check_alone(folders, others)
-        surface.evaluate(judging.as_json)
+        surface.evaluate(judging.as_json, judging.quiet)
         return
     from sat_intervals.cli.tables import show_scene, show_scenes
     from sat_intervals.evaluate.disparity import evaluate_run

@@ -1,7 +1,7 @@
 """Evaluate a surface model: the options of ``sat-intervals evaluate --dsm``, and what they print and write."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -9,8 +9,9 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import say_json
+from sat_intervals.cli.options import Command, SurfaceAndReference, reference_options, say_json, with_options
 
+Line = tuple[float, float, float, float]
 _FILE = click.Path(path_type=Path)
 _SOFTWARE = "sat-intervals"
 # Beginnings of files of figures: those without one are not replaced.
@@ -21,12 +22,10 @@ _MARKS = f'{{\n "software": "{_SOFTWARE}"', f"<!-- {_SOFTWARE} -->\n"
 class Surface:
     """A surface model to evaluate, and how."""
 
-    dsm: Path
-    reference: Path
+    given: SurfaceAndReference
     classes: Path | None
-    registers: bool
     folder: Path | None
-    line: tuple[float, float, float, float] | None
+    line: Line | None
 
     def check_alone(self, folders: Sequence[Path], options: Mapping[str, Any]) -> None:
         """Raise if there are runs to evaluate too, or options for them."""
@@ -36,28 +35,27 @@ class Surface:
         if folders:
             raise click.UsageError(f"{folders[0]} is a run and --dsm a surface model: evaluate one of them at a time.")
 
-    def evaluate(self, as_json: bool) -> None:
-        """Print figures, and write them with pictures to the folder."""
+    def evaluate(self, as_json: bool, quiet: bool) -> None:
+        """Print figures, and write them with pictures to the folder, whose names are not printed if quiet."""
         from sat_intervals.cli.tables import show_surface
         from sat_intervals.evaluate.dsm import evaluate_surface
 
         if self.folder is not None and not self.folder.is_dir():
             raise click.UsageError(f"--pictures {self.folder} is no folder: give an existing one.")
-        report = evaluate_surface(self.dsm, self.reference, self.classes, registers=self.registers)
+        given = self.given
+        report = evaluate_surface(given.dsm, given.reference, self.classes, registers=given.registers)
         if as_json:
             say_json(report)
         else:
-            show_surface(str(self.dsm), report)
+            show_surface(str(given.dsm), report)
         if self.folder is not None:
-            for path in _drawn(self, self.folder, report):
+            written = _drawn(given, self.folder, self.line, report)
+            for path in () if quiet else written:
                 click.echo(path, err=as_json)
 
 
 _OPTIONS = (
-    click.option("--dsm", type=_FILE, help="Evaluate this surface model against --reference, instead of runs."),
-    click.option("--reference", type=_FILE, help="Reference heights above the same datum, in any CRS."),
     click.option("--classes", type=_FILE, help="With --dsm: raster of whole numbers, such as land cover, in any CRS."),
-    click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
     click.option(
         "--pictures",
         type=_FILE,
@@ -74,35 +72,29 @@ _OPTIONS = (
 )
 
 
-def surface_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def surface_options(command: Command) -> Command:
     """Add options for a surface model; the command gets ``surface``, None without one."""
 
     @wraps(command)
     def with_surface(
         *,
-        dsm: Path | None,
-        reference: Path | None,
+        surface: SurfaceAndReference | None,
         classes: Path | None,
-        no_register: bool,
         pictures: Path | None,
-        line: tuple[float, float, float, float] | None,
+        line: Line | None,
         **others: Any,
     ) -> Any:
-        given = {"--classes": classes, "--no-register": no_register, "--pictures": pictures, "--line": line}
+        given = {"--classes": classes, "--pictures": pictures, "--line": line}
         extra = next((name for name, value in given.items() if value), None)
-        if bool(dsm) != bool(reference):
-            raise click.UsageError("--dsm and --reference go together: give both.")
-        if extra and not dsm:
+        if extra and surface is None:
             raise click.UsageError(f"{extra} goes with --dsm: leave it out.")
-        surface = Surface(dsm, reference, classes, not no_register, pictures, line) if dsm and reference else None
-        return command(surface=surface, **others)
+        return command(surface=surface and Surface(surface, classes, pictures, line), **others)
 
-    for option in reversed(_OPTIONS):
-        with_surface = option(with_surface)
-    return with_surface
+    add_reference = reference_options("Evaluate this surface model against --reference, instead of runs.")
+    return add_reference(with_options(with_surface, *_OPTIONS))
 
 
-def _drawn(given: Surface, folder: Path, report: dict[str, Any]) -> list[Path]:
+def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: dict[str, Any]) -> list[Path]:
     """Write figures and pictures of a surface model to a folder; return their paths."""
     from sat_intervals.cli.tables import surface_markdown
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
@@ -117,7 +109,7 @@ def _drawn(given: Surface, folder: Path, report: dict[str, Any]) -> list[Path]:
     _check_texts(texts)
     names = given.dsm.name, given.reference.name
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
-    profile = read_profile(compared, given.line)
+    profile = read_profile(compared, line)
     content = json.dumps({"software": _SOFTWARE} | report, indent=1), surface_markdown(str(given.dsm), report)
     for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
         with whole_file(path) as new:

@@ -1,7 +1,7 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,10 +49,11 @@ class PairArguments:
 
 @dataclass(frozen=True)
 class SettingsArguments:
-    """A file of settings, and the sections of the command line, which win over it."""
+    """A file of settings, and the sections of the command line, which win over it; names of the options given."""
 
     file: Path | None
     sections: dict[str, Any]
+    options: tuple[str, ...] = ()
 
     def load(self, **sections: Any) -> "Config":
         """Load the settings; the sections given here win."""
@@ -202,6 +203,8 @@ def settings_options(command: Command) -> Command:
     @wraps(command)
     def with_settings(*, config_file: Path | None, preset: str | None, cluster: str | None, **others: Any) -> Any:
         sections: dict[str, Any] = {"preset": preset} if preset else {}
+        given = {"config": config_file, "preset": preset, "cluster": cluster} | {name: others[name] for name in _PLACES}
+        names = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
         for option, (section, key) in _PLACES.items():
             if (value := others.pop(option)) is not None:
                 sections.setdefault(section, {})[key] = value
@@ -209,7 +212,7 @@ def settings_options(command: Command) -> Command:
             is_address = "://" in cluster
             chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
             sections["cluster"] = sections.get("cluster", {}) | chosen
-        return command(settings=SettingsArguments(config_file, sections), **others)
+        return command(settings=SettingsArguments(config_file, sections, names), **others)
 
     return with_options(with_settings, *_SETTINGS_OPTIONS)
 
@@ -232,7 +235,7 @@ def search_options(command: Command) -> Command:
         if range_grid is not None:
             search["grid"] = range_grid
         sections = settings.sections | ({"disparity": search} if search else {})
-        return command(settings=SettingsArguments(settings.file, sections), **others)
+        return command(settings=replace(settings, sections=sections), **others)
 
     return with_options(settings_options(with_search), *_SEARCH_OPTIONS)
 

@@ -1,6 +1,7 @@
 """Options shared by commands, and checks of file names."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,46 @@ def sensor_options(command: Command) -> Command:
         return command(sensor_files=(left_model, right_model, left_grid, right_grid), **others)
 
     return with_options(with_sensors, *_SENSOR_OPTIONS)
+
+
+@dataclass(frozen=True)
+class SurfaceAndReference:
+    """A surface model, reference heights to compare it with, and whether these are moved to it first."""
+
+    dsm: Path
+    reference: Path
+    registers: bool
+
+
+def reference_options(dsm_help: str) -> Callable[[Command], Command]:
+    """Return a decorator that adds --dsm, --reference and --no-register.
+
+    The command gets ``surface``, a `SurfaceAndReference`, or None without them.
+    """
+
+    def decorated(command: Command) -> Command:
+        @wraps(command)
+        def with_reference(*, dsm: Path | None, reference: Path | None, no_register: bool, **others: Any) -> Any:
+            if bool(dsm) != bool(reference):
+                raise click.UsageError("--dsm and --reference go together: give both.")
+            if no_register and not dsm:
+                raise click.UsageError("--no-register goes with --dsm: leave it out.")
+            surface = SurfaceAndReference(dsm, reference, not no_register) if dsm and reference else None
+            return command(surface=surface, **others)
+
+        return with_options(
+            with_reference,
+            click.option("--dsm", callback=path, metavar="FILE", help=dsm_help),
+            click.option(
+                "--reference",
+                callback=path,
+                metavar="FILE",
+                help="With --dsm: reference heights above the same datum, in any CRS.",
+            ),
+            click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
+        )
+
+    return decorated
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")

@@ -16,6 +16,7 @@ from sat_intervals.cli.matching import (
     search_options,
 )
 from sat_intervals.cli.options import json_option, path, say_json, sensor_options
+from sat_intervals.cli.triangulate import point_warnings, say_points
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -51,11 +52,13 @@ def surface(
 
     config = settings.load()
     with Console(run.quiet or as_json) as console:
+        from sat_intervals.config import resolved
         from sat_intervals.heights.dsm import make_surface
         from sat_intervals.heights.triangulate import triangulate
         from sat_intervals.run.before import report_before
 
-        _check(out, cells, sensor_files, settings.file, config.interval)
+        _check_kept(out, cells, sensor_files, settings.file)
+        _check(out, cells, sensor_files, resolved(config).interval)
         left, right = pair.open()
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
@@ -65,27 +68,29 @@ def surface(
     if as_json:
         say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
+    say_points(console, points)
     say_surface(console, made)
     console.say(str(out / "dsm.tif"))
-    run.check_strict(report["warnings"])
+    run.check_strict([*report["warnings"], *point_warnings(points)])
 
 
-def _check(
-    out: Path,
-    cells: dict[str, Any],
-    sensor_files: Sequence[str | Path],
-    config: Path | None,
-    interval: "Interval | None",
+def _check_kept(
+    out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path], config: Path | None = None
 ) -> None:
-    """Raise for what the later steps cannot use, before hours of matching."""
-    from sat_intervals.heights.dsm import checked_cells, surface_tags
-    from sat_intervals.heights.sensors import Sensors
+    """Raise if a step would write over a file that is read."""
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS
 
     results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
     like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
     check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
+
+
+def _check(out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
+    """Raise for what the later steps cannot use, before hours of matching."""
+    from sat_intervals.heights.dsm import checked_cells, surface_tags
+    from sat_intervals.heights.sensors import Sensors
+
     _, cell, _, radius = checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
     Sensors.load(*map(Path, sensor_files))
@@ -94,14 +99,25 @@ def _check(
 def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -> "Finish":
     """Return a function that makes the surface model of a pair of a batch, if its row asks for one.
 
-    Models and grids are read now, before hours of matching.
+    Models and grids are read now, before hours of matching. Those that cannot be used fail their pair, at its end.
     """
+    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.heights.choices import SurfaceChoices
 
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
+    errors: dict[str, SatIntervalsError] = {}
+    if any(pair.sensors for pair in pairs):
+        import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
     for pair in pairs:
-        if pair.sensors:
-            _check(out / pair.name, {"resolution": pair.resolution, **cells}, pair.sensors, None, None)
+        if not pair.sensors:
+            continue
+        folder, of_pair = out / pair.name, {"resolution": pair.resolution, **cells}
+        _check_kept(folder, of_pair, pair.sensors)
+        try:
+            _check(folder, of_pair, pair.sensors, None)
+        except SatIntervalsError as error:
+            errors[pair.name] = error
+            click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
 
     def surface_of(pair: "PairOfBatch") -> dict[str, Any]:
         from sat_intervals.heights.dsm import make_surface
@@ -110,8 +126,10 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         folder = out / pair.name
         if not pair.sensors or not pair.resolution:
             return {}
-        triangulate(folder, *pair.sensors, console.progress)
+        if pair.name in errors:
+            raise errors[pair.name]
+        points = triangulate(folder, *pair.sensors, console.progress)
         made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
-        return {"surface": made}
+        return {"points": points, "surface": made}
 
     return surface_of

@@ -167,6 +167,7 @@ def _notes(report: dict[str, Any]) -> list[str]:
         "nominal coverage, or alpha: unknown, so no interval scores"
         if nominal is None
         else f"nominal coverage, or alpha: {nominal:g}; the interval score judges for it, less is better",
+        *report["warnings"],
     ]
 
 

@@ -1,10 +1,14 @@
 """``sat-intervals triangulate``: compute ground points of a run."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, sensor_options
+
+if TYPE_CHECKING:
+    from sat_intervals.cli.console import Console
 
 # Metres between lines of sight above which models are suspect.
 _SUSPECT = 0.1
@@ -37,7 +41,13 @@ def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], as_json:
         report = triangulate(out, *sensor_files, progress=console.progress)
     if as_json:
         say_json(report)
-    elif report["points"]:
+    say_points(console, report)
+    console.say(str(out / "points.tif"))
+
+
+def say_points(console: "Console", report: dict[str, Any]) -> None:
+    """Print the range of the points of a run, and what is wrong with them."""
+    if report["points"]:
         (lowest, highest), residual = report["height"], report["residual"][1]
         console.say(
             f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid, "
@@ -45,13 +55,19 @@ def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], as_json:
         )
     else:
         console.say("no valid pixels, so no points")
-    if report["lost"]:
-        click.echo(f"{report['lost']} valid pixels have no point: grids or models have no values there", err=True)
-    if report["median_residual"] > _SUSPECT:
-        click.echo(
+    for line in point_warnings(report):
+        click.echo(line, err=True)
+
+
+def point_warnings(report: dict[str, Any]) -> list[str]:
+    """Return lines about pixels without a point, and models that hardly fit."""
+    lines = []
+    if report.get("lost"):
+        lines.append(f"{report['lost']} valid pixels have no point: grids or models have no values there")
+    if report.get("median_residual", 0) > _SUSPECT:
+        lines.append(
             f"warning: lines of sight miss each other by {report['median_residual']:.2g} m in the median, where "
             "matching models and grids give millimetres. Height errors may be many times larger: check that the grids "
-            "were made with these models",
-            err=True,
+            "were made with these models"
         )
-    console.say(str(out / "points.tif"))
+    return lines

@@ -14,7 +14,8 @@ from sat_intervals.config.sections import ConfigError
 
 _MAKE_ONE = "make one with sat-intervals calibrate --dsm"
 # Tags of a surface that its intervals depend on.
-_OF_INTERVALS = ("INTERVAL", "RADIUS", "COVERAGE", "ALPHA", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE")
+_OF_MATCHING = "COVERAGE", "ALPHA", "DISPARITY_CALIBRATION"
+_OF_INTERVALS = *_OF_MATCHING, "INTERVAL", "RADIUS", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE"
 # Metres.
 _LARGEST = 10_000.0
 
@@ -46,6 +47,9 @@ class HeightCalibration(CalibrationFile):
         For people.
     coverage
         Share of true heights inside the widened intervals.
+    registered
+        Whether the reference was moved to the surface first. Then the margins do not include a constant shift, such as
+        an error of the models' position.
     surface
         What surfaces the margins belong to, see `surface_key`.
     classes
@@ -56,6 +60,7 @@ class HeightCalibration(CalibrationFile):
 
     name: str
     coverage: float = Field(gt=0, lt=1)
+    registered: bool
     surface: dict[str, str]
     classes: tuple[WidthClass, ...] = Field(strict=False, min_length=1)
     provenance: dict[str, Any] = Field(default_factory=dict)

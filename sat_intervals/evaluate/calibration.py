@@ -15,6 +15,7 @@ from sat_intervals.config import HeightCalibration, WidthClass, surface_key
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.comparison import (
+    NOT_MOVED,
     Comparison,
     check_common,
     compared,
@@ -80,12 +81,13 @@ def calibrate_surface(
     -------
     Its provenance has the files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks
     of ground with the margins of the other blocks (None with too few cells): coverage, median and mean width in metres;
-    ``lowest``, the smallest coverage of a block (None with too few cells in each).
+    ``lowest``, the smallest coverage of a block (None with too few cells in each); ``warnings``, lines for people.
 
     Raises
     ------
     SatIntervalsError
-        A file cannot be used, both do not overlap, seem to have different datums, or have too few cells in common.
+        A file cannot be used, both do not overlap or have too few cells in common; or seem to have different datums,
+        and the reference was not moved.
     """
     check_unchanged = watched([surface, reference])
     given = open_comparison(surface, reference)
@@ -95,13 +97,16 @@ def calibrate_surface(
     moved = moved_by(given, found and found.report())
     sample, cells_of_height = _sample(moved)
     check_unchanged()
-    _check_datum(given, sample, moved.shift[2])
+    warnings = [NOT_MOVED] if registers and found is None else []
+    warnings += _datum_warnings(given, sample, moved.shift[2], is_registered=found is not None)
     sample = sample.of(np.isfinite(sample.width))
     fit = fitted(sample, cells_of_height, coverage)
     if fit is None:
+        once = f" (those in a pixel of {given.resolution:.3g} m count as one)" if _coarser(given) > 1 else ""
         raise SatIntervalsError(
             f"{round(sample.height.size * cells_of_height)} cells of {given.surface} have an interval and a height in "
-            f"{given.reference}, {least_number(coverage)} are needed for coverage {coverage:g}: give a larger reference"
+            f"{given.reference}{once}, {least_number(coverage)} are needed for coverage {coverage:g}: give a larger "
+            "reference"
         )
     limits = [float(limit) for limit in fit.limits]
     classes = tuple(
@@ -115,9 +120,16 @@ def calibrate_surface(
         "shift": None if found is None else [round(float(value), 3) for value in moved.shift],
         "before": _figures(sample, sample.lower, sample.upper),
         "expected": _expected(sample, cells_of_height, coverage),
+        "warnings": warnings,
     }
-    key = surface_key(tags, given.cell)
-    return HeightCalibration(name=name, coverage=coverage, surface=key, classes=classes, provenance=provenance)
+    return HeightCalibration(
+        name=name,
+        coverage=coverage,
+        registered=found is not None,
+        surface=surface_key(tags, given.cell),
+        classes=classes,
+        provenance=provenance,
+    )
 
 
 def _checked_coverage(surface: Path, tags: Mapping[str, str], coverage: float | None) -> float:
@@ -133,19 +145,30 @@ def _checked_coverage(surface: Path, tags: Mapping[str, str], coverage: float | 
     return coverage
 
 
+def _coarser(given: Comparison) -> float:
+    """Return the cells along a pixel of the reference, at least 1."""
+    return max(1.0, round(given.resolution / given.cell, 3))
+
+
 def _sample(given: Comparison) -> tuple[Sample, float]:
-    """Return heights spread over both, at most some `_MOST`, and the number of cells that one stands for."""
-    heights = given.finer**2
-    stride = -(-given.shape[0] * given.shape[1] * heights // _MOST)
-    parts, places = [], []
+    """Return the heights of both, `_MOST` at most by chance, and the number of cells that one stands for."""
+    random = np.random.default_rng(0)
+    parts, common, gathered, share = [np.empty((6, 0))], 0, 0, 1.0
     for window in tiles(given):
         cells = compared(given, window)
-        row, column = (place[::stride] // given.finer for place in np.nonzero(cells.known))
-        parts.append([values[::stride] for values in cells[:4]])
-        places.append([row + window.row, column + window.column])
-    row, column = (_part(np.concatenate(values)) for values in zip(*places, strict=True))
-    height, lower, upper, truth = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return Sample(height, lower, upper, truth, _BLOCKS * row + column), min(1.0, stride / heights)
+        row, column = (place // given.finer for place in np.nonzero(cells.known))
+        values = np.stack([*cells[:4], row + window.row, column + window.column])
+        common += row.size
+        parts.append(values[:, random.random(row.size) < share])
+        gathered += parts[-1].shape[1]
+        while gathered > _MOST:
+            share /= 2
+            parts = [part[:, random.random(part.shape[1]) < 0.5] for part in parts]
+            gathered = sum(part.shape[1] for part in parts)
+    height, lower, upper, truth, row, column = np.concatenate(parts, axis=1)
+    cells_of_all = common / (given.finer * _coarser(given)) ** 2
+    block = _BLOCKS * _part(row) + _part(column)
+    return Sample(height, lower, upper, truth, block), min(1.0, cells_of_all / max(1, height.size))
 
 
 def _part(place: np.ndarray) -> np.ndarray:
@@ -156,15 +179,22 @@ def _part(place: np.ndarray) -> np.ndarray:
     return np.asarray(_BLOCKS * (place - first) // count)
 
 
-def _check_datum(given: Comparison, sample: Sample, up: float) -> None:
-    """Raise without a common height, or if the heights differ by as much as two datums do."""
+def _datum_warnings(given: Comparison, sample: Sample, up: float, *, is_registered: bool) -> list[str]:
+    """Return a warning if the heights differ by as much as two datums do; raise if the reference was not moved.
+
+    Raises without a common height, too.
+    """
     median = float(np.median(sample.height - sample.reference)) + up if sample.height.size else None
     check_common(given, sample.height.size, median)
-    if median is not None and abs(median) > _DATUM:
-        raise SatIntervalsError(
-            f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as those above "
-            "a geoid and the ellipsoid do: make the surface with --geoid, or convert the reference"
-        )
+    if median is None or abs(median) <= _DATUM:
+        return []
+    line = (
+        f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as those above "
+        "a geoid and the ellipsoid do"
+    )
+    if is_registered:
+        return [f"{line}; the margins do not include it"]
+    raise SatIntervalsError(f"{line}: make the surface with --geoid, convert the reference, or let it be moved")
 
 
 def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins | None:

@@ -13,6 +13,7 @@ from sat_intervals.kernels.registration import REACH, Blocks, Registration, regi
 from sat_intervals.raster import (
     Georeferencing,
     check_reference,
+    covered_window,
     is_surface,
     read_heights,
     read_layers,
@@ -21,6 +22,8 @@ from sat_intervals.raster import (
 )
 from sat_intervals.tiling import Grid, Window
 
+NOT_MOVED = "the reference was not moved: too few common heights"
+"""Warning of a registration that was asked for and not possible."""
 # Heights compared at a time, some hundred bytes each.
 _TILE = 1 << 20
 # Blocks of each side that register, their sides in cells, and points of a block.
@@ -37,6 +40,8 @@ class Comparison:
         The files.
     shape, place
         Size and georeferencing of the surface.
+    resolution
+        Size of the reference's pixels in metres.
     finer
         Heights of the reference along a cell.
     shift
@@ -47,6 +52,7 @@ class Comparison:
     reference: Path
     shape: tuple[int, int]
     place: Georeferencing
+    resolution: float
     finer: int
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -80,8 +86,9 @@ def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
     read_place(reference)
     check_reference(reference, surface)
     assert place.pixel_size is not None
-    finer = max(1, round(place.pixel_size[0] / resolution_of(reference, place)))
-    return Comparison(surface, reference, shape, place, finer)
+    resolution = resolution_of(reference, place)
+    finer = max(1, round(place.pixel_size[0] / resolution))
+    return Comparison(surface, reference, shape, place, resolution, finer)
 
 
 def moved_by(given: Comparison, registration: dict[str, Any] | None) -> Comparison:
@@ -140,12 +147,13 @@ def compared(given: Comparison, window: Window) -> ComparedCells:
 
 def registered(given: Comparison) -> Registration | None:
     """Return the shift from the reference to the surface; None with too few heights."""
-    side = min(_LARGEST_BLOCK, max(_SMALLEST, min(given.shape) // _BLOCKS))
-    grid = Grid(Window(0, 0, *given.shape), side)
+    part = covered_window(given.reference, given.place, given.shape)
+    side = min(_LARGEST_BLOCK, max(_SMALLEST, min(part.height, part.width) // _BLOCKS))
+    grid = Grid(part, side)
     size = side + 2 * (REACH + 1)
     surfaces: list[np.ndarray] = []
     parts: list[tuple[np.ndarray, ...]] = []
-    rows, columns = (range(0, count, -(-count // _BLOCKS)) for count in (grid.rows, grid.columns))
+    rows, columns = (range(0, count, max(1, -(-count // _BLOCKS))) for count in (grid.rows, grid.columns))
     for core in (grid.tile(row, column).core for row in rows for column in columns):
         height = read_layers(given.surface, core)[0].astype(np.float64)
         row, column = np.nonzero(np.isfinite(height))

@@ -9,6 +9,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import Accuracy, Errors
 from sat_intervals.evaluate.comparison import (
+    NOT_MOVED,
     Comparison,
     check_common,
     compared,
@@ -59,7 +60,8 @@ def evaluate_surface(
     For ``all`` heights, by ``slope`` of the reference (degrees), by ``width`` of the interval (metres) and by
     ``classes``: the figures of `Accuracy.report`. ``before``: those of all heights with the reference in its place.
     ``from`` and ``to`` are the limits of a class, ``class`` its number. ``registration``, see `Registration.report`;
-    None without, or with too few heights. ``nominal``: coverage or alpha of the surface; None if unknown.
+    None without, or with too few heights, of which ``warnings`` tell. ``nominal``: coverage or alpha of the surface;
+    None if unknown.
 
     Raises
     ------
@@ -94,6 +96,7 @@ def evaluate_surface(
     return {
         "nominal": nominal,
         "registration": found and found.report(),
+        "warnings": [NOT_MOVED] if registers and found is None else [],
         "before": in_place,
         "all": report,
         "slope": _by(slopes, SLOPES),

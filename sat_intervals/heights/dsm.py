@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Interval, surface_key
+from sat_intervals.config import Calibration, Interval, surface_key
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.cells import Tally, strips
 from sat_intervals.heights.choices import SurfaceChoices
@@ -156,12 +156,16 @@ def surface_tags(
     levels = {("COVERAGE", one.coverage) if one.coverage else ("ALPHA", one.alpha) for one in intervals if one}
     tags = {"RUNS": " ".join(runs), **choices.tags(), "RADIUS": f"{radius:g} m"}
     tags |= {name: str(level) for name, level in levels} if len(levels) == 1 else {}
+    matched = [one.calibration for one in intervals if one and isinstance(one.calibration, Calibration)]
+    if matched:
+        tags["DISPARITY_CALIBRATION"] = ", ".join(sorted({f"{one.name} {one.sha256}" for one in matched}))
     calibration = choices.calibration
     if calibration is None:
         return tags
     calibration.check_surface(surface_key(tags, cell))
     tags.pop("ALPHA", None)
-    return tags | {"COVERAGE": f"{calibration.coverage:g}", "CALIBRATION": f"{calibration.name} {calibration.sha256}"}
+    tags |= {"COVERAGE": f"{calibration.coverage:g}", "CALIBRATION": f"{calibration.name} {calibration.sha256}"}
+    return tags | {"REGISTERED": "yes" if calibration.registered else "no"}
 
 
 def _check_lengths(resolution: float, radius: float) -> None:

@@ -34,7 +34,7 @@ def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
     Raises
     ------
     SatIntervalsError
-        The file has other content.
+        Sensor positions change by less than 0.4 or more than 40 pixels per epipolar pixel. Nothing else is tested.
     """
     grid = RectificationGrid(str(path))
     has_displacements = read_tags(path).get(_TAG) == _OTB

@@ -26,7 +26,14 @@ from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, grid_mapping, utm_of
 from sat_intervals.raster.publishing import OutputError, stamps
 from sat_intervals.raster.space import check_space, file_bytes, part_bytes
-from sat_intervals.raster.surfaces import check_reference, is_surface, read_heights, read_place, resolution_of
+from sat_intervals.raster.surfaces import (
+    check_reference,
+    covered_window,
+    is_surface,
+    read_heights,
+    read_place,
+    resolution_of,
+)
 from sat_intervals.raster.windows import read_views, read_window
 from sat_intervals.raster.writer import OutputWriter, remove_scratch, restore
 
@@ -53,6 +60,7 @@ __all__ = [
     "check_space",
     "codec_versions",
     "compressed",
+    "covered_window",
     "factors",
     "file_bytes",
     "footprint",

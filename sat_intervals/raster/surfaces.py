@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pyproj
 from rasterio.enums import Resampling
+from rasterio.transform import array_bounds
 from rasterio.vrt import WarpedVRT
-from rasterio.warp import calculate_default_transform
+from rasterio.warp import calculate_default_transform, transform_bounds
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
@@ -72,6 +73,24 @@ def resolution_of(path: Path, place: Georeferencing) -> float:
             dataset.crs, place.crs, dataset.width, dataset.height, *dataset.bounds
         )
         return float(transform.a)
+
+
+def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) -> Window:
+    """Return the part of a north-up grid of cells that the extent of a raster covers; all cells if it is unknown."""
+    whole, grid = Window(0, 0, *shape), place.transform
+    assert grid is not None
+    with opened(str(path)) as dataset:
+        given = dataset.bounds
+        cells = transform_bounds(place.crs, dataset.crs, *array_bounds(*shape, grid))
+        left, right = max(cells[0], given.left), min(cells[2], given.right)
+        bottom, top = max(cells[1], min(given.bottom, given.top)), min(cells[3], max(given.bottom, given.top))
+        if not (left < right and bottom < top):  # apart, or across the antimeridian
+            return whole
+        # only the common part: the whole extent may reach where the CRS of the cells is not defined
+        west, south, east, north = transform_bounds(dataset.crs, place.crs, left, bottom, right, top)
+    column, row = (int(np.floor(value)) for value in (~grid) * (west, north))
+    column_stop, row_stop = (int(np.ceil(value)) for value in (~grid) * (east, south))
+    return Window(row, column, row_stop - row, column_stop - column).clipped(whole)
 
 
 def read_heights(

@@ -63,8 +63,8 @@ def match_batch(
 
     Returns
     -------
-    By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``counts`` and ``seconds``. ``batch.json``
-    has the same during the batch, with "waiting" for pairs that have not ended.
+    By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``counts`` and ``seconds``, or all of them if
+    ``finish`` failed. ``batch.json`` has the same during the batch, with "waiting" for pairs that have not ended.
 
     Raises
     ------
@@ -196,7 +196,7 @@ def _finished(pair: PairOfBatch, how: dict[str, Any], finish: Finish) -> dict[st
         more = finish(pair)
         return {**how, **more} if more else how
     except Exception as error:  # one pair's failure must not stop the others
-        return _failed(error)
+        return {**how, **_failed(error)}
 
 
 def _raise_file_limit() -> None:

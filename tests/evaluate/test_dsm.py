@@ -82,6 +82,16 @@ def test_evaluate_surface__registers_on_relief_and_says_what_it_moved(tmp_path):
     assert alone["all"] == alone["before"] == report["before"]
 
 
+def test_evaluate_surface__registers_a_reference_of_a_small_part_of_the_surface(tmp_path, monkeypatch):
+    # Of the blocks of 16 cells every third was tried, and none of them is in the reference.
+    monkeypatch.setattr("sat_intervals.evaluate.comparison._LARGEST_BLOCK", 16)
+    row, column = np.indices((320, 320)).astype(np.float64)
+    truth = relief(row, column)
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
+    reference = write_raster(tmp_path / "part.tif", [truth[16:48, 16:48] - 5], PLACE * Affine.translation(16, 16))
+    assert evaluate_surface(model, reference)["registration"]["shift"][2] == pytest.approx(5, abs=0.1)
+
+
 def test_evaluate_surface__by_classes_of_a_raster(tmp_path):
     model = write_surface(tmp_path / "dsm.tif", [[1.0, 2, 3, 4]], [[0.0] * 4], [[9.0] * 4])
     reference = write_raster(tmp_path / "reference.tif", [[[1.0, 1, 1, 1]]])
@@ -189,6 +199,9 @@ def test_evaluate_command__of_a_surface(tmp_path):
     assert result.stdout.splitlines()[2].split() == [
         "all", "cells", "2", "-3.750", "-3.750", "4.818", "4.962", "6.350", "5.850", "0.500", "1.000", "1.000", "-"
     ]  # fmt: skip
+    assert result.stdout.splitlines()[-1] == "the reference was not moved: too few common heights"
+    alone = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register")
+    assert "not moved" not in alone.stdout
     assert (
         json.loads(invoke("evaluate", "--dsm", model, "--reference", reference, "--json").stdout)["all"]["count"] == 2
     )
@@ -208,7 +221,10 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
     assert json.loads(written[0].read_text())["all"]["median"] == pytest.approx(0.1)
     assert "| all cells | 4200 | 0.100 |" in written[1].read_text()
     assert all(path.stat().st_size > 5000 for path in written[2:])
-    assert invoke(*words, "--pictures", tmp_path).exit_code == 0  # its own files are replaced
+    again = invoke(*words, "--pictures", tmp_path, "--quiet")  # its own files are replaced
+    assert again.exit_code == 0
+    assert "all cells" in again.stdout
+    assert "dsm-accuracy" not in again.stdout
     for line, message in (((0, 0, 1, 1), "does not cross"), ((PLACE.c, PLACE.f, PLACE.c + 70, PLACE.f - 60), "")):
         result = invoke(*words, "--pictures", tmp_path, "--line", *line)
         assert result.exit_code == (2 if message else 0)

@@ -16,7 +16,7 @@ from pyproj import Transformer
 from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.config import load_height_calibration
+from sat_intervals.config import load_calibration, load_height_calibration
 from sat_intervals.errors import RunError
 from sat_intervals.heights import cells
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
@@ -303,6 +303,7 @@ def test_make_surface__poor_cells_are_no_data(tmp_path):
 CALIBRATION = """\
 name: city
 coverage: 0.8
+registered: true
 surface: {CELL: 1 m, PAIRS: '1', INTERVAL: median, RADIUS: 0.6 m, COVERAGE: '0.9', OPEN_POINTS: left out}
 classes:
 - {below: 5.0, margin: 0.75, cells: 100}
@@ -325,6 +326,12 @@ def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tm
     assert_allclose(surface[:3, i, [j, j + 4]].T, [(10, 8.25, 12.75), (10, 10, 15)], atol=1e-5)
     assert (tags["COVERAGE"], tags["HEIGHTS"]) == ("0.8", "above the WGS 84 ellipsoid")
     assert tags["CALIBRATION"] == f"city {load_height_calibration(file).sha256}"
+    assert tags["REGISTERED"] == "yes"
+    file.write_text(CALIBRATION.replace("registered: true", "registered: false"))
+    assert invoke(*words).exit_code == 0
+    with rasterio.open(out / "dsm.tif") as dataset:
+        assert dataset.tags()["REGISTERED"] == "no"
+        assert dataset.tags()["CALIBRATION"] != tags["CALIBRATION"]
     for changes, message in (
         (["--resolution", "2"], "belongs to other surfaces, CELL is 1 m there and 2 m here: make one with"),
         (["--bounds", "mean"], "INTERVAL is median there and mean here"),
@@ -336,6 +343,20 @@ def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tm
         assert result.exit_code == 2, result.output
         assert message in result.stderr
         assert result.stderr.count("\n") == 1
+
+
+def test_dsm_command__a_calibration_belongs_to_the_calibration_of_the_disparities(tmp_path):
+    out = with_coverage(write_points(tmp_path / "a", [0.5, 4.5], [-0.5] * 2, [10.0] * 2))
+    report = json.loads((out / "run.json").read_text())
+    report["settings"]["interval"]["calibration"] = load_calibration("satellite").model_dump(mode="json")
+    (out / "run.json").write_text(json.dumps(report))
+    file = tmp_path / "heights.yaml"
+    words = ["dsm", str(out), "--resolution", "1", "--radius", "0.6", "--calibration", str(file)]
+    file.write_text(CALIBRATION)
+    assert "DISPARITY_CALIBRATION is null there and satellite" in invoke(*words).stderr
+    of_runs = f"satellite {load_calibration('satellite').sha256}"
+    file.write_text(CALIBRATION.replace("{CELL", f"{{DISPARITY_CALIBRATION: {of_runs}, CELL"))
+    assert invoke(*words).exit_code == 0
 
 
 def test_make_surface__takes_the_grid_of_a_raster(tmp_path):

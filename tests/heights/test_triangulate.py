@@ -370,7 +370,8 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     wrong = invoke(*command[:-1], "-1")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
     (tmp_path / "heights.yaml").write_text(
-        "{name: city, coverage: 0.9, surface: {CELL: 9 m}, classes: [{below: null, margin: 1.0, cells: 99}]}"
+        "{name: city, coverage: 0.9, registered: true, surface: {CELL: 9 m}, "
+        "classes: [{below: null, margin: 1.0, cells: 99}]}"
     )
     wrong = invoke(*command, "--height-calibration", tmp_path / "heights.yaml")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
@@ -413,8 +414,6 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
         (f"a,{images},{sensors},", "row 1 lacks resolution: a surface needs left_model"),
         (f"a,{images},,,,,1", "row 1 lacks left_model and right_model and left_grid and right_grid: a surface needs"),
         (f"a,{images},{sensors},wide", "resolution is 'wide', needed: a number"),
-        (f"a,{images},{sensors},-1", "resolution is -1 m: give one above 0"),
-        (f"a,{images},no.tif,{sensors.partition(',')[2]},1", "no.tif"),
     ):
         result = batch(row)
         assert (result.exit_code, result.stderr.count("\n"), out.exists()) == (2, 1, False), result.output
@@ -425,6 +424,8 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert report["a"]["surface"]["crs"] == "EPSG:32631"
     assert "surface" not in report["b"]
     assert not (out / "b" / "dsm.tif").exists()
+    result = batch(f"a,{images},out/a/intervals.tif,{sensors.partition(',')[2]},1")
+    assert (result.exit_code, "intervals.tif would be written" in result.stderr) == (2, True)
     assert batch(f"a,{images},{sensors},2").exit_code == 0
     assert read(out / "a" / "dsm.tif").shape[1] < 60  # made again
     (out / "a" / "points.tif").write_bytes(b"mine")
@@ -434,3 +435,43 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert "a: " in result.stderr
     assert "points.tif exists and was not made by triangulate" in result.stderr
     assert (out / "b" / "dsm.tif").exists()
+
+
+def test_surface_command__warns_of_models_that_nearly_fit(tmp_path):
+    scene = make_scene(60, 80, seed=4)
+    write_pair(tmp_path, scene)
+    files = [*cameras(tmp_path, 60, 80)[:3], grid(tmp_path / "shifted.tif", 60, 80, offset=1.5)]
+    search = "--disparity", scene.minimum, scene.maximum
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    command = "surface", *images, tmp_path / "out", *sensor_words(files), *search, "--resolution", 1
+    result = invoke(*command)
+    assert result.exit_code == 0, result.stderr
+    assert "m above the ellipsoid, lines of sight at most" in result.stdout
+    assert "warning: lines of sight miss each other by 0." in result.stderr
+    assert "--strict is given" in invoke(*command, "--strict").stderr
+
+
+def test_batch_command__a_bad_model_fails_its_pair_only(tmp_path):
+    scene = make_scene(60, 80, seed=4)
+    write_pair(tmp_path, scene)
+    cameras(tmp_path, 60, 80)
+    grid(tmp_path / "shifted.tif", 60, 80, offset=1.5)
+    images = f"left.tif,right.tif,{scene.minimum},{scene.maximum}"
+    (tmp_path / "pairs.csv").write_text(
+        "name,left,right,minimum,maximum,left_model,right_model,left_grid,right_grid,resolution\n"
+        f"good,{images},left_model.tif,right_model.tif,left_grid.tif,right_grid.tif,1\n"
+        f"near,{images},left_model.tif,right_model.tif,left_grid.tif,shifted.tif,1\n"
+        f"bad,{images},no.tif,right_model.tif,left_grid.tif,right_grid.tif,1\n"
+    )
+    result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"bad: there will be no surface: {tmp_path / 'no.tif'}: no such file")
+    assert "1 of 3 pairs failed" in result.stderr
+    assert "\nnear: warning: lines of sight miss each other by 0." in result.stderr
+    assert "good: warning" not in result.stderr
+    report = json.loads((tmp_path / "out" / "batch.json").read_text())
+    assert [end["state"] for end in report.values()] == ["done", "done", "failed"]
+    assert report["bad"]["counts"] == report["good"]["counts"]
+    assert "no.tif: no such file" in report["bad"]["error"]
+    assert report["good"]["points"]["points"] > 0
+    assert (tmp_path / "out" / "near" / "dsm.tif").exists()

@@ -67,6 +67,16 @@ def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
         assert not (tmp_path / "batch" / f"pair{seed}" / "tiles").exists()
 
 
+def test_match_batch__keeps_the_counts_of_a_pair_whose_last_step_fails(images, tmp_path):
+    def finish(pair):
+        raise SatIntervalsError("no model")
+
+    pair = read_batch(rows(images))[0]
+    end = match_batch([pair], tmp_path / "batch", finish=finish)[pair.name]
+    assert (end["state"], end["error"]) == ("failed", "no model")
+    assert end["counts"] == json.loads((tmp_path / "batch" / pair.name / "run.json").read_text())["counts"]
+
+
 def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(images, tmp_path):
     pairs = read_batch(rows(images))[:1]
     match_batch(pairs, tmp_path, {"tiles": {"size": 64, "overlap": 20}})

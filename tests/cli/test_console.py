@@ -1,0 +1,24 @@
+"""What a command prints at its end."""
+
+from sat_intervals.cli.console import Console
+
+COUNTS = {"pixels": 200, "valid": 150, "median_interval_width": 2.5}
+
+
+def test_batch_summary__shows_surfaces_of_the_pairs_that_have_one(capsys):
+    surface = {"filled": 0.876, "median_half_width": 1.25}
+    report = {
+        "a": {"state": "done", "counts": COUNTS, "surface": surface},
+        "b": {"state": "done", "counts": COUNTS, "surface": surface | {"median_half_width": None}},
+        "c": {"state": "failed", "counts": COUNTS, "error": "no model"},
+    }
+    Console(quiet=False).batch_summary(report)
+    head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
+    assert head == ["pair", "state", "valid", "median", "width", "filled", "median", "half", "width"]
+    assert rows == [
+        ["a", "done", "75.0", "%", "2.50", "px", "87.6", "%", "+-1.25", "m"],
+        ["b", "done", "75.0", "%", "2.50", "px", "87.6", "%"],
+        ["c", "failed", "75.0", "%", "2.50", "px"],
+    ]
+    Console(quiet=False).batch_summary({"c": report["c"]})
+    assert "filled" not in capsys.readouterr().out
