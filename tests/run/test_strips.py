@@ -246,6 +246,15 @@ def test_finish_strips__makes_damaged_parts_again(tall, tmp_path, monkeypatch, k
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
 
+def test_finish_strips__names_all_missing_parts_in_one_line(tall, tmp_path, monkeypatch):
+    out = with_tiles(tall, tmp_path / "out")
+    for name in ("finish_strip", "reduce_rows"):
+        monkeypatch.setattr(strips, name, lambda *arguments: None)
+    message = rf"^parts 0_0, 0_1, 0_2, 0_3, 1_0, 1_1, 2_0 in {out}/tiles are damaged or missing: rerun the same command"
+    with pytest.raises(DamagedTilesError, match=message):
+        matched(tall, out)
+
+
 def test_finish_strips__takes_no_parts_of_other_settings(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
     other = with_tiles(tall, tmp_path / "other")

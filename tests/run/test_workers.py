@@ -77,25 +77,30 @@ def test_computing__lets_one_more_thread_read_while_kernels_run(tmp_path, monkey
     settings = write_pair(tmp_path, make_scene(140, 70, seed=1), tiles={"size": 64, "overlap": 10})
     pair = tmp_path / "left.tif", tmp_path / "right.tif"
     match_pair(*pair, tmp_path / "local", settings)
-    read_views, match_costed = tile.read_views, tile.match_costed
+    read_views = tile.read_views
     reads, at_work, most = [], [], []
 
     def read(*arguments):
         reads.append(threading.current_thread())
         return read_views(*arguments)
 
-    def match(*arguments):
-        at_work.append(None)
-        most.append(len(at_work))
-        if len(most) == 1:
-            wait_until(lambda: len(set(reads)) == 2, "another tile is read meanwhile")
-        try:
-            return match_costed(*arguments)
-        finally:
-            at_work.pop()
+    def counted(kernel):
+        def work(*arguments):
+            at_work.append(None)
+            most.append(len(at_work))
+            if len(most) == 1:
+                wait_until(lambda: len(set(reads)) == 2, "another tile is read meanwhile")
+            time.sleep(0.05)  # so that two at once meet
+            try:
+                return kernel(*arguments)
+            finally:
+                at_work.pop()
+
+        return work
 
     monkeypatch.setattr(tile, "read_views", read)
-    monkeypatch.setattr(tile, "match_costed", match)
+    for kernel in ("match_costed", "look_in_tile", "ambiguity_histogram"):
+        monkeypatch.setattr(tile, kernel, counted(getattr(tile, kernel)))
     match_pair(*pair, tmp_path / "out", settings | {"cluster": {"workers": 1, "store": "memory://tiles"}})
     assert max(most) == 1
     assert hashes(tmp_path / "out") == hashes(tmp_path / "local")
