@@ -25,8 +25,7 @@ from sat_intervals.evaluate.comparison import (
     tiles,
 )
 from sat_intervals.kernels.conformal import least_number, margins, widened
-from sat_intervals.raster import read_tags
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster import read_tags, watched_rasters
 
 # Heights that are used: a sample, if there are more.
 _MOST = 1 << 20
@@ -89,7 +88,7 @@ def calibrate_surface(
         A file cannot be used, both do not overlap or have too few cells in common; or seem to have different datums,
         and the reference was not moved.
     """
-    check_unchanged = watched([surface, reference])
+    check_unchanged = watched_rasters([surface, reference])
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)
     coverage = _checked_coverage(given.surface, tags, coverage)

@@ -18,8 +18,7 @@ from sat_intervals.evaluate.comparison import (
     registered,
     tiles,
 )
-from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags, watched_rasters
 from sat_intervals.tiling import Window
 
 # Limits of classes: slope of the reference in degrees, width of the interval in metres.
@@ -68,7 +67,7 @@ def evaluate_surface(
     SatIntervalsError
         A file cannot be read, or both do not overlap, or their heights differ by too much.
     """
-    check_unchanged = watched([surface, reference, classes])
+    check_unchanged = watched_rasters([surface, reference, classes])
     given = open_comparison(surface, reference)
     nominal = nominal_of(given.surface)
     if classes is not None:

@@ -26,8 +26,7 @@ from sat_intervals.kernels.splat import (
     splat,
 )
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW
-from sat_intervals.raster import Projection
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster import Projection, watched_rasters
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Window
 
@@ -100,7 +99,7 @@ class PointCloud:
     def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices | None = None) -> None:
         self.run = run
         self._path = run.out / "points.tif"
-        self._check_unchanged = watched([self._path])
+        self._check_unchanged = watched_rasters([self._path])
         self._projection = projection
         self._choices = choices or SurfaceChoices().for_intervals([run.config.interval])
         self._extents: list[tuple[Window, Extent]] = []

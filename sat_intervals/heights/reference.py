@@ -32,8 +32,8 @@ from sat_intervals.raster import (
     read_tags,
     truth_file,
     utm_of,
+    watched_rasters,
 )
-from sat_intervals.raster.identity import watched
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -123,7 +123,7 @@ def make_truth(
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     if registers:
         triangulated([run.out])
-    check_unchanged = watched([reference.path, run.out / "points.tif"])
+    check_unchanged = watched_rasters([reference.path, run.out / "points.tif"])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))

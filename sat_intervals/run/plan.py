@@ -19,12 +19,11 @@ from sat_intervals.run.pair import match_pair
 from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
 from sat_intervals.run.workers import readers, reason, tiles_at_once
+from sat_intervals.store.zarr_arrays import STORED_BYTES
 from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.
 SAMPLE = 512
-# Bytes per pixel of raw products: 8 to 12 compressed, 2 more for each sub-pixel level.
-_STORE_BYTES = 12
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def plan(
         worker_bytes=PROCESS_BYTES + waiting + task,
         together=together,
         together_bytes=PROCESS_BYTES + waiting + together * task,
-        disk_bytes=pixels * (_STORE_BYTES + 2 * config.subpixel_levels)
+        disk_bytes=pixels * (STORED_BYTES + 2 * config.subpixel_levels)
         + part_bytes(files, region.height, region.width)
         + file_bytes(files, region.height, region.width)
         + handed_bytes(grid, config),
