@@ -20,7 +20,7 @@ demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals plot demo-out & $(BIN)/sat-intervals report demo-out && wait $$!
 	@echo 'Open demo-out/overview.png and demo-out/report.html'
 
-# Tests that need no services, no other extras and no real pairs; three minutes on two cores.
+# Tests that need no services, no other extras and no real pairs; under five minutes on two cores.
 test: $(READY)
 	$(PYTEST) $(PARALLEL) -m 'not process and not peer and not ported'
 
@@ -39,7 +39,7 @@ lint: $(READY)
 bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
 
-# The tables of docs/speed.md on exact seams; about five minutes.
+# The tables of docs/speed.md on exact seams; about nine minutes.
 bench-seams: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/seams.py
 
