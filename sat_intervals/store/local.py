@@ -8,7 +8,7 @@ import stat
 import tempfile
 import time
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -47,6 +47,19 @@ class LocalFolder:
         check_regular(self.path / name)
         try:
             return (self.path / name).read_bytes()
+        except FileNotFoundError:
+            return None
+
+    def read_parts(self, parts: Sequence[tuple[str, int, int]]) -> list[bytes | None]:
+        """See `Folder`."""
+        return [self._part(*part) for part in parts]
+
+    def _part(self, name: str, start: int, stop: int) -> bytes | None:
+        check_regular(self.path / name)
+        try:
+            with (self.path / name).open("rb") as file:
+                file.seek(start)
+                return file.read(stop - start)
         except FileNotFoundError:
             return None
 

@@ -88,7 +88,7 @@ def test_evaluate_surface__registers_a_reference_of_a_small_part_of_the_surface(
     row, column = np.indices((320, 320)).astype(np.float64)
     truth = relief(row, column)
     model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
-    reference = write_raster(tmp_path / "part.tif", [truth[16:48, 16:48] - 5], PLACE * Affine.translation(16, 16))
+    reference = write_raster(tmp_path / "part.tif", [truth[16:48, 16:48] - 5], PLACE @ Affine.translation(16, 16))
     assert evaluate_surface(model, reference)["registration"]["shift"][2] == pytest.approx(5, abs=0.1)
 
 
