@@ -40,8 +40,6 @@ _TABLES: dict[str, type[np.generic]] = {"seams": np.int16, "histogram": np.uint3
 # Rows of a shard that are compressed together. Writing a tile of 1024 x 1024 pixels and reading it by strips of 512
 # rows with a halo takes 0.26 s of processor time with 64 rows, as with 128, and 0.34 s with 32: each piece has a price.
 _ROWS_TOGETHER = 64
-# Attribute of the group: marks the folder of a run even without a manifest.
-MADE_BY = {"made_by": "sat-intervals"}
 # A tile takes 0.13 s and 12 MB, without compression 0.11 s and 21 MB.
 _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 # Bytes per pixel of raw products: 8 to 12 compressed, 2 more for each sub-pixel level.
@@ -285,7 +283,7 @@ def _planes(levels: int) -> dict[str, dict[str, type[np.generic]]]:
 def _descriptions(grid: Grid, count: int, ambiguities: int, levels: int, has_seams: bool) -> dict[str, str]:
     """Return the metadata of the group and arrays as texts by file name."""
     texts: dict[str, Any] = {}
-    group = zarr.create_group(MemoryStore(texts), zarr_format=3, attributes=MADE_BY)
+    group = zarr.create_group(MemoryStore(texts), zarr_format=3)
 
     def describe(
         name: str,

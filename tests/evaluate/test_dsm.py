@@ -240,6 +240,11 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
         assert f"{file.name} is a named pipe" in invoke(*words, "--pictures", tmp_path).stderr
         file.unlink()
         file.write_text(made)
+    written[-1].unlink()
+    os.mkfifo(written[-1])
+    result = invoke(*words, "--pictures", tmp_path)
+    assert result.stderr == f"sat-intervals: {written[-1]} is a named pipe: move it away or choose another output\n"
+    assert result.stdout == ""
 
 
 def test_evaluate_surface__ends_where_a_file_is_replaced_meanwhile(tmp_path, monkeypatch):
