@@ -71,7 +71,7 @@ pictures: $(VENV)/.has-dsm,plot
 	for name in overview profile dsm wavefronts; do $(BIN)/python -c 'import sys; from PIL import Image; Image.open(sys.argv[1]).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(sys.argv[2], optimize=True)' demo-out/$$name.png .github/pictures/$$name.png; done
 
 # The documentation site, in site/; a warning is an error. Pictures of the gallery are made by running the commands.
-docs: $(VENV)/.has-docs,plot
+docs: $(VENV)/.has-docs,dsm,plot
 	$(BIN)/python docs/site.py
 
 # Wheel and sdist in dist/, checked; the wheel is installed and run in an empty environment.

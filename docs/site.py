@@ -24,14 +24,25 @@ from sat_intervals.config import Config
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "build" / "docs"
+CAMERAS = "--left-model demo/left_model.tif --right-model demo/right_model.tif"
+GRIDS = "--left-grid demo/left_grid.tif --right-grid demo/right_grid.tif"
+COMPARED = "--dsm demo/dsm.tif --reference demo/lidar.tif"
 # Commands of the gallery, run in the folder of its pictures: title, command, what it shows.
 GALLERY = (
-    ("A scene with exact truth", "sat-intervals demo demo --size 700 700", None),
+    ("A scene with exact truth", "sat-intervals demo demo --size 700 700 --coverage 0.9", None),
     ("Maps", "sat-intervals plot demo --dpi 90", "demo/overview.png"),
     ("Where intervals miss the truth", "sat-intervals plot demo --dpi 90", "demo/errors.png"),
     ("Coverage and width", "sat-intervals plot demo --dpi 90", "demo/coverage.png"),
     ("A row", "sat-intervals plot demo --dpi 90 --row 350 --columns 100 500", "demo/profile.png"),
     ("The page of a run", "sat-intervals report demo", "demo/report.html"),
+    ("Sensor models and heights of the scene", "python docs/pictures/demo_cameras.py demo", None),
+    ("Points", f"sat-intervals triangulate demo {CAMERAS} {GRIDS}", None),
+    ("A surface model", "sat-intervals dsm demo --resolution 1", None),
+    ("Margins from heights", f"sat-intervals calibrate {COMPARED} --output heights.yaml", None),
+    ("The calibrated surface", "sat-intervals dsm demo --resolution 1 --calibration heights.yaml", None),
+    ("Its heights and half widths", "sat-intervals plot demo --dpi 90", "demo/dsm.png"),
+    ("Its errors", f"sat-intervals evaluate {COMPARED} --pictures demo", "demo/dsm-errors.png"),
+    ("A line across it", f"sat-intervals evaluate {COMPARED} --pictures demo", "demo/dsm-profile.png"),
     ("A relief, with local search ranges", "sat-intervals demo relief --size 500 500 --relief 60 --local-range", None),
     ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
 )  # fmt: skip
@@ -148,9 +159,12 @@ def gallery() -> str:
     folder = PAGES / "gallery-files"
     folder.mkdir()
     for title, command, file in GALLERY:
-        subprocess.run(
-            [sys.executable, "-c", RUN, *command.split()[1:]], cwd=folder, check=True, stdout=subprocess.DEVNULL
-        )
+        program, *arguments = command.split()
+        if program == "sat-intervals":
+            words = ["-c", RUN, *arguments]
+        else:
+            words = [str(ROOT / arguments[0]), *arguments[1:]]
+        subprocess.run([sys.executable, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
         lines += [f"## {title}", "", "```", command, "```", ""]
         if file:
             link = f"gallery-files/{file}"

@@ -1,6 +1,6 @@
-"""Write sensor models and epipolar grids for the demo scene, for the picture of its surface model.
+"""Write sensor models, epipolar grids and exact heights of the demo scene, for pictures of its surface model.
 
-Usage: python demo_cameras.py FOLDER. Writes left_model.tif, right_model.tif, left_grid.tif and right_grid.tif.
+Usage: python demo_cameras.py FOLDER. Writes left_model.tif, right_model.tif, left_grid.tif, right_grid.tif, lidar.tif.
 """
 
 import sys
@@ -11,7 +11,7 @@ import rasterio
 from rasterio.rpc import RPC
 from rasterio.transform import Affine
 
-from sat_intervals.demo import DATUM, PIXEL, VIEWS
+from sat_intervals.demo import DATUM, PIXEL, VIEWS, profiles
 
 LONGITUDE, LATITUDE = 1.45, 43.6  # of the first pixel
 EAST, NORTH = 80_700.0, 111_110.0  # metres in a degree there
@@ -55,9 +55,20 @@ def write_grid(path: Path, rows: int, columns: int) -> None:
         dataset.write(positions)
 
 
+def write_heights(path: Path, rows: int, columns: int) -> None:
+    """Write the height of the ground at the centres of the scene's pixels."""
+    heights = np.stack([np.interp(np.arange(columns), u, height) for _, u, height, _ in profiles(rows, columns)])
+    width, height = PIXEL / EAST, PIXEL / NORTH
+    place = Affine(width, 0, LONGITUDE - width / 2, 0, -height, LATITUDE + height / 2)
+    kind = {"height": rows, "width": columns, "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:4326", transform=place, **kind) as dataset:
+        dataset.write(heights[np.newaxis])
+
+
 folder = Path(sys.argv[1])
 with rasterio.open(folder / "left.tif") as image:
     size = image.shape
 for name, tilt in zip(("left", "right"), VIEWS, strict=True):
     write_model(folder / f"{name}_model.tif", tilt)
     write_grid(folder / f"{name}_grid.tif", *size)
+write_heights(folder / "lidar.tif", *size)
