@@ -10,9 +10,8 @@ _MARK = ", found by sat-intervals calibrate"
 
 def checked_folder(output: Path) -> Path:
     """Return the folder of a file, where tiles are kept meanwhile; raise if it cannot be written."""
-    from sat_intervals.errors import SatIntervalsError, check_regular
+    from sat_intervals.errors import SatIntervalsError
 
-    check_regular(output)
     folder = output.absolute().parent
     if output.is_dir() or not os.access(folder, os.W_OK):
         raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")

@@ -14,6 +14,9 @@ from sat_intervals.cli.options import Command, SurfaceAndReference, reference_op
 Line = tuple[float, float, float, float]
 _FILE = click.Path(path_type=Path)
 _SOFTWARE = "sat-intervals"
+# Files of --pictures: figures and pictures.
+_TEXTS = "dsm-accuracy.json", "dsm-accuracy.md"
+_PICTURES = "dsm-reliability.png", "dsm-errors.png", "dsm-profile.png"
 # Beginnings of files of figures: those without one are not replaced.
 _MARKS = f'{{\n "software": "{_SOFTWARE}"', f"<!-- {_SOFTWARE} -->\n"
 
@@ -41,9 +44,9 @@ class Surface:
         from sat_intervals.evaluate.dsm import evaluate_surface
         from sat_intervals.raster import watched_rasters
 
-        if self.folder is not None and not self.folder.is_dir():
-            raise click.UsageError(f"--pictures {self.folder} is no folder: give an existing one.")
         given = self.given
+        if self.folder is not None:
+            _check_kept(self.folder, [given.dsm, given.reference, self.classes])
         check_unchanged = watched_rasters([given.dsm, given.reference])
         report = evaluate_surface(given.dsm, given.reference, self.classes, registers=given.registers)
         if as_json:
@@ -104,12 +107,8 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     from sat_intervals.evaluate.dsm import read_profile
     from sat_intervals.raster import whole_file
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
-    from sat_intervals.show.marks import check_made_here
 
-    paths = [folder / f"dsm-{name}" for name in ("reliability.png", "errors.png", "profile.png")]
-    texts = [folder / f"dsm-accuracy.{ending}" for ending in ("json", "md")]
-    check_made_here(paths)
-    _check_texts(texts)
+    texts, paths = [folder / name for name in _TEXTS], [folder / name for name in _PICTURES]
     names = given.dsm.name, given.reference.name
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
@@ -123,11 +122,16 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     return [*texts, *paths]
 
 
-def _check_texts(paths: list[Path]) -> None:
-    """Raise if a file exists and does not begin with a mark of this tool."""
-    from sat_intervals.errors import SatIntervalsError, check_regular
+def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
+    """Raise if there is no such folder, or if files there would be replaced that are inputs or without a mark."""
+    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.show.marks import check_made_here
 
-    for path in paths:
-        check_regular(path)
+    if not folder.is_dir():
+        raise click.UsageError(f"--pictures {folder} is no folder: give an existing one.")
+    check_not_replaced(inputs, [folder / name for name in (*_TEXTS, *_PICTURES)])
+    check_made_here(folder / name for name in _PICTURES)
+    for path in (folder / name for name in _TEXTS):
         if path.exists() and not path.read_bytes().startswith(tuple(mark.encode() for mark in _MARKS)):
             raise SatIntervalsError(f"{path} exists and was not made by sat-intervals: move it away")

@@ -110,7 +110,8 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
     given = {**click.get_current_context().params, "log_file": None}.values()
     names = [name for value in given for name in (value if isinstance(value, tuple) else (value,))]
     paths = [Path(name) for name in names if isinstance(name, (str, Path))]
-    check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
+    if log_file.is_file() or not log_file.exists():  # a pipe or terminal is none of these, and is not replaced
+        check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
     try:
         if log_file.is_file() and not _is_text(log_file):
             raise SatIntervalsError(f"{log_file} exists and is not a log: choose another --log-file")

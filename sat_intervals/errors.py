@@ -19,19 +19,19 @@ class RunError(SatIntervalsError):
     """A run that failed although its arguments are correct; finished tiles are kept, so it can be resumed."""
 
 
-def check_regular(path: str | os.PathLike[str]) -> None:
-    """Raise if a path is a local pipe, socket or device: reading it could block forever.
+def check_regular(path: str | os.PathLike[str], way_out: str = "give a regular file") -> None:
+    """Raise if a path is a local pipe, socket or device: reading it could block forever, and it must not be replaced.
 
     Missing files, folders and URLs pass; opening them gives a better message.
 
     Raises
     ------
     SatIntervalsError
-        Names the path and its kind.
+        Names the path, its kind and the way out.
     """
     try:
         kind = _KINDS.get(stat.S_IFMT(os.stat(path).st_mode))
     except (OSError, ValueError):
         return
     if kind:
-        raise SatIntervalsError(f"{os.fspath(path)} is {kind}: give a regular file")
+        raise SatIntervalsError(f"{os.fspath(path)} is {kind}: {way_out}")

@@ -7,7 +7,6 @@ registered to the points of the run first.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +27,7 @@ from sat_intervals.raster import (
     OutputWriter,
     Projection,
     Vertical,
-    check_marked,
-    read_tags,
+    check_made_by,
     truth_file,
     utm_of,
     watched_rasters,
@@ -119,7 +117,7 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    _check_own(path)
+    check_made_by(path, "reference", "REFERENCE")
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     if registers:
         triangulated([run.out])
@@ -130,8 +128,11 @@ def make_truth(
     tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), **MARK}
     tags["SHIFT"] = " ".join(f"{part:.3f}" for part in shift) + " m"
     tally = _Tally(run)
-    with OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer:
-        for row, strip in work.strips(shift, progress):
+    with (
+        OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer,
+        writer.scratch("reference") as scratch,
+    ):
+        for row, strip in work.strips(shift, scratch, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))
             tally.add(row, strip)
         check_unchanged()
@@ -140,13 +141,6 @@ def make_truth(
         writer.publish()
         progress("files", 1, 1)
     return tally.report() | {"row_misfit": work.row_misfit, "registration": found and found.report()}
-
-
-def _check_own(path: Path) -> None:
-    """Raise if a file exists that `make_truth` did not write. Links are replaced, never followed: they pass."""
-    check_marked(path)
-    if path.is_file() and not path.is_symlink() and "REFERENCE" not in read_tags(path):
-        raise SatIntervalsError(f"{path} exists and was not made by sat-intervals reference: move it away")
 
 
 class _Work:
@@ -235,24 +229,23 @@ class _Work:
                 kept, keys = kept[least], keys[least]
         return kept
 
-    def strips(self, shift: Shift, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the first row and the true disparities of strips from the top."""
+    def strips(self, shift: Shift, scratch: Path, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the first row and the true disparities of strips from the top; points are kept in an empty folder."""
         height = self.run.shape[0]
         if isinstance(self._heights, HeightRaster):
             for row, strip in RasterSight(self._scene, self._heights, shift, self._search).strips(self._pixel):
                 progress("truth", row + len(strip), height)
                 yield row, strip
             return
-        with TemporaryDirectory(dir=self.run.out, prefix=".reference-") as folder:
-            sight = PointSight(Path(folder), self.run.region, self._rise)
-            lattice = self._lattice(shift, progress)
-            if lattice is not None:
-                for part in self._near(progress):
-                    row, column, _, right = lattice.positions(part + shift).T
-                    sight.add(row, column, right - column)
-            for row, strip in sight.strips():
-                progress("truth", row + len(strip), height)
-                yield row, strip
+        sight = PointSight(scratch, self.run.region, self._rise)
+        lattice = self._lattice(shift, progress)
+        if lattice is not None:
+            for part in self._near(progress):
+                row, column, _, right = lattice.positions(part + shift).T
+                sight.add(row, column, right - column)
+        for row, strip in sight.strips():
+            progress("truth", row + len(strip), height)
+            yield row, strip
 
     def _lattice(self, shift: Shift, progress: Progress) -> GroundLattice | None:
         """Return the lattice around all points near the run; None without a point."""

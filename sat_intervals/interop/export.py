@@ -13,10 +13,12 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import LEFT_WINDOW, Band, Bands
-from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_marked
+from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_made_by
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window, strips
 
+# Tag of the files: their format.
+_FORMAT = "EXPORT"
 # Pixels of a strip.
 _STRIP = 1 << 22
 
@@ -95,13 +97,13 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
 
     Returns
     -------
-    The files written. Existing exports of these names are replaced. A band that the run lacks, such as bounds without
-    intervals, has no file.
+    The files written. Existing exports of these names and this format are replaced. A band that the run lacks, such as
+    bounds without intervals, has no file.
 
     Raises
     ------
     SatIntervalsError
-        The folder is not a run, or a file cannot be written or would replace one that is not an export.
+        The folder is not a run, or a file cannot be written or would replace one that is not an export in this format.
     """
     run, target = open_run(out), Path(target)
     left = run.report["inputs"]["left"]
@@ -113,9 +115,9 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     files = [file for file, _ in rasters]
     run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
     for file in files:
-        check_marked(folder / file.name)
+        check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
     place = Georeferencing(transform=run.left_georeferencing.transform if form == "otb" else None)
-    with OutputWriter(folder, files, *shape, place, MARK) as writer:
+    with OutputWriter(folder, files, *shape, place, {**MARK, _FORMAT: form}) as writer:
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
 from sat_intervals.raster import (
     Georeferencing,
@@ -86,7 +86,6 @@ def _check_own(file: Path) -> None:
     """Raise if the file exists and is no item of this tool. Links are replaced, never followed: they pass."""
     if not os.path.lexists(file) or file.is_symlink():
         return
-    check_regular(file)
     with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
         if "sat-intervals" in json.loads(file.read_text(encoding="utf-8"))["properties"]["processing:software"]:
             return

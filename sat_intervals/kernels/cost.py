@@ -61,24 +61,36 @@ def between(left: Codes, right: Codes) -> Costs:
 
 
 @cached
-def _census_words(pixels, radius, words):
-    """Shift one bit per neighbour into each word.
+def _census_words(pixels, arm, words):
+    """Shift the bits of each row of a window into its word: those above the centre into the first, below it the last.
 
-    The inner loop runs over columns and vectorises: 5x5 takes 4.9 ms at 600 x 600, 13 ms with one pixel at a time.
+    ``arm`` is a tuple of as many items as the window's radius: the compiler knows how many, and unrolls the loops over
+    a row of the window. 5x5 takes 2.8 ms at 1024 x 1024, 5.1 ms with one neighbour at a time.
     """
-    bits = words.itemsize * 8
+    radius, side, one = len(arm), 2 * len(arm) + 1, np.uint32(1)
     rows, columns = words.shape[1:]
     for r in range(rows):
         centre = pixels[r + radius, radius : radius + columns]  # slices: columns vectorise, 3.6 times faster
-        neighbour = 0
-        for dr in range(2 * radius + 1):
-            for dc in range(2 * radius + 1):
-                if dr == radius and dc == radius:
-                    continue
-                row, other = words[neighbour // bits, r], pixels[r + dr, dc : dc + columns]
+        for dr in range(side):
+            line, word = pixels[r + dr], words[0 if dr < radius else -1, r]
+            if dr != radius:
                 for c in range(columns):
-                    row[c] = (row[c] << 1) | (other[c] > centre[c])
-                neighbour += 1
+                    bits = np.uint32(0)
+                    for dc in range(side):
+                        bits = (bits << one) | np.uint32(line[c + dc] > centre[c])
+                    word[c] = (word[c] << side) | bits
+                continue
+            before = words[0, r]
+            for c in range(columns):
+                bits = np.uint32(0)
+                for dc in range(radius):
+                    bits = (bits << one) | np.uint32(line[c + dc] > centre[c])
+                before[c] = (before[c] << radius) | bits
+            for c in range(columns):
+                bits = np.uint32(0)
+                for dc in range(radius + 1, side):
+                    bits = (bits << one) | np.uint32(line[c + dc] > centre[c])
+                word[c] = (word[c] << radius) | bits
 
 
 @cached
@@ -136,7 +148,7 @@ def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     dtype = np.uint32 if neighbours <= 32 else np.uint64
     count = -(-neighbours // (8 * np.dtype(dtype).itemsize))
     words = np.zeros((count, *shape), dtype)
-    _census_words(pixels, radius, words)
+    _census_words(pixels, (0,) * radius, words)
     return Codes(words, window_state(state, radius))
 
 

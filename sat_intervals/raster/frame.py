@@ -8,7 +8,7 @@ import pyproj
 from pyproj.exceptions import CRSError
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster.projection import geoid_grid
+from sat_intervals.raster.projection import geoid_grid, transformed, undulation
 
 _GEOGRAPHIC = "EPSG:4326"
 # Degrees of longitude and latitude, and metres.
@@ -73,27 +73,21 @@ class Frame:
 
     def from_ellipsoid(self, longitude: np.ndarray, latitude: np.ndarray, height: np.ndarray) -> Places:
         """Return x, y and height in the frame of points on the WGS 84 ellipsoid; NaN outside the geoid grid."""
-        x, y = self._from_ellipsoid.transform(longitude, latitude)
-        return x, y, (height - self._undulation(longitude, latitude)) / self.unit
+        x, y = transformed(self._from_ellipsoid, longitude, latitude)
+        return x, y, (height - undulation(self._geoid, longitude, latitude)) / self.unit
 
     def to_ellipsoid(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> Places:
         """Return longitude, latitude (WGS 84) and ellipsoidal height of points in the frame."""
-        longitude, latitude = self._from_ellipsoid.transform(x, y, direction="INVERSE")
-        return longitude, latitude, height * self.unit + self._undulation(longitude, latitude)
+        longitude, latitude = transformed(self._from_ellipsoid, x, y, inverse=True)
+        return longitude, latitude, height * self.unit + undulation(self._geoid, longitude, latitude)
 
     def check(self, longitude: float, latitude: float) -> None:
         """Raise if the geoid grid does not cover a place (degrees)."""
-        if np.isnan(self._undulation(np.array([longitude]), np.array([latitude]))[0]):
+        if np.isnan(undulation(self._geoid, np.array([longitude]), np.array([latitude]))[0]):
             raise SatIntervalsError(
                 f"{self._grid} has no geoid height at longitude {longitude:.2f}, latitude {latitude:.2f}: give a grid "
                 "that covers the run"
             )
-
-    def _undulation(self, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
-        if self._geoid is None:
-            return np.zeros(np.shape(longitude))
-        down = np.asarray(self._geoid.transform(longitude, latitude, np.zeros(np.shape(longitude)))[2])
-        return np.where(np.isfinite(down), -down, np.nan)
 
 
 def _check_ellipsoid(name: str, whole: pyproj.CRS, vertical: Vertical, level: str) -> None:

@@ -187,7 +187,7 @@ def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
 def check_not_replaced(
     inputs: Iterable[str | Path | None], outputs: Iterable[str | Path], folders: Iterable[str | Path] = ()
 ) -> None:
-    """Raise if an input is also an output, under any name or link, or is inside a folder of outputs.
+    """Raise if an input is also an output, under any name or link, or inside a folder of outputs, or an output a pipe.
 
     Parameters
     ----------
@@ -201,9 +201,11 @@ def check_not_replaced(
     Raises
     ------
     SatIntervalsError
-        Names the first input that would be lost.
+        Names the first output that is a pipe, socket or device, or the first input that would be lost.
     """
     outputs, parents = list(outputs), [Path(folder).resolve() for folder in folders]
+    for output in outputs:
+        check_regular(output, "move it away or choose another output")
     for name in inputs:
         file = name if name is None or os.path.exists(name) else _local_file(os.fspath(name))
         if file is None:

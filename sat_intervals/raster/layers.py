@@ -210,6 +210,20 @@ def check_marked(path: Path) -> None:
         )
 
 
+def check_made_by(path: Path, command: str, tag: str, value: str | None = None) -> None:
+    """Raise if a raster exists that a command did not make: without `MARK`, or without its tag, of any value if None.
+
+    Links are replaced, never followed: they pass.
+    """
+    check_marked(path)
+    if path.is_file() and not path.is_symlink():
+        found = read_tags(path).get(tag)
+        if found is None or value not in (None, found):
+            raise SatIntervalsError(
+                f"{path} exists and was not made by sat-intervals {command}, or by an earlier version: move it away"
+            )
+
+
 def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:
     """Read the tags of a file as a whole."""
     with opened(str(path)) as dataset:

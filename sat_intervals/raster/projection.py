@@ -1,5 +1,6 @@
 """Convert longitude and latitude to map coordinates, and ellipsoidal heights to heights above a geoid."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -105,18 +106,37 @@ class Projection:
 
     def place(self, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return easting and northing in metres."""
-        return self._map.transform(longitude, latitude)
+        x, y = transformed(self._map, longitude, latitude)
+        return x, y
 
     def degrees(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return longitude and latitude of map coordinates."""
-        return self._map.transform(x, y, direction="INVERSE")
+        longitude, latitude = transformed(self._map, x, y, inverse=True)
+        return longitude, latitude
 
     def undulation(self, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
         """Return metres from the ellipsoid up to the geoid; 0 without a geoid, NaN outside its grid."""
-        if self._geoid is None:
-            return np.zeros(longitude.shape)
-        height = np.asarray(self._geoid.transform(longitude, latitude, np.zeros(longitude.shape))[2])
-        return np.where(np.isfinite(height), -height, np.nan)
+        return undulation(self._geoid, longitude, latitude)
+
+
+def transformed(transformer: Transformer, *values: np.ndarray, inverse: bool = False) -> tuple[np.ndarray, ...]:
+    """Transform coordinates, arrays of any shape.
+
+    pyproj takes an array of one value for a number if numpy converts it to one, as it does before 2.4.
+    """
+    transform = partial(transformer.transform, direction="INVERSE" if inverse else "FORWARD")
+    shape = np.shape(values[0])
+    if shape == () or np.size(values[0]) != 1:
+        return tuple(transform(*values))
+    return tuple(value[:1].reshape(shape) for value in transform(*(np.repeat(value, 2) for value in values)))
+
+
+def undulation(geoid: Transformer | None, longitude: np.ndarray, latitude: np.ndarray) -> np.ndarray:
+    """Return metres from the ellipsoid up to the geoid of `geoid_grid`; 0 without one, NaN outside its grid."""
+    if geoid is None:
+        return np.zeros(np.shape(longitude))
+    height = transformed(geoid, longitude, latitude, np.zeros(np.shape(longitude)))[2]
+    return np.where(np.isfinite(height), -height, np.nan)
 
 
 def geoid_grid(path: Path) -> Transformer:

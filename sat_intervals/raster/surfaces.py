@@ -1,5 +1,6 @@
 """Read rasters on the grid of a surface model."""
 
+from math import ceil, floor
 from pathlib import Path
 
 import numpy as np
@@ -88,8 +89,8 @@ def covered_window(path: Path, place: Georeferencing, shape: tuple[int, int]) ->
             return whole
         # only the common part: the whole extent may reach where the CRS of the cells is not defined
         west, south, east, north = transform_bounds(dataset.crs, place.crs, left, bottom, right, top)
-    column, row = (int(np.floor(value)) for value in (~grid) * (west, north))
-    column_stop, row_stop = (int(np.ceil(value)) for value in (~grid) * (east, south))
+    row, column = floor((north - grid.f) / grid.e), floor((west - grid.c) / grid.a)
+    row_stop, column_stop = ceil((south - grid.f) / grid.e), ceil((east - grid.c) / grid.a)
     return Window(row, column, row_stop - row, column_stop - column).clipped(whole)
 
 

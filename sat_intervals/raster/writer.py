@@ -6,7 +6,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -210,6 +210,10 @@ class OutputWriter:
                 _flush(self._scratch / name)
         publish(self._scratch, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
         self._is_published = True
+
+    def scratch(self, name: str) -> AbstractContextManager[Path]:
+        """Return the context of a folder for temporary files of the caller, see `LocalFolder.scratch`."""
+        return LocalFolder(self._folder).scratch(name)
 
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:

@@ -265,9 +265,8 @@ def _thread() -> Iterator[tuple[ThreadPoolExecutor, Progress]]:
 
 def _kernels(config: Config) -> str:
     """Return a key of the kernels that a configuration needs."""
-    return config.model_dump_json(
-        include={"cost": True, "disparity": {"local", "grid"}, "sgm": {"penalty"}, "cross_check": {"method"}}
-    )
+    search, sgm, cross_check = config.disparity, config.sgm, config.cross_check
+    return repr((config.cost, search.local, search.grid, sgm and sgm.penalty, cross_check and cross_check.method))
 
 
 def _assembled(client: Workers, matched: Matched, keep_tiles: bool, progress: Progress) -> dict[str, Any]:

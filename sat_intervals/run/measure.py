@@ -1,7 +1,5 @@
 """Match pairs with truth at a ladder of levels, tile by tile, and measure their intervals."""
 
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -125,15 +123,14 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
     check_unchanged = watched_rasters(subject.truth.image.path for subject in subjects)
     levels = ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
-    scratch = Path(tempfile.mkdtemp(prefix=".calibrate-", dir=folder))
-    try:
-        with connected(subjects[0].config.cluster, scratch) as client:
-            for number, subject in enumerate(subjects):
-                one = progress if len(subjects) == 1 else partial(_of_all, progress, number, len(subjects))
-                one("subjects", 0, 1)
-                found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with (
+        LocalFolder(folder).scratch("calibrate") as scratch,
+        connected(subjects[0].config.cluster, scratch) as client,
+    ):
+        for number, subject in enumerate(subjects):
+            one = progress if len(subjects) == 1 else partial(_of_all, progress, number, len(subjects))
+            one("subjects", 0, 1)
+            found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
     check_unchanged()
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")

@@ -1,6 +1,6 @@
 """Folders of a store: local ones, and prefixes of fsspec file systems."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -21,6 +21,9 @@ class Folder(Protocol):
 
     def read_bytes(self, name: str) -> bytes | None:
         """Read the content of a file, None if it does not exist."""
+
+    def read_parts(self, parts: Sequence[tuple[str, int, int]]) -> list[bytes | None]:
+        """Read the bytes ``[start, stop)`` of some files, fewer if one is shorter, None if it does not exist."""
 
     def read_all(self, folder: str) -> dict[str, str]:
         """Read the texts of all JSON files in a folder, by name without suffix."""
@@ -53,7 +56,7 @@ class Folder(Protocol):
         """Create a folder if the file system needs that."""
 
     def place(self, name: str) -> Path | str:
-        """Return the path or URL of a name, for zarr."""
+        """Return the path or URL of a name."""
 
     def free_bytes(self) -> int | None:
         """Return the free space in bytes, None if unknown."""

@@ -5,9 +5,10 @@ import fcntl
 import os
 import shutil
 import stat
+import tempfile
 import time
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 
 # The lock file is regular and empty; any other file of this name is left unchanged.
 _LOCK = ".sat-intervals.lock"
+# Folder of the files of `LocalFolder.scratch`, beside the lock.
+_FILES = "files"
 # Seconds to wait for a lock.
 _TIMEOUT = 0.2
 # Empty folders deleted at once.
@@ -44,6 +47,19 @@ class LocalFolder:
         check_regular(self.path / name)
         try:
             return (self.path / name).read_bytes()
+        except FileNotFoundError:
+            return None
+
+    def read_parts(self, parts: Sequence[tuple[str, int, int]]) -> list[bytes | None]:
+        """See `Folder`."""
+        return [self._part(*part) for part in parts]
+
+    def _part(self, name: str, start: int, stop: int) -> bytes | None:
+        check_regular(self.path / name)
+        try:
+            with (self.path / name).open("rb") as file:
+                file.seek(start)
+                return file.read(stop - start)
         except FileNotFoundError:
             return None
 
@@ -199,6 +215,31 @@ class LocalFolder:
         finally:
             os.close(lock)
         return False
+
+    @contextmanager
+    def scratch(self, name: str) -> Iterator[Path]:
+        """Yield a hidden folder for temporary files, new in this one; delete it after the block.
+
+        Those of this name that killed processes left are deleted before. They are known by the lock file that is left.
+        """
+        for left in self.path.glob(f".{name}-*"):
+            with suppress(OSError, SatIntervalsError):  # it is in use, or cannot be deleted
+                lock = (left / _LOCK).lstat()
+                if not left.is_symlink() and stat.S_ISREG(lock.st_mode) and not lock.st_size:
+                    with LocalFolder(left)._emptied():
+                        pass
+        with LocalFolder(Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)))._emptied() as files:
+            files.mkdir()
+            yield files
+
+    @contextmanager
+    def _emptied(self) -> Iterator[Path]:
+        """Lock the folder for the block; yield the place of its temporary files, which are then deleted."""
+        with self.locked():
+            try:
+                yield self.path / _FILES
+            finally:
+                shutil.rmtree(self.path / _FILES, ignore_errors=True)
 
 
 def _depth(folder: LocalFolder) -> int:

@@ -1,20 +1,19 @@
 """Recognise and delete the files of a run's tiles in a folder; other files are kept."""
 
-import json
 import re
 from contextlib import suppress
 
 from sat_intervals.store.folder import Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, is_sealed, parsed
-from sat_intervals.store.zarr_arrays import MADE_BY
 
 ARRAYS, RECORDS, FAILURES, BORDERS, COSTS = "arrays.zarr", "records", "failures", "borders", "costs"
 PARTS = "parts"
 FOLDERS = RECORDS, FAILURES, BORDERS, COSTS, PARTS
 NORMALIZATION, SEARCH = "normalization.json", "range.json"
-_GROUP = f"{ARRAYS}/zarr.json"
+# Empty file that says that a run made the folder: its name outlasts a power loss, which truncates other files.
+MADE = ".sat-intervals.tiles"
 _OF_RUN = re.compile(
-    rf"{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
+    rf"{re.escape(MADE)}|{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
     rf"|{PARTS}/(?:[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)|[0-9a-f]{{8}}_current)"
 )
 _OF_TILE = re.compile(
@@ -38,10 +37,10 @@ def drop(folder: Folder) -> None:
     """
     names = _names(folder)
     if is_of_run(folder):
-        # The manifest first, since the rest is invalid without it. The group last, to recognise an unfinished removal.
+        # The manifest first, since the rest is invalid without it. The mark last, to recognise an unfinished removal.
         folder.delete(MANIFEST)
-        folder.delete_all(names.keys() - {MANIFEST, _GROUP}, FOLDERS)
-        folder.delete_all([_GROUP], [ARRAYS])
+        folder.delete_all(names.keys() - {MANIFEST, MADE}, [*FOLDERS, ARRAYS])
+        folder.delete(MADE)
     folder.delete_if_empty()
 
 
@@ -98,11 +97,10 @@ def final_name(name: str) -> str:
 
 
 def is_of_run(folder: Folder) -> bool:
-    """Return whether a run made a folder: it has a manifest, the arrays' metadata or a record."""
+    """Return whether a run made a folder: it has its mark, a manifest or a record."""
     with suppress(StoreError):
         if {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys():
             return True
-    with suppress(ValueError, AttributeError):
-        if json.loads(folder.read(_GROUP) or "").get("attributes") == MADE_BY:
-            return True
+    if folder.read(MADE) is not None:
+        return True
     return any(is_sealed(text) for text in folder.read_all(RECORDS).values())

@@ -27,6 +27,7 @@ from sat_intervals.store.removal import (
     ARRAYS,
     FAILURES,
     FOLDERS,
+    MADE,
     NORMALIZATION,
     RECORDS,
     SEARCH,
@@ -149,6 +150,7 @@ class Store:
                 folder.delete(MANIFEST)
             for name in ("", *FOLDERS):
                 folder.make(name)
+            folder.write(MADE, "")
             home.make("")
             home.delete(_FINISHED)
             if overwrite:

@@ -1,14 +1,16 @@
-"""Zarr arrays of the tiles of a run; each tile writes its own files. Only this module imports zarr."""
+"""Zarr arrays of the tiles of a run; each tile writes its own files. Only this module imports zarr.
 
-import asyncio
+zarr describes the arrays, for other tools. Chunks are written and read here: every byte is checked on its way in, on
+which zarr's stores cannot be relied (3.4 reads around the methods of a wrapped store), and zarr takes milliseconds for
+each file.
+"""
+
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import accumulate
-from pathlib import Path
 from typing import Any
 
 import google_crc32c
@@ -16,10 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import zarr
 from numcodecs import blosc
-from zarr.abc.store import ByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.codecs import BloscCodec
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import FsspecStore, LocalStore, MemoryStore, StorePath, WrapperStore
+from zarr.storage import MemoryStore
 
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY
 from sat_intervals.store.folder import Folder
@@ -40,8 +40,6 @@ _TABLES: dict[str, type[np.generic]] = {"seams": np.int16, "histogram": np.uint3
 # Rows of a shard that are compressed together. Writing a tile of 1024 x 1024 pixels and reading it by strips of 512
 # rows with a halo takes 0.26 s of processor time with 64 rows, as with 128, and 0.34 s with 32: each piece has a price.
 _ROWS_TOGETHER = 64
-# Attribute of the group: marks the folder of a run even without a manifest.
-MADE_BY = {"made_by": "sat-intervals"}
 # A tile takes 0.13 s and 12 MB, without compression 0.11 s and 21 MB.
 _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 # Bytes per pixel of raw products: 8 to 12 compressed, 2 more for each sub-pixel level.
@@ -88,20 +86,11 @@ class TileArrays:
 
     def create(self) -> None:
         """Write missing or damaged metadata of the arrays; every run writes the same."""
-        texts, _ = _descriptions(self.grid, self.count, self.ambiguities, self.levels, self.has_seams)
+        texts = _descriptions(self.grid, self.count, self.ambiguities, self.levels, self.has_seams)
         for name, text in texts.items():
             if self.folder.read(name) != text:
                 self.folder.make(name.rpartition("/")[0])
                 self.folder.write(name, text)
-
-    def _array(self, name: str, store: Store) -> "zarr.Array[Any]":
-        """Open an array of a store without reading its metadata there, which are for other tools."""
-        _, metadata = _descriptions(self.grid, self.count, self.ambiguities, self.levels, self.has_seams)
-        return zarr.Array(zarr.AsyncArray(metadata[name], StorePath(store, name)))
-
-    def _store(self) -> Store:
-        place = self.folder.place("")
-        return LocalStore(place) if isinstance(place, Path) else FsspecStore.from_url(place)
 
     def files_of(self, tile: Tile) -> set[str]:
         """Return the names of a tile's files."""
@@ -164,7 +153,7 @@ class TileArrays:
 
         zarr itself takes some ms for each file, which is more than matching a small tile.
         """
-        together = math.gcd(self.grid.size, _ROWS_TOGETHER)
+        together = _together(self.grid)
         pieces: list[bytes] = []
         index: list[int] = []
         place = 0
@@ -189,16 +178,19 @@ class TileArrays:
 
     def histogram(self, checksums: Checksums) -> np.ndarray:
         """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as in `strips`."""
-        stored = self._array("histogram", _CheckedStore(self._store(), checksums))
-        rows = (np.asarray(stored[row]).sum(axis=0, dtype=np.int64) for row in range(self.grid.rows))
-        return sum(rows, np.zeros(self.ambiguities + 1, np.int64))
+        total = np.zeros(self.ambiguities + 1, np.int64)
+        for row in range(self.grid.rows):
+            total += np.sum(self._row_of_tables("histogram", row, checksums), 0, np.int64)
+        return total
 
     def seams(self, checksums: Checksums) -> np.ndarray:
         """Return the lines along tile borders: int16 (grid rows, grid columns, SIDES, own or ring, products, size).
 
         Errors as in `strips`.
         """
-        return np.asarray(self._array("seams", _CheckedStore(self._store(), checksums))[:])
+        shape = len(SIDES), 2, _lines(self.levels), self.grid.size
+        rows = [self._row_of_tables("seams", row, checksums) for row in range(self.grid.rows)]
+        return np.reshape(rows, (self.grid.rows, self.grid.columns, *shape))
 
     def strips(
         self, rows: int, checksums: Checksums, first: int = 0, last: int | None = None
@@ -222,16 +214,56 @@ class TileArrays:
             Names the first missing or damaged file.
         """
         step = max(_ROWS_TOGETHER, rows // _ROWS_TOGETHER * _ROWS_TOGETHER)
-        store = _CheckedStore(self._store(), checksums)
-        stored = {name: self._array(name, store) for name in (*_planes(self.levels), _RIGHT)}
         last = self.grid.region.height if last is None else last
-        for top in range(first // step * step, last, step):
-            here = slice(max(top, first), min(top + step, last))
+        for start in range(first // step * step, last, step):
+            top, bottom = max(start, first), min(start + step, last)
             strip: dict[str, np.ndarray] = {}
             for dtype, planes in _planes(self.levels).items():
-                read = np.asarray(stored[dtype][:, here, : self.grid.region.width])
+                read = self._rows(dtype, len(planes), top, bottom, checksums)[:, :, : self.grid.region.width]
                 strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
-            yield strip | {"right_winner": self._merged(np.asarray(stored[_RIGHT][here]))}
+            yield strip | {"right_winner": self._merged(self._rows(_RIGHT, 1, top, bottom, checksums)[0])}
+
+    def _rows(self, name: str, planes: int, top: int, bottom: int, checksums: Checksums) -> np.ndarray:
+        """Read the rows ``[top, bottom)`` of an array with one shard a tile: ``(planes, rows, columns)``."""
+        size, together = self.grid.size, _together(self.grid)
+        dtype, width = (np.dtype(np.uint32), self._reach) if name == _RIGHT else (np.dtype(name), size)
+        found = np.empty((planes, bottom - top, self.grid.columns * width), dtype)
+        for row in range(top // size, -(-bottom // size)):
+            start, stop = max(top - row * size, 0), min(bottom - row * size, size)  # rows of the tile
+            pieces = range(start // together, -(-stop // together))
+            inside = slice(start - pieces.start * together, stop - pieces.start * together)
+            target = found[:, row * size + start - top : row * size + stop - top]
+            for column, read in enumerate(self._read(name, row, pieces, dtype, checksums)):
+                rows = np.concatenate([piece.reshape(planes, together, width) for piece in read], axis=1)
+                target[:, :, column * width : (column + 1) * width] = rows[:, inside]
+        return found
+
+    def _row_of_tables(self, name: str, row: int, checksums: Checksums) -> np.ndarray:
+        """Read the chunks of a row of tiles in an array with one chunk a tile, each as one line."""
+        return np.stack([chunk for (chunk,) in self._read(name, row, range(1), np.dtype(_TABLES[name]), checksums)])
+
+    def _read(
+        self, name: str, row: int, pieces: range, dtype: np.dtype[Any], checksums: Checksums
+    ) -> Iterator[list[np.ndarray]]:
+        """Read some pieces of the files of a row of tiles, and check them; yield those of each tile, all flat."""
+        files = [self._file(name, self.grid.tile(row, column)) for column in range(self.grid.columns)]
+        expected, parts = [], []
+        for file in files:
+            if file not in checksums:
+                raise DamagedFileError(file)
+            numbers = checksums[file][2:] or checksums[file]  # a file without pieces is one itself
+            ends = list(accumulate(numbers[::2], initial=0))
+            chosen = slice(2 * pieces.start, 2 * pieces.stop)
+            expected.append(list(zip(numbers[chosen][::2], numbers[chosen][1::2], strict=True)))
+            parts.append((file, ends[pieces.start], ends[pieces.stop]))
+        for file, content, sums in zip(files, self.folder.read_parts(parts), expected, strict=True):
+            view, found = memoryview(content or b""), []
+            for size, crc in sums:
+                if checksum(view[:size]) != [size, crc]:
+                    raise DamagedFileError(file)
+                found.append(np.frombuffer(blosc.decompress(view[:size]), dtype))
+                view = view[size:]
+            yield found
 
     def _merged(self, ranks: np.ndarray) -> np.ndarray:
         """Merge the right views of a row of cores into one, ``(rows, width + count - 1)``."""
@@ -248,14 +280,10 @@ def _planes(levels: int) -> dict[str, dict[str, type[np.generic]]]:
     return {"int16": {**_WORDS, **bounds}, "uint32": _LONG_WORDS}
 
 
-@lru_cache(maxsize=16)
-def _descriptions(
-    grid: Grid, count: int, ambiguities: int, levels: int, has_seams: bool
-) -> tuple[dict[str, str], dict[str, Any]]:
-    """Return the metadata of the group and arrays as texts by file name, and as objects by array name."""
+def _descriptions(grid: Grid, count: int, ambiguities: int, levels: int, has_seams: bool) -> dict[str, str]:
+    """Return the metadata of the group and arrays as texts by file name."""
     texts: dict[str, Any] = {}
-    group = zarr.create_group(MemoryStore(texts), zarr_format=3, attributes=MADE_BY)
-    metadata: dict[str, Any] = {}
+    group = zarr.create_group(MemoryStore(texts), zarr_format=3)
 
     def describe(
         name: str,
@@ -265,13 +293,12 @@ def _descriptions(
         dtype: npt.DTypeLike,
         fill: Any = 0,
     ) -> None:
-        metadata[name] = group.create_array(
+        group.create_array(
             name, shape=shape, shards=shard, chunks=chunk, dtype=dtype, compressors=_COMPRESSOR, fill_value=fill
-        ).metadata
+        )
 
     size, height, width = grid.size, grid.rows * grid.size, grid.columns * grid.size
-    together = math.gcd(size, _ROWS_TOGETHER)
-    reach = _reach(grid, count)
+    together, reach = _together(grid), _reach(grid, count)
     for dtype, planes in _planes(levels).items():
         planes_together = len(planes)
         describe(
@@ -282,12 +309,22 @@ def _descriptions(
             dtype,
         )
     describe(_RIGHT, (height, grid.columns * reach), (size, reach), (together, reach), np.uint32, _UNSEEN)
-    lines = len(SIDES), 2, 5 if levels == 2 else 3, size
+    lines = len(SIDES), 2, _lines(levels), size
     counts = ambiguities + 1
     if has_seams:
         describe("seams", (grid.rows, grid.columns, *lines), None, (1, 1, *lines), _TABLES["seams"], NO_DISPARITY)
     describe("histogram", (grid.rows, grid.columns, counts), None, (1, 1, counts), _TABLES["histogram"])
-    return {name: text.to_bytes().decode() for name, text in texts.items()}, metadata
+    return {name: text.to_bytes().decode() for name, text in texts.items()}
+
+
+def _together(grid: Grid) -> int:
+    """Return the number of rows of a shard that are compressed together."""
+    return math.gcd(grid.size, _ROWS_TOGETHER)
+
+
+def _lines(levels: int) -> int:
+    """Return the number of products along the borders of tiles: winner and bounds."""
+    return 5 if levels == 2 else 3
 
 
 def _reach(grid: Grid, count: int) -> int:
@@ -304,47 +341,6 @@ def _compressed(chunk: np.ndarray) -> bytes:
 def checksum(content: bytes | memoryview) -> list[int]:
     """Return size in bytes and CRC-32 of a file."""
     return [len(content), zlib.crc32(content)]
-
-
-class _CheckedStore(WrapperStore[Store]):
-    """A zarr store that checks all that it reads: whole files, or whole pieces of shards."""
-
-    def __init__(self, store: Store, checksums: Checksums) -> None:
-        super().__init__(store)
-        self._checksums = checksums
-
-    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        read = await self._store.get(key, prototype, byte_range)
-        content = b"" if read is None else read.to_bytes()
-        if not await asyncio.to_thread(_is_intact, content, byte_range, self._checksums.get(key, (-1, 0))):
-            raise DamagedFileError(key)
-        return read
-
-    async def get_partial_values(
-        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
-    ) -> list[Buffer | None]:
-        return [await self.get(key, prototype, part) for key, part in key_ranges]
-
-
-def _is_intact(content: bytes, byte_range: ByteRequest | None, checksums: Sequence[int]) -> bool:
-    """Return whether a file, or a range of whole pieces of a shard, has these checksums."""
-    size, _, *pieces = checksums
-    if byte_range is None:
-        return checksum(content) == list(checksums[:2])
-    if isinstance(byte_range, RangeByteRequest):
-        first, last = byte_range.start, byte_range.end
-    else:
-        assert isinstance(byte_range, SuffixByteRequest)  # for the index
-        first, last = size - byte_range.suffix, size
-    starts = accumulate(pieces[::2], initial=0)
-    place = 0
-    view = memoryview(content)
-    for start, length, crc in zip(starts, pieces[::2], pieces[1::2], strict=False):
-        if first <= start < last:
-            if checksum(view[place : place + length]) != [length, crc]:
-                return False
-            place += length
-    return place == len(content) > 0
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:

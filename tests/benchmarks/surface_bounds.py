@@ -98,7 +98,7 @@ def truth_of(place, shape, kind):
 
     def at(down, across):
         row, column = np.indices(shape)
-        longitude, latitude = back.transform(*(place * (column + 0.5 + across, row + 0.5 + down)))
+        longitude, latitude = back.transform(*(place @ (column + 0.5 + across, row + 0.5 + down)))
         u, v = (longitude - LONGITUDE) * EAST / PIXEL, np.rint((LATITUDE - latitude) * NORTH / PIXEL).astype(int)
         height = np.full(shape, np.nan)
         for row in range(SIZE):

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -43,13 +44,20 @@ def run(command, cores, environment=None):
     return time.perf_counter() - started, usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime, printed
 
 
-def candidate(name, size, disparities, runs=RUNS):
+def candidate(name, size, disparities, runs=RUNS, core=CORES[0]):
     """Median seconds, peak memory and seconds outside the network of MC-CNN of one candidate on one core."""
     command = [sys.executable, HERE / "candidates.py", name, size, size, disparities, runs]
-    *_, printed = run([str(part) for part in command], CORES[:1])
+    *_, printed = run([str(part) for part in command], [core])
     result = json.loads(printed.splitlines()[-1])
     outside = [whole - network for whole, network in zip(result["seconds"], result["network"], strict=True)]
     return statistics.median(result["seconds"]), result["megabytes"], statistics.median(outside)
+
+
+def scaling():
+    """How many times as fast two independent `match_arrays` on two cores are as one after another."""
+    with ThreadPoolExecutor(2) as threads:
+        both = list(threads.map(lambda core: candidate("ours", 2000, 64, 2 * RUNS, core)[0], CORES[:2]))
+    return 2 * candidate("ours", 2000, 64)[0] / max(both)
 
 
 def write_pair(folder, size):
@@ -179,6 +187,7 @@ def file_to_file(folder):
         two = median_run(pairs[4000], folder / "out", 2, 3)
         tiles = stages["tiles"] / two[3]["seconds"]["tiles"]
         row("two workers on two cores against one", f"{one[0] / two[0]:.2f} x (tiles {tiles:.2f} x), {two[1]:.0f} MB")
+        row("two independent `match_arrays` against one after another", f"{scaling():.2f} x")
     small, large = median_run(pairs[2000], folder / "out", 1, RUNS), median_run(pairs[8000], folder / "out", 1, 1)
     row("cost a pixel, 8000 x 8000 against 2000 x 2000", f"{large[0] / small[0] / 16:.2f}")
     row("peak memory, the same", f"{large[1] / small[1]:.2f} ({large[1]:.0f} and {small[1]:.0f} MB)")

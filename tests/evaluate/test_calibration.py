@@ -111,7 +111,7 @@ def test_calibrate_surface__a_small_reference_is_not_thinned_by_the_size_of_the_
     model, reference = scene(tmp_path)
     with rasterio.open(reference) as dataset:
         part = dataset.read(1)[50:70, 60:90]
-    small = write_raster(tmp_path / "small.tif", [part], PLACE * Affine.translation(60, 50))
+    small = write_raster(tmp_path / "small.tif", [part], PLACE @ Affine.translation(60, 50))
     monkeypatch.setattr("sat_intervals.evaluate.calibration._MOST", 1000)
     found = calibrate_surface(model, small, "x", registers=False)
     assert sum(kind.cells for kind in found.classes) == 600
@@ -121,7 +121,7 @@ def test_calibrate_surface__cells_in_one_pixel_of_a_coarser_reference_count_as_o
     random = np.random.default_rng(0)
     height = 100 + random.normal(0, 1, (120, 150))
     model = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1, TAGS)
-    coarse = [write_raster(tmp_path / f"{n}.tif", [np.full((n, n), 100.0)], PLACE * Affine.scale(side))
+    coarse = [write_raster(tmp_path / f"{n}.tif", [np.full((n, n), 100.0)], PLACE @ Affine.scale(side))
               for n, side in ((10, 30), (50, 10))]  # fmt: skip
     with pytest.raises(SatIntervalsError, match=r"20 cells of .* \(those in a pixel of 30 m count as one\), 100 are"):
         calibrate_surface(model, coarse[0], "x", registers=False)

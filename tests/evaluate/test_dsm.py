@@ -88,7 +88,7 @@ def test_evaluate_surface__registers_a_reference_of_a_small_part_of_the_surface(
     row, column = np.indices((320, 320)).astype(np.float64)
     truth = relief(row, column)
     model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)
-    reference = write_raster(tmp_path / "part.tif", [truth[16:48, 16:48] - 5], PLACE * Affine.translation(16, 16))
+    reference = write_raster(tmp_path / "part.tif", [truth[16:48, 16:48] - 5], PLACE @ Affine.translation(16, 16))
     assert evaluate_surface(model, reference)["registration"]["shift"][2] == pytest.approx(5, abs=0.1)
 
 
@@ -240,6 +240,11 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
         assert f"{file.name} is a named pipe" in invoke(*words, "--pictures", tmp_path).stderr
         file.unlink()
         file.write_text(made)
+    written[-1].unlink()
+    os.mkfifo(written[-1])
+    result = invoke(*words, "--pictures", tmp_path)
+    assert result.stderr == f"sat-intervals: {written[-1]} is a named pipe: move it away or choose another output\n"
+    assert result.stdout == ""
 
 
 def test_evaluate_surface__ends_where_a_file_is_replaced_meanwhile(tmp_path, monkeypatch):

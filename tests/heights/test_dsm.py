@@ -25,6 +25,7 @@ from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.splat import AGREEING, COUNT, MEDIAN, NEAREST, cell_bounds, empty_cells, reaching, splat
 from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
 from sat_intervals.raster import POINT_FILES, Projection, north_up, write_layer
+from sat_intervals.raster.projection import transformed
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -40,7 +41,7 @@ def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run
     bands = np.full((4, *height.shape), 1.0, np.float32)
     bands[3] = confidence
     out = write_run(folder, bands, np.broadcast_to(np.uint16(validity), height.shape))
-    longitude, latitude = TO_DEGREES.transform(LEFT + x, TOP + y)
+    longitude, latitude = transformed(TO_DEGREES, LEFT + x, TOP + y)
     nothing = np.isnan(height)
     layers = dict.fromkeys((band.name for band in POINTS), np.zeros(height.shape)) | {
         "longitude": longitude,

@@ -21,9 +21,9 @@ SHAPE = 40, 50
 def displacements(path, positions, left, **tags):
     """Write a position grid as OTB does: displacements from coordinates, those of the pixels of an image."""
     with rasterio.open(positions) as source:
-        place = left * Affine.translation(0.5, 0.5) * source.transform
+        place = left @ Affine.translation(0.5, 0.5) @ source.transform
         column, row = np.meshgrid(np.arange(source.width) + 0.5, np.arange(source.height) + 0.5)
-        values = source.read() - np.stack(place * (column, row))
+        values = source.read() - np.stack(place @ (column, row))
         kind = source.profile | {"transform": place}
     with rasterio.open(path, "w", **kind) as dataset:
         dataset.write(values)

@@ -378,6 +378,26 @@ def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_
     assert not (tmp_path / "truth.tif").exists()
 
 
+def test_make_truth__deletes_the_points_that_a_killed_one_left(relief, tmp_path):
+    out, files, _ = relief
+    points, left = write_csv(tmp_path / "p.csv", places(hills, 1500)), tmp_path / "out" / ".reference-left"
+
+    def keep(stage, done, total):
+        if stage == "truth" and not left.exists():
+            (used,) = left.parent.glob(".reference-*")
+            shutil.copytree(used, left)
+
+    def make(progress):
+        given = Reference(points, True, Vertical(True, None))
+        path = tmp_path / "out" / "truth.tif"
+        make_truth(out, SensorFiles(*files), given, path=path, registers=False, progress=progress)
+
+    make(keep)
+    assert len(list(left.rglob("*"))) > 1
+    make(lambda stage, done, total: None)
+    assert [path.name for path in left.parent.iterdir()] == ["truth.tif"]
+
+
 @pytest.mark.parametrize("name", ["intervals.tif", "truth.tif"])
 def test_reference_command__replaces_only_a_truth_of_its_own(relief, tmp_path, name):
     out, files, reference = relief

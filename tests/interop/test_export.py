@@ -116,7 +116,7 @@ def test_export__a_region_lies_at_its_place_in_the_left_image(tmp_path, row):
     exported(out, "otb", tmp_path / "otb")
     for name in ("disparity.tif", "mask.tif"):
         with rasterio.open(tmp_path / "otb" / name) as dataset:
-            assert (dataset.transform, dataset.crs) == (PLACE.transform * Affine.translation(-7, -row), None)
+            assert (dataset.transform, dataset.crs) == (PLACE.transform @ Affine.translation(-7, -row), None)
 
 
 def test_export__refuses_what_is_no_run_and_what_it_does_not_know(run, tmp_path):

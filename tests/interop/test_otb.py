@@ -136,8 +136,8 @@ def displaced(source, target, first):
     """Write a position grid of CARS as OTB's, for a raw image that begins at a column and row."""
     with rasterio.open(source) as grid:
         column, row = np.meshgrid(np.arange(grid.width) + 0.5, np.arange(grid.height) + 0.5)
-        place = Affine.translation(0.5, 0.5) * grid.transform  # pixels of images without a geotransform
-        values = grid.read() - np.stack(place * (column, row)) - np.reshape(first, (2, 1, 1))
+        place = Affine.translation(0.5, 0.5) @ grid.transform  # pixels of images without a geotransform
+        values = grid.read() - np.stack(place @ (column, row)) - np.reshape(first, (2, 1, 1))
         kind = {"count": 2, "dtype": "float64", "transform": place}
         size = {"height": grid.height, "width": grid.width}
     with rasterio.open(target, "w", driver="GTiff", **kind, **size) as dataset:

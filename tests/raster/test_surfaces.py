@@ -16,10 +16,10 @@ LONGITUDE, LATITUDE = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=
 @pytest.mark.parametrize(
     ("place", "crs", "shape", "expected"),
     [
-        (PLACE * Affine.translation(30, 20), "EPSG:32631", (40, 50), Window(20, 30, 40, 50)),
-        (PLACE * Affine.translation(-5, 190), "EPSG:32631", (40, 50), Window(190, 0, 10, 45)),
-        (PLACE * Affine.translation(30, 60) * Affine.scale(1, -1), "EPSG:32631", (40, 50), Window(20, 30, 40, 50)),
-        (PLACE * Affine.translation(500, 0), "EPSG:32631", (40, 50), Window(0, 0, 200, 300)),  # apart: unknown
+        (PLACE @ Affine.translation(30, 20), "EPSG:32631", (40, 50), Window(20, 30, 40, 50)),
+        (PLACE @ Affine.translation(-5, 190), "EPSG:32631", (40, 50), Window(190, 0, 10, 45)),
+        (PLACE @ Affine.translation(30, 60) @ Affine.scale(1, -1), "EPSG:32631", (40, 50), Window(20, 30, 40, 50)),
+        (PLACE @ Affine.translation(500, 0), "EPSG:32631", (40, 50), Window(0, 0, 200, 300)),  # apart: unknown
         (Affine(1, 0, -180, 0, -1, 90), "EPSG:4326", (180, 360), Window(0, 0, 200, 300)),  # the whole Earth
     ],
 )

@@ -148,6 +148,21 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     assert not (tmp_path / "new.yaml").exists()
 
 
+def test_measure_subjects__deletes_the_tiles_of_a_killed_calibration(scene, tmp_path):
+    subjects = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    left = tmp_path / ".calibrate-left"
+
+    def keep(stage, done, total):
+        if stage == "tiles" and not left.exists():
+            (used,) = tmp_path.glob(".calibrate-*")
+            copytree(used, left)
+
+    measure_subjects(subjects, tmp_path, keep)
+    assert list(left.rglob("manifest.json"))
+    measure_subjects(subjects, tmp_path, lambda stage, done, total: None)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_measure_subjects__ends_where_a_truth_is_replaced_meanwhile(scene, tmp_path):
     for name in ("left.tif", "right.tif", "truth.tif", "meta.json"):
         (tmp_path / name).write_bytes((scene / name).read_bytes())

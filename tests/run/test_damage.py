@@ -459,6 +459,25 @@ def test_match__goes_on_after_a_kill_at_the_first_file_of_its_tiles(scene, tmp_p
     assert not (tmp_path / "out" / "tiles").exists()
 
 
+@pytest.mark.parametrize("elsewhere", [False, True])
+@pytest.mark.parametrize(("how", "names"), [("empty", ["manifest.json", "arrays.zarr/zarr.json"]), ("half", ["**/*"])])
+def test_match__overwrites_tiles_that_a_power_loss_damaged_before_the_first_record(
+    scene, tmp_path, how, names, elsewhere
+):
+    out, options = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
+    more = {"cluster": {"workers": 1} | ({"store": str(tmp_path / "store")} if elsewhere else {})}
+    settings = yaml.safe_load((scene / "settings.yaml").read_text()) | more
+    prepare(scene / "left.tif", scene / "right.tif", out, settings).begin()
+    (tiles,) = (file.parent for file in tmp_path.rglob("manifest.json"))
+    for file in [file for name in names for file in tiles.glob(name) if file.is_file()]:
+        damage(file, how)
+    mine = with_files(tiles, ["notes.txt", "records/notes.json"])
+    match(scene, out, *options, "--overwrite")
+    assert_same(scene, out)
+    assert {file for file in tiles.rglob("*") if file.is_file()} == mine.keys()
+    assert_kept(mine)
+
+
 @pytest.mark.parametrize("name", [SHARDS[0], "records/1_0.json"])
 def test_match__names_a_folder_where_a_file_of_a_tile_must_be(scene, tmp_path, name):
     (tmp_path / "out" / "tiles" / name).mkdir(parents=True)

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import shutil
+import stat
 import subprocess
 import sys
 import threading
@@ -408,6 +409,26 @@ def test_locked__keeps_what_is_not_its_lock(tmp_path, kind):
     assert (precious.read_text(), (folder / ".lock").read_text()) == ("mine", "mine")
 
 
+def test_scratch__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
+    elsewhere, foreign, link = tmp_path / "elsewhere", tmp_path / ".work-mine", tmp_path / ".work-link"
+    with LocalFolder(tmp_path).scratch("work") as used:
+        (used / "tiles").mkdir()
+        (used / "tiles" / "file").write_text("half")
+        left = shutil.copytree(used.parent, tmp_path / ".work-left")
+        shutil.copytree(used.parent, elsewhere)
+        (used.parent / "link").symlink_to(elsewhere)
+        link.symlink_to(elsewhere)
+        foreign.mkdir()
+        (foreign / "files").write_text("mine")
+        with LocalFolder(tmp_path).scratch("work") as new:
+            assert (list(new.iterdir()), new.parent.parent) == ([], tmp_path)
+        assert not left.exists()
+        assert (used / "tiles" / "file").exists()
+        (used.parent / "link").unlink()
+    assert sorted(tmp_path.iterdir()) == [link, foreign, elsewhere]
+    assert sorted(path.name for path in elsewhere.rglob("*")) == [LOCK, "file", "files", "tiles"]
+
+
 @pytest.mark.parametrize("inner", ["", "files", "files/replaced"])
 def test_output_writer__adopts_no_folder_through_a_link(tmp_path, inner):
     precious = tmp_path / "precious"
@@ -694,6 +715,26 @@ def test_report_and_plot__replace_only_files_that_they_made(finished, name):
     assert (finished / "curve.png").read_text() == "of nobody's concern"
 
 
+@pytest.mark.parametrize("kind", [stat.S_IFIFO, stat.S_IFSOCK])
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("report", "report.html"),
+        ("plot", "overview.png"),
+        ("project", "project.qgz"),
+        ("project", "width.vrt"),
+        ("stac", "stac.json"),
+    ],
+)
+def test_commands__replace_no_pipe_and_no_socket(finished, command, name, kind):
+    os.mknod(finished / name, 0o600 | kind)
+    before = sorted(finished.iterdir())
+    what = "named pipe" if kind == stat.S_IFIFO else "socket"
+    refused([command, finished], f"{finished / name} is a {what}: move it away or choose another output")
+    assert sorted(finished.iterdir()) == before
+    assert stat.S_IFMT((finished / name).stat().st_mode) == kind
+
+
 @pytest.mark.parametrize("name", ["report.html", "profile.png"])
 def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, monkeypatch, name):
 
@@ -884,12 +925,17 @@ def test_export__replaces_only_its_own_files(finished, tmp_path, form, name):
     export(finished, form, target)
     export(finished, form, target)
     profile = {"count": 1, "dtype": "uint8", "height": 2, "width": 2}
-    with rasterio.open(target / name, "w", driver="PNG" if name.endswith("png") else "GTiff", **profile) as file:
-        file.write(np.ones((1, 2, 2), np.uint8))
-    before = contents(target)
-    with pytest.raises(SatIntervalsError, match=rf"{name} exists and was not made by sat-intervals, .*move it away"):
-        export(finished, form, target)
-    assert contents(target) == before
+    driver = "PNG" if name.endswith("png") else "GTiff"
+    mine, of_another_command = {}, {"Software" if driver == "PNG" else "SOFTWARE": "sat-intervals"}
+    for tags in (mine, of_another_command, of_another_command | {"EXPORT": "another"}):
+        with rasterio.Env(WRITE_METADATA_AS_TEXT=True), rasterio.open(target / name, "w", driver, **profile) as file:
+            file.update_tags(**tags)
+            file.write(np.ones((1, 2, 2), np.uint8))
+        before = contents(target)
+        by = f" export --to {form}" if tags else ""
+        with pytest.raises(SatIntervalsError, match=rf"{name} exists and was not made by sat-intervals{by}, .*move it"):
+            export(finished, form, target)
+        assert contents(target) == before
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])

@@ -90,6 +90,14 @@ def test_log_file__does_not_wait_for_who_reads_a_pipe(tmp_path):
     assert "pipe cannot be written: No such device or address: choose another --log-file" in result.stderr
 
 
+def test_log_file__may_be_a_pipe_that_is_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    invoke("ablate", tmp_path, "--log-file", tmp_path / "pipe")
+    assert b"ablate begins" in os.read(reader, 4096)
+    os.close(reader)
+
+
 @pytest.mark.parametrize("name", ["run.json", "batch.json", "meta.json"])
 def test_commands__refuse_json_that_is_nested_without_end(tmp_path, name):
     for file in (name, "left.tif", "right.tif", "truth.tif"):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from zarr.storage import LocalStore
+import zarr
 
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.zarr_arrays import DamagedFileError, TileArrays
@@ -43,16 +43,25 @@ def test_strips__have_the_rows_that_were_written(arrays, first, last):
         np.testing.assert_array_equal(found[name], band[first:last])
 
 
+def test_write__makes_arrays_that_zarr_reads(arrays):
+    arrays, _, whole = arrays
+    group = zarr.open_group(arrays.folder.path, mode="r")
+    for array, names in ("int16", ("winner", "lower", "upper", "validity")), ("uint32", ("disparity", "ambiguity")):
+        for plane, name in zip(group[array][:, :300], names, strict=True):
+            np.testing.assert_array_equal(plane.view(whole[name].dtype), whole[name])
+    assert group["histogram"][:].shape == (2, 1, 21)
+
+
 def test_strips__read_only_the_pieces_of_their_rows(arrays, monkeypatch):
     arrays, checksums, _ = arrays
-    get, read = LocalStore.get, []
+    read_parts, read = LocalFolder.read_parts, []
 
-    async def counted(store, key, *arguments):
-        buffer = await get(store, key, *arguments)
-        read.append(len(buffer.to_bytes()))
-        return buffer
+    def counted(folder, parts):
+        contents = read_parts(folder, parts)
+        read.extend(map(len, contents))
+        return contents
 
-    monkeypatch.setattr(LocalStore, "get", counted)
+    monkeypatch.setattr(LocalFolder, "read_parts", counted)
     joined(arrays, checksums, 70, 120)
     assert sum(read) < 0.4 * sum(size for name, (size, *_) in checksums.items() if name.endswith(("0/0", "c/0")))
 
