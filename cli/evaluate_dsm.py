@@ -42,10 +42,12 @@ class Surface:
         """Print figures, and write them with pictures to the folder, whose names are not printed if quiet."""
         from sat_intervals.cli.tables import show_surface
         from sat_intervals.evaluate.dsm import evaluate_surface
+        from sat_intervals.raster import watched_rasters
 
         given = self.given
         if self.folder is not None:
             _check_kept(self.folder, [given.dsm, given.reference, self.classes])
+        check_unchanged = watched_rasters([given.dsm, given.reference])
         report = evaluate_surface(given.dsm, given.reference, self.classes, registers=given.registers)
         if as_json:
             say_json(report)
@@ -53,6 +55,7 @@ class Surface:
             show_surface(str(given.dsm), report)
         if self.folder is not None:
             written = _drawn(given, self.folder, self.line, report)
+            check_unchanged()
             for path in () if quiet else written:
                 click.echo(path, err=as_json)
 

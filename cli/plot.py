@@ -85,9 +85,10 @@ def plot(
     if _is_current(surface := out / "dsm.tif", results.report["finished"]):
         drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
     check_made_here(out / f"{name}.png" for name in drawings)
-    for name, draw in drawings.items():
-        draw(out / f"{name}.png")
-        click.echo(out / f"{name}.png")
+    with results.unchanged("dsm.tif"):
+        for name, draw in drawings.items():
+            draw(out / f"{name}.png")
+            click.echo(out / f"{name}.png")
 
 
 def _check(results: "Results", row: int | None, columns: tuple[int, int] | None, pixel: tuple[int, int] | None) -> None:

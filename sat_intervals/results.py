@@ -24,7 +24,7 @@ from sat_intervals.raster import (
     read_small_layers,
     read_window,
 )
-from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed
+from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, watched
 from sat_intervals.tiling import Window, strips
 
 # Pixels in a strip, and band count of each file.
@@ -96,13 +96,15 @@ class Run:
             )
 
     @contextmanager
-    def unchanged(self) -> Iterator[None]:
-        """Raise RunError at the end of the block if another run has replaced the files."""
+    def unchanged(self, *others: str) -> Iterator[None]:
+        """Raise RunError at the end of the block if the run, or one of ``others`` in its folder, was replaced."""
+        check_others = watched(self.out / name for name in others)
         try:
             yield
         finally:
             if _which(self.out / "run.json") != self.which:
                 raise RunError(f"the run in {self.out} was replaced while it was read: rerun the command")
+        check_others()
 
     def windows(self) -> Iterator[Window]:
         """Yield full-width windows of the results from the top."""

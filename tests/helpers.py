@@ -89,3 +89,10 @@ def shares_that_differ(one, other):
     either_valid = (flags & INVALID == 0) | (other_flags & INVALID == 0)
     differs = (first != second) & ~(np.isnan(first) & np.isnan(second)) & either_valid
     return differs[0].sum() / either_valid.sum(), (differs[1] | differs[2]).sum() / either_valid.sum()
+
+
+def flip_bit(path):
+    """Flip a bit in the middle of a file."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)

@@ -110,13 +110,13 @@ class PointCloud:
     def _kept(self, window: Window) -> tuple[np.ndarray, np.ndarray, int, int]:
         """Return the bands of a window, the mask of the points that contribute, and the numbers left out."""
         bands, known = read_points(self._path, window)
-        self._check_unchanged()
         outlying = open_ended = np.zeros(known.shape, np.bool_)
         if self._choices.outliers is not None:
             outlying = known & self._outlying(window, self._choices.outliers)
         if not self._choices.keeps_open:
             validity = self.run.read_bands(window).validity.astype(np.int64)
             open_ended = known & ~outlying & (validity & (OPEN_BELOW | OPEN_ABOVE) != 0)
+        self._check_unchanged()
         return bands, known & ~outlying & ~open_ended, int(outlying.sum()), int(open_ended.sum())
 
     def _outlying(self, window: Window, limit: float) -> np.ndarray:

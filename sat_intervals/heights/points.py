@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.heights.triangulate import check_points
 from sat_intervals.products import POINTS
 from sat_intervals.raster import read_layers, read_shape, read_tags
+from sat_intervals.raster.published import check_points
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Grid, Window
 

@@ -7,23 +7,21 @@ enough. Rows are read, computed and written strip by strip, so memory does not d
 import json
 import os
 from collections.abc import Iterable, Iterator
-from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import POINT_FILES, OutputWriter, read_tags
-from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.published import POINTS_FILE, POINTS_REPORT, published_points
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
 if TYPE_CHECKING:
     from sat_intervals.heights.sensors import Lattice, Points
 
-_POINTS, _REPORT = POINT_FILES[0].name, "points.json"
 # Pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes.
 _PIXELS = 1 << 20
 # Positions are rounded to 0.01 mm on the ground and 0.1 mm in height, below the error of the lattice. This halves the
@@ -70,7 +68,9 @@ def triangulate(
 
     run = open_run(out)
     _check_own(run.out)
-    run.check_kept([run.out / name for name in (_POINTS, _REPORT)], [left_model, right_model, left_grid, right_grid])
+    run.check_kept(
+        [run.out / name for name in (POINTS_FILE, POINTS_REPORT)], [left_model, right_model, left_grid, right_grid]
+    )
     search = run.config.disparity
     files = map(Path, (left_model, right_model, left_grid, right_grid))
     sensors = Sensors.load(*files, left=run.left_georeferencing)
@@ -85,51 +85,21 @@ def triangulate(
             tally.add(int(np.isfinite(disparities[0]).sum()), height=bands[2], residual=bands[5])
             progress("points", window.row_stop, run.shape[0])
         progress("files", 0, 1)
-        writer.publish((_REPORT, json.dumps({"files": writer.build()}, indent=1) + "\n"))
+        writer.publish((POINTS_REPORT, json.dumps({"files": writer.build()}, indent=1) + "\n"))
         progress("files", 1, 1)
     return tally.report() | {"median_residual": lattice.residual}
 
 
 def _check_own(out: Path) -> None:
     """Raise if ``points.tif`` or ``points.json`` exists and was not made by this tool."""
-    path = out / _POINTS
-    if _published(out) is None and os.path.lexists(path):
+    path = out / POINTS_FILE
+    if published_points(out) is None and os.path.lexists(path):
         try:
             is_own = "RUN" in read_tags(path)
         except SatIntervalsError:
             is_own = False
         if not is_own:
             raise SatIntervalsError(f"{path} exists and was not made by triangulate, or is damaged: move it away")
-
-
-def check_points(out: Path) -> None:
-    """Raise if the bytes of ``points.tif`` differ from those that were published; earlier versions wrote no checksum.
-
-    Raises
-    ------
-    SatIntervalsError
-        Names the damaged file.
-    """
-    published = _published(out)
-    if published and published != checksum_of(out / _POINTS):
-        raise SatIntervalsError(
-            f"{out / _POINTS} is not what triangulate published; it is damaged or was changed: triangulate again"
-        )
-
-
-def _published(out: Path) -> dict[str, int] | None:
-    """Return size and CRC-32 of ``points.tif`` from ``points.json``; None if that is missing."""
-    file = out / _REPORT
-    check_regular(file)
-    try:
-        known = json.loads(file.read_text(encoding="utf-8"))["files"][_POINTS]
-        return {key: index(known[key]) for key in ("bytes", "crc32")}
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: move it away") from error
-    except (ValueError, LookupError, TypeError, RecursionError) as error:
-        raise SatIntervalsError(f"{file} is not the report of {_POINTS}: move it away and triangulate again") from error
 
 
 class _Tally:

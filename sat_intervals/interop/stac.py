@@ -23,6 +23,7 @@ from sat_intervals.raster import (
     read_tags,
     whole_file,
 )
+from sat_intervals.raster.published import check_points
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
 
@@ -64,7 +65,7 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     file = run.out / "stac.json"
     run.check_kept([file])
     _check_own(file)
-    with run.unchanged():
+    with run.unchanged("points.tif", "dsm.tif", "overview.png"):
         item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
     with whole_file(file) as new:
         new.write_text(json.dumps(item, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -149,6 +150,7 @@ def _assets(run: Run, place: Georeferencing) -> Iterator[tuple[str, dict[str, An
     yield "validity", _raster(run.out / "validity.tif", "Validity flags", (_VALIDITY,), place)
     finished = run.report["finished"]
     if _has_tag(points := run.out / "points.tif", "RUN", finished):
+        check_points(run.out)
         yield "points", _raster(points, "Longitude, latitude and height of every pixel", POINTS, place)
     if _has_tag(surface := run.out / "dsm.tif", "RUNS", finished):
         yield "dsm", _raster(surface, "Surface model with intervals", SURFACE, read_place(surface)[1])

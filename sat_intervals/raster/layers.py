@@ -1,5 +1,6 @@
 """Read and write layers that fit in memory, and replace files atomically."""
 
+import errno
 import os
 import re
 import shutil
@@ -8,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from rasterio import Env
@@ -19,10 +21,14 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import stamps
+from sat_intervals.raster.publishing import OutputError, stamps
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Window, strips
 
+# Pixels read back at a time.
+_STRIP = 1 << 22
+SUM_WRAPS = 1 << 64
+"""Sums of bits are modulo 2^64."""
 # Name of a file kept aside: the report's stamp and the file's name.
 _ASIDE = ".sat-intervals.{}.{}"
 
@@ -40,12 +46,20 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give the block a temporary file to write; rename it to ``path`` at the end, or delete it on failure.
 
     A symbolic link at ``path`` is replaced, not followed.
+
+    Raises
+    ------
+    OutputError
+        Names ``path`` and the system's reason.
     """
     path = Path(path)
     new = path.with_name(f".{uuid.uuid4().hex}-{path.name}")
     try:
         yield new
         os.replace(new, path)
+    except (*gdal.GDAL_ERRORS, OSError) as error:
+        reason = getattr(error, "strerror", None) or gdal.reason(error)
+        raise OutputError(f"{path} cannot be written: {reason}: make room or check its rights") from error
     finally:
         with suppress(OSError):
             new.unlink()
@@ -95,15 +109,7 @@ def write_layer(
     tags: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Write ``(rows, columns)`` as a tiled, compressed GeoTIFF of one band; replaces an existing file."""
-    height, width = pixels.shape
-    kind = {"count": 1, "dtype": pixels.dtype.name, "nodata": nodata, "tiled": True, "compress": "deflate"}
-    with (
-        whole_file(path) as new,
-        Env(),
-        gdal.create(str(new), height=height, width=width, **kind, **georeferencing.creation_options()) as dataset,
-    ):
-        dataset.update_tags(**tags)
-        dataset.write(pixels, 1)
+    _write(path, [pixels[np.newaxis]], pixels.dtype, (1, *pixels.shape), georeferencing, tags, nodata)
 
 
 def write_rows(
@@ -116,18 +122,40 @@ def write_rows(
 
     ``shape`` has the numbers of bands, rows and columns.
     """
+    _write(path, rows, np.dtype(np.int16), shape, georeferencing, MARK)
+
+
+def _write(
+    path: str | os.PathLike[str],
+    rows: Iterable[np.ndarray],
+    dtype: np.dtype[Any],
+    shape: tuple[int, int, int],
+    georeferencing: Georeferencing,
+    tags: Mapping[str, str],
+    nodata: float | None = None,
+) -> None:
+    """Write rows from the top and read them back: GDAL closes a file without an error when the disk is full."""
     bands, height, width = shape
-    kind = {"count": bands, "dtype": "int16", "tiled": True, "compress": "deflate"}
-    with (
-        whole_file(path) as new,
-        Env(),
-        gdal.create(str(new), height=height, width=width, **kind, **georeferencing.creation_options()) as dataset,
-    ):
-        dataset.update_tags(**MARK)
-        first = 0
-        for part in rows:
-            dataset.write(part, window=RasterioWindow(0, first, width, part.shape[1]))
-            first += part.shape[1]
+    kind = {"count": bands, "height": height, "width": width, "dtype": dtype.name, "nodata": nodata}
+    kind |= {"tiled": True, "compress": "deflate", **georeferencing.creation_options()}
+    first = difference = 0
+    with whole_file(path) as new:
+        with Env(), gdal.create(str(new), **kind) as dataset:
+            dataset.update_tags(**tags)
+            for part in rows:
+                dataset.write(part, window=RasterioWindow(0, first, width, part.shape[1]))
+                first += part.shape[1]
+                difference += sum_of_bits(np.ascontiguousarray(part, dtype))
+        with gdal.reading(str(new)) as dataset:
+            for window in strips(height, width, _STRIP):
+                difference -= sum_of_bits(dataset.read(window=RasterioWindow(0, window.row, width, window.height)))
+        if difference % SUM_WRAPS:
+            raise OSError(errno.EIO, "the content read back differs from that written")
+
+
+def sum_of_bits(bands: np.ndarray) -> int:
+    """Return the sum of an array's bits as unsigned integers, modulo SUM_WRAPS; independent of the order of blocks."""
+    return int(bands.view(f"uint{8 * bands.itemsize}").sum(dtype=np.uint64))
 
 
 def write_once(

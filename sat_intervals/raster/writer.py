@@ -22,6 +22,7 @@ from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
 from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, publish, put_back, stamps
 from sat_intervals.raster.space import WAY_OUT, check_space, file_bytes
 from sat_intervals.raster.streaming import Stream
@@ -36,7 +37,6 @@ _UNFINISHED = r"(?:(?:strips|rows)-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.war
 _PNG = {"WRITE_METADATA_AS_TEXT": "YES"}
 # GDAL's block cache in bytes; the default is a twentieth of the memory.
 _CACHE = 16 << 20
-_SUM_WRAPS = 1 << 64  # sums of bits are modulo 2^64
 
 
 class OutputWriter:
@@ -155,7 +155,7 @@ class OutputWriter:
                 file.describe(self._pictures[file.name][0])
             strips, before = self._pictures[file.name]
             strips.write(bands, window=RasterioWindow(0, row, self._shape[1], bands.shape[1]))
-            self._pictures[file.name] = strips, before + _sum(bands)
+            self._pictures[file.name] = strips, before + sum_of_bits(bands)
 
     def assemble(self, name: str, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
         """Make a file of rows of blocks, see `cog.assemble`, under a temporary name."""
@@ -181,7 +181,7 @@ class OutputWriter:
                 copy(strips.name, str(self._scratch / name), driver="PNG", **_PNG)
                 _flush(self._scratch / name)
                 with gdal.reading(str(self._scratch / name)) as dataset:
-                    if (_sum(dataset.read()) - expected) % _SUM_WRAPS:
+                    if (sum_of_bits(dataset.read()) - expected) % SUM_WRAPS:
                         raise OSError(errno.EIO, "the content read back differs from that written")
                 self._made[name] = checksum_of(self._scratch / name)
             os.unlink(strips.name)
@@ -279,11 +279,6 @@ def _killed(folder: Path, files: Sequence[File]) -> Iterator[OutputWriter]:
             writer._remove_scratch()
     else:
         yield writer
-
-
-def _sum(bands: np.ndarray) -> int:
-    """Return the sum of an array's bits as unsigned integers, modulo 2^64; independent of the order of blocks."""
-    return int(bands.view(f"uint{8 * bands.itemsize}").sum(dtype=np.uint64))
 
 
 def _flush(path: Path) -> None:

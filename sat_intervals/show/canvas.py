@@ -39,12 +39,8 @@ def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterato
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
-        try:
-            with whole_file(path) as new:
-                figure.savefig(new, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
-        except OSError as error:
-            reason = error.strerror or error
-            raise SatIntervalsError(f"{path} cannot be written: {reason}: make room or check its rights") from error
+        with whole_file(path) as new:
+            figure.savefig(new, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
 
 
 def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:

@@ -24,6 +24,7 @@ from sat_intervals.raster import (
     read_tags,
     whole_file,
 )
+from sat_intervals.raster.published import check_points
 from sat_intervals.results import Run, open_run
 from sat_intervals.show import styles
 from sat_intervals.show.marks import check_made_here, is_replaceable
@@ -96,7 +97,7 @@ def write_project(out: str | Path) -> Written:
     run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
     check_made_here([file])
     written = Written([], [])
-    with run.unchanged():
+    with run.unchanged("points.tif", "dsm.tif"):
         layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
         _write_defaults(run, layers, written)
         layers += _images(run, written)
@@ -149,6 +150,7 @@ def _points(run: Run, written: Written) -> Iterator[Layer]:
     if read_tags(file).get("RUN") != run.report["finished"] or read_shape(file)[1:] != run.shape:
         written.notes.append(f"{file} belongs to another run and is left out: rerun sat-intervals triangulate")
         return
+    check_points(run.out)
     place = run.georeferencing
     bands = read_small_layers(file, _fitting(run.shape))
     for number, ramp in ((6, styles.MAGMA), (3, styles.VIRIDIS)):

@@ -261,6 +261,24 @@ def test_evaluate_surface__ends_where_a_file_is_replaced_meanwhile(tmp_path, mon
         evaluate_surface(model, reference, registers=False)
 
 
+@pytest.mark.peer("matplotlib")
+def test_evaluate_command__ends_where_a_surface_is_replaced_before_its_pictures(tmp_path, monkeypatch):
+    row, column = np.indices((60, 70)).astype(np.float64)
+    truth = relief(row, column)
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
+    reference = write_raster(tmp_path / "reference.tif", [truth])
+    read_profile = dsm.read_profile
+
+    def replaced_before(*arguments):
+        write_surface(tmp_path / "dsm.tif", truth + 9, truth + 8, truth + 10)
+        return read_profile(*arguments)
+
+    monkeypatch.setattr(dsm, "read_profile", replaced_before)
+    done = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register", "--pictures", tmp_path)
+    assert done.exit_code == 1
+    assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
+
+
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
     model = write_surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
     away = write_raster(tmp_path / "away.tif", [[[1.5, 9]]], Affine(1, 0, 5, 0, -1, 5))

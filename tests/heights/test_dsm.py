@@ -156,6 +156,21 @@ def test_make_surface__ends_where_points_are_replaced_meanwhile(tmp_path, monkey
     assert not (tmp_path / "dsm.tif").exists()
 
 
+def test_point_cloud__ends_where_points_are_replaced_before_outliers_are_found(tmp_path, monkeypatch):
+    x, y = np.meshgrid(np.arange(20.0), -np.arange(20.0))
+    out = write_points(tmp_path / "a", x, y, 10 + 0 * x)
+    other = write_points(tmp_path / "b", x, y, 99 + 0 * x)
+    outlying = PointCloud._outlying
+
+    def replaced_before(*arguments):
+        (other / "points.tif").replace(out / "points.tif")
+        return outlying(*arguments)
+
+    monkeypatch.setattr(PointCloud, "_outlying", replaced_before)
+    with pytest.raises(RunError, match=r"points.tif was replaced or changed while it was read: rerun the command"):
+        PointCloud(open_run(out), Projection("EPSG:32631"), SurfaceChoices(outliers=1.0, keeps_open=True))
+
+
 def test_make_surface__keeps_the_surface_whose_grid_it_takes(tmp_path):
     out = write_points(tmp_path / "a", [0.5, 3.5], [-0.5, -0.9], [10, 14])
     surface_of([out], tmp_path)

@@ -9,10 +9,11 @@ import shutil
 import numpy as np
 import pytest
 import rasterio
-from finished import no_bands, random_bands, write_run, write_surface
-from helpers import invoke
+from finished import no_bands, random_bands, write_points, write_run, write_surface
+from helpers import flip_bit, invoke
 from numpy.testing import assert_allclose
 
+from sat_intervals.interop import stac
 from sat_intervals.raster import north_up, read_layers
 
 
@@ -124,3 +125,30 @@ def test_stac__replaces_its_own_item_only(made, tmp_path):
     (out / "stac.json").unlink()
     os.mkfifo(out / "stac.json")
     assert f"{out / 'stac.json'} is a named pipe" in invoke("stac", out).stderr
+
+
+def test_write_item__refuses_damaged_points(made, tmp_path):
+    out = shutil.copytree(made[0], tmp_path / "out")
+    write_points(out, np.full((60, 80), 700.0))
+    assert invoke("stac", out).exit_code == 0
+    before = (out / "stac.json").read_bytes()
+    flip_bit(out / "points.tif")
+    done = invoke("stac", out)
+    assert (done.exit_code, (out / "stac.json").read_bytes()) == (2, before)
+    assert "points.tif is not what triangulate published; " in done.stderr
+
+
+def test_write_item__ends_where_a_surface_is_replaced_meanwhile(made, tmp_path, monkeypatch):
+    """Else it gives the checksum of one surface and the statistics of another."""
+    out = shutil.copytree(made[0], tmp_path / "out")
+    bands = stac._bands
+
+    def replaced_before(path, *arguments):
+        if path.name == "dsm.tif":
+            write_surface(out, np.full((60, 80), 700.0))
+        return bands(path, *arguments)
+
+    monkeypatch.setattr(stac, "_bands", replaced_before)
+    done = invoke("stac", out)
+    assert done.exit_code == 1
+    assert re.search(r"dsm.tif was replaced or changed while it was read: rerun the command", done.stderr)

@@ -34,8 +34,12 @@ from sat_intervals.raster import (
     OutputWriter,
     check_pair,
     open_image,
+    read_layers,
     read_window,
     surface_file,
+    whole_file,
+    write_layer,
+    write_rows,
 )
 from sat_intervals.tiling import Window
 
@@ -695,3 +699,31 @@ def test_output_writer__leaves_nothing_on_a_full_disk(disk, products, size, othe
         fill()
     message(failure, place / "out", reason, "choose another folder")
     assert set(left_behind(place)) <= {"other", "out"}
+
+
+# The file has 527 kB. GDAL keeps its end until it is closed, and closes without an error what does not fit.
+@pytest.mark.parametrize("size", [8 << 10, 492 << 10, 512 << 10])
+def test_write_layer__leaves_no_damaged_file_on_a_full_disk(disk, size):
+    noise = np.random.default_rng(0).integers(0, 60000, (512, 512)).astype(np.uint16)
+    place = disk(size)
+    with pytest.raises(OutputError, match=r"noise.tif cannot be written: .*: make room or check its rights"):
+        write_layer(place / "noise.tif", noise, 0, Georeferencing())
+    assert list(place.iterdir()) == []
+    disk(600 << 10)
+    write_layer(place / "noise.tif", noise, 0, Georeferencing())
+    assert (read_layers(place / "noise.tif")[0] == noise).all()
+
+
+def test_write_rows__leaves_no_damaged_file_on_a_full_disk(disk):
+    place = disk(8 << 10)
+    (place / "other").write_bytes(bytes(8 << 10))
+    with pytest.raises(OutputError, match=r"ranges.tif cannot be written"):
+        write_rows(place / "ranges.tif", [np.ones((2, 9, 9), np.int16)], (2, 9, 9), Georeferencing())
+    assert left_behind(place) == ["other"]
+
+
+def test_whole_file__names_the_file_that_cannot_be_written(tmp_path):
+    """Not the temporary one."""
+    for path in (tmp_path / "missing" / "a.txt", tmp_path):
+        with pytest.raises(OutputError, match=rf"{path} cannot be written: .*: make room or"), whole_file(path) as new:
+            new.write_text("a")

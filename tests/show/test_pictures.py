@@ -28,7 +28,7 @@ from sat_intervals.products import FLAGS, INVALID, LEFT_WINDOW, MISMATCH, NOT_RE
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run.statistics import Tally
-from sat_intervals.show import maps
+from sat_intervals.show import dsm, maps
 from sat_intervals.show.canvas import widest
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.show.dsm import _relief, draw_surface
@@ -324,6 +324,22 @@ def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tm
     shutil.copy(out / "validity.tif", tmp_path / "dsm.tif")
     with pytest.raises(SatIntervalsError, match=r"dsm\.tif is not a surface model of sat-intervals dsm"):
         draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png")
+
+
+def test_plot__ends_where_a_surface_is_replaced_meanwhile(tmp_path, monkeypatch, unrendered):
+    """Else dsm.png is of another run than the other pictures, or its caption of another surface than its maps."""
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    write_surface(out, np.full((40, 50), 700.0))
+    figures = dsm._figures
+
+    def replaced_before(*arguments):
+        write_surface(out, np.full((40, 50), 1700.0))
+        return figures(*arguments)
+
+    monkeypatch.setattr(dsm, "_figures", replaced_before)
+    done = invoke("plot", out, "--dpi", "40")
+    assert done.exit_code == 1
+    assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
 
 
 def test_draw_surface__without_bounds(tmp_path, words):

@@ -11,14 +11,15 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import rasterio
-from finished import PLACE, no_bands, random_bands, without_intervals, write_run, write_surface
-from helpers import invoke
+from finished import PLACE, no_bands, random_bands, without_intervals, write_points, write_run, write_surface
+from helpers import flip_bit, invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from rasterio.crs import CRS
 
 from sat_intervals.products import INVALID
 from sat_intervals.raster import ControlPoint, Georeferencing
+from sat_intervals.show import project
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
 from sat_intervals.show.styles import write_difference
 
@@ -140,6 +141,31 @@ def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
     assert "the right image is left out: " in done.stderr
     names = [name for _, name, _ in layers_of(read_project(out))]
     assert names == ["validity", "confidence", "interval width", "disparity", "truth", "left"]
+
+
+def test_write_project__refuses_damaged_points(run):
+    out, _, _ = run
+    write_points(out, np.full((60, 80), 700.0))
+    assert invoke("project", out).exit_code == 0
+    flip_bit(out / "points.tif")
+    done = invoke("project", out)
+    assert done.exit_code == 2
+    assert "points.tif is not what triangulate published; " in done.stderr
+
+
+def test_write_project__ends_where_a_surface_is_replaced_meanwhile(run, monkeypatch):
+    out, _, _ = run
+    read_place = project.read_place
+
+    def replaced_after(path):
+        found = read_place(path)
+        write_surface(out, np.full((60, 80), 1700.0))
+        return found
+
+    monkeypatch.setattr(project, "read_place", replaced_after)
+    done = invoke("project", out)
+    assert done.exit_code == 1
+    assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
 
 
 def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_path):

@@ -8,7 +8,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import whole_file
 from sat_intervals.results import Results
@@ -39,11 +38,8 @@ def write_report(results: Results) -> Path:
     script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
     parts = {"summary": _summary(contents), "style": _asset("report.css"), "script": script, "contents": data}
     page = re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], page)
-    try:
-        with whole_file(path) as new:
-            new.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise SatIntervalsError(f"{path} cannot be written: {error.strerror}: make room or check its rights") from error
+    with whole_file(path) as new:
+        new.write_text(page, encoding="utf-8")
     return path
 
 

@@ -1,0 +1,43 @@
+"""Compare ``points.tif`` with the size and checksum that were published with it."""
+
+import json
+from operator import index
+from pathlib import Path
+
+from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.raster.files import POINT_FILES
+from sat_intervals.raster.identity import checksum_of
+
+POINTS_FILE, POINTS_REPORT = POINT_FILES[0].name, "points.json"
+
+
+def check_points(out: Path) -> None:
+    """Raise if the bytes of ``points.tif`` differ from those that were published; earlier versions wrote no checksum.
+
+    Raises
+    ------
+    SatIntervalsError
+        Names the damaged file.
+    """
+    published = published_points(out)
+    if published and published != checksum_of(out / POINTS_FILE):
+        raise SatIntervalsError(
+            f"{out / POINTS_FILE} is not what triangulate published; it is damaged or was changed: triangulate again"
+        )
+
+
+def published_points(out: Path) -> dict[str, int] | None:
+    """Return size and CRC-32 of ``points.tif`` from ``points.json``; None if that is missing."""
+    file = out / POINTS_REPORT
+    check_regular(file)
+    try:
+        known = json.loads(file.read_text(encoding="utf-8"))["files"][POINTS_FILE]
+        return {key: index(known[key]) for key in ("bytes", "crc32")}
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: move it away") from error
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise SatIntervalsError(
+            f"{file} is not the report of {POINTS_FILE}: move it away and triangulate again"
+        ) from error
