@@ -160,10 +160,7 @@ def gallery() -> str:
     folder.mkdir()
     for title, command, file in GALLERY:
         program, *arguments = command.split()
-        if program == "sat-intervals":
-            words = ["-c", RUN, *arguments]
-        else:
-            words = [str(ROOT / arguments[0]), *arguments[1:]]
+        words = ["-c", RUN, *arguments] if program == "sat-intervals" else [str(ROOT / arguments[0]), *arguments[1:]]
         subprocess.run([sys.executable, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
         lines += [f"## {title}", "", "```", command, "```", ""]
         if file:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sat_intervals.heights.sensors import Lattice, Points
 
 # Pixels computed at a time, 300 bytes each; pixels read ahead take 18 bytes.
-_PIXELS = 1 << 20
+_PIXELS = 1 << 18
 # Positions are rounded to 0.01 mm on the ground and 0.1 mm in height, below the error of the lattice. This halves the
 # file.
 _DEGREES, _METRES = 2.0**-33, 2.0**-13

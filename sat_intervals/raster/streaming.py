@@ -10,9 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from sat_intervals.machine import usable_cores
 from sat_intervals.raster.blocks import BLOCK, COLUMNS, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import File
+
+# Bytes of a pixel of which COLUMNS are compressed at a time, fewer of larger ones: each thread has some copies.
+_PIXEL = 16
 
 
 class Stream:
@@ -56,8 +60,12 @@ class Stream:
 
     def _end_row(self, level: int, rows: np.ndarray) -> None:
         """Compress a row of blocks, and add its reduced rows to the next level."""
-        columns = (rows[:, :, first : first + COLUMNS] for first in range(0, rows.shape[2], COLUMNS))
-        with ThreadPoolExecutor(self._threads) as pool, open(self._path("strips", level), "ab") as out:
+        step = max(BLOCK, COLUMNS * _PIXEL // (rows.shape[0] * rows.itemsize) // BLOCK * BLOCK)
+        columns = (rows[:, :, first : first + step] for first in range(0, rows.shape[2], step))
+        with (
+            ThreadPoolExecutor(self._threads or usable_cores()) as pool,
+            open(self._path("strips", level), "ab") as out,
+        ):
             start, sizes, checksum = out.tell(), list[int](), 0
             for blocks in pool.map(partial(compressed, file=self._file), columns):
                 out.write(blocks.content)
