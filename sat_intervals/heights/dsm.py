@@ -15,6 +15,7 @@ from sat_intervals.heights.cells import Tally, strips
 from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
 from sat_intervals.heights.points import point_near_the_middle, triangulated
+from sat_intervals.machine import usable_cores
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Projection, is_surface, north_up, read_place, surface_file, utm_of
 from sat_intervals.results import Run
@@ -91,7 +92,7 @@ def make_surface(
     place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
     writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
     tally = Tally()
-    with writer, ThreadPoolExecutor() as threads:
+    with writer, ThreadPoolExecutor(usable_cores()) as threads:
         for row, strip in strips(threads, clouds, cells, radius, choices):
             tally.add(strip)
             writer.write(row, strip.bands)
