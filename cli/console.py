@@ -17,6 +17,7 @@ STAGES = {
     "pairs": "checking pairs",
     "pairs.files": "writing files of pairs",
     "subjects": "measuring pairs",
+    "levels": "matching at levels",
     "kernels": "preparing kernels (compiled once per machine, then about a second)",
     "range": "finding the search range",
     "images": "measuring images",

@@ -106,7 +106,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
     folder
         Where tiles are kept meanwhile; all workers must see it.
     progress
-        Called with the stages of `match_pair`, and ``subjects``.
+        Called with the stages of `match_pair`, or ``levels``, of one subject, and ``subjects`` of several.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
         connected(subjects[0].config.cluster, scratch) as client,
     ):
         for number, subject in enumerate(subjects):
-            one = progress if len(subjects) == 1 else partial(_of_all, progress, number, len(subjects))
+            one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
             found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
     check_unchanged()
@@ -137,9 +137,9 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
     return found
 
 
-def _of_all(progress: Progress, number: int, total: int, *_: object) -> None:
-    """Report the progress of one of several subjects."""
-    progress("subjects", number, total)
+def _of_all(progress: Progress, stage: str, number: int, total: int, *_: object) -> None:
+    """Report any progress of one of several subjects or batches of levels as theirs."""
+    progress(stage, number, total)
 
 
 def _of_subject(
@@ -153,10 +153,13 @@ def _of_subject(
         ]
         # several tiles of one job keep all workers busy; stores of all jobs at once would fill the disk
         batches = [jobs] if len(jobs[0].store.grid) == 1 else [[job] for job in jobs]
-        for batch in batches:
+        for number, batch in enumerate(batches):
+            step = progress
+            if in_blocks and len(batches) > 1:  # stages of each batch would begin again
+                step = partial(_of_all, progress, "levels", number, len(batches))
             for job in batch:
-                measure_images(client, job, progress)
-            for matched in match_jobs(client, batch, progress):
+                measure_images(client, job, step)
+            for matched in match_jobs(client, batch, step):
                 job = matched.job
                 check_failures(job, matched.failures)
                 gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)

@@ -44,6 +44,11 @@ def calibrated(folder, output, *options):
     return output.read_bytes()
 
 
+def begun(said, stage):
+    """How often a stage of a command's progress begins."""
+    return sum(line.startswith(f"{stage}: 0/") for line in said.splitlines())
+
+
 def settings_with(folder, **interval):
     low, high = json.loads((folder / "meta.json").read_text())["disparity"]
     return {"disparity": {"minimum": low, "maximum": high}, "interval": interval}
@@ -73,6 +78,8 @@ def test_calibrate__the_file_says_what_to_expect(scene):
 @pytest.mark.process
 def test_calibrate__workers_do_not_change_a_byte(scene, tmp_path):
     one = calibrated(scene, tmp_path / "one.yaml", "--tile-size", 64, "--workers", 1)
+    said = invoke("calibrate", scene, "--output", tmp_path / "one.yaml", "--name", "one", "--tile-size", 64).output
+    assert (begun(said, "matching at levels"), begun(said, "matching tiles")) == (1, 0)
     assert one == calibrated(scene, tmp_path / "two.yaml", "--tile-size", 64, "--workers", 2)
     assert one == calibrated(scene, tmp_path / "processes.yaml", "--tile-size", 64, "--cluster", "processes")
     assert len(list(tmp_path.iterdir())) == 3  # no tiles are left
