@@ -47,7 +47,7 @@ bench-seams: $(VENV)/.has-bench
 tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore tests/benchmarks/tune.py
 
-# The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; about half an hour.
+# The built-in calibrations, on the pairs of SAT_INTERVALS_SHARED; ten minutes of processor time.
 calibration: $(VENV)/.has-mccnn
 	$(BIN)/python tests/benchmarks/calibrations.py
 
