@@ -166,8 +166,8 @@ def gallery() -> str:
         if file:
             link = f"gallery-files/{file}"
             lines += [f"[![{title}]({link})]({link})" if file.endswith(".png") else f"[Open the page]({link})", ""]
-    for raster in (*folder.rglob("*.tif"), *folder.rglob("run.json")):
-        raster.unlink()
+    for file in [path for path in folder.rglob("*.*") if path.suffix not in (".png", ".html")]:
+        file.unlink()
     return "\n".join(lines)
 
 
