@@ -52,7 +52,8 @@ class RemoteFolder:
         """See `Folder`; all at once."""
         with self._reached("") as (system, root):
             paths = [root + name for name, _, _ in parts]
-            found = system.cat_ranges(paths, [start for _, start, _ in parts], [stop for *_, stop in parts])
+            starts, stops = [start for _, start, _ in parts], [stop for *_, stop in parts]
+            found = system.cat_ranges(paths, starts, stops, on_error="return")
         contents: list[bytes | None] = []
         for (name, start, stop), read in zip(parts, found, strict=True):
             if isinstance(read, Exception):  # missing, or shorter than `start`, which services refuse: now it is told
