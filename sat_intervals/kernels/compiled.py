@@ -7,6 +7,7 @@ only the file of a kernel, not the files of the kernels that it calls.
 import hashlib
 import os
 import threading
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -44,9 +45,30 @@ def cached(kernel):
     with _LOCK:
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         try:
-            return njit(nogil=True, cache=True)(kernel)
+            return _healing(njit(nogil=True, cache=True)(kernel))
         finally:
             config.CACHE_DIR = before
+
+
+def _healing(kernel):
+    """Let a kernel be compiled again if its cache is damaged, as after a power loss; numba would fail for good."""
+    cached = getattr(kernel, "_cache", None)
+    if cached is None:  # numba compiles nothing, with NUMBA_DISABLE_JIT
+        return kernel
+    load = cached.load_overload
+
+    def load_or_drop(*arguments):
+        try:
+            return load(*arguments)
+        except (OSError, MemoryError):
+            raise
+        except Exception:  # whatever unpickling damaged bytes raises
+            with suppress(OSError):  # then the next process compiles it again, too
+                cached.flush()
+            return None
+
+    cached.load_overload = load_or_drop
+    return kernel
 
 
 @cache

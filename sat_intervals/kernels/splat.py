@@ -96,11 +96,14 @@ def reaching(column, row, radius, rows, columns):
                     if filling:
                         points[starts[cell]] = n
                     starts[cell + (not filling)] += 1
+        # Loops: `cumsum` and a copy of slices would take seconds longer to compile.
         if filling:  # each start has moved to the next one
-            starts[1:] = starts[:-1].copy()
+            for cell in range(starts.size - 1, 0, -1):
+                starts[cell] = starts[cell - 1]
             starts[0] = 0
         else:
-            starts = np.cumsum(starts)
+            for cell in range(1, starts.size):
+                starts[cell] += starts[cell - 1]
             points = np.empty(starts[-1], np.int32)
     return starts, points
 
@@ -131,8 +134,12 @@ def cell_bounds(starts, points, height, lower, upper, middle, how):
                     best = n
             bounds[0, cell], bounds[1, cell] = lower[best], upper[best]
             continue
-        lows, ups = np.sort(lower[points[first:last]]), np.sort(upper[points[first:last]])
         count = last - first
+        lows, ups = np.empty(count, lower.dtype), np.empty(count, upper.dtype)
+        for n in range(count):
+            lows[n], ups[n] = lower[points[first + n]], upper[points[first + n]]
+        lows.sort()
+        ups.sort()
         if how == MEDIAN:
             bounds[0, cell] = (lows[(count - 1) // 2] + lows[count // 2]) / 2
             bounds[1, cell] = (ups[(count - 1) // 2] + ups[count // 2]) / 2

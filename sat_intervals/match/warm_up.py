@@ -13,8 +13,11 @@ from sat_intervals.match.postprocess import ConfidenceScale, RawRows, postproces
 from sat_intervals.tiling import View, Window
 
 
-def compile_kernels(config: Config) -> None:
-    """Compile every kernel that the settings need, by matching a few random pixels."""
+def compile_kernels(config: Config, *, hands_states_on: bool = True) -> None:
+    """Compile every kernel that the settings need, by matching a few random pixels.
+
+    ``hands_states_on``: whether tiles hand path states on, where the settings ask for it. A single tile does not.
+    """
     random = np.random.default_rng(0)
     search = config.disparity
     frame = Frame.of_whole(Window(0, 0, 4, 4))
@@ -28,7 +31,7 @@ def compile_kernels(config: Config) -> None:
     statistics = PairStatistics(ImageStatistics(0.5, 0.3), ImageStatistics(0.5, 0.3))
     views = left, right
     patch = match_patch(views, frame, config, statistics, ranges)
-    if config.hands_states_on:
+    if hands_states_on and config.hands_states_on:
         (cost,) = cost_areas(views, [frame_area(frame, config, ranges)], config, statistics)
         trace_area(cost, frame, borders_of(frame, config, [{} for _ in WAVEFRONTS]), 0, config, ranges)
     list(postprocess_strips([RawRows.of(patch.raw, patch.right)], ConfidenceScale(0.0, 1.0), config))

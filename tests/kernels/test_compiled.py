@@ -99,6 +99,19 @@ if __name__ == "__main__":
 
 
 @pytest.mark.process
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+@pytest.mark.parametrize("how", ["empty", "zeros", "short"])
+def test_cached__a_damaged_kernel_is_compiled_again(tmp_path, kind, how):
+    use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(tmp_path))
+    for file in tmp_path.rglob(f"*.{kind}"):
+        content = file.read_bytes()
+        file.write_bytes({"empty": b"", "zeros": bytes(len(content)), "short": content[: len(content) // 2]}[how])
+    again, after = (use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
+    assert again[:2] == ["0", "1"]
+    assert after[:2] == ["1", "0"]
+
+
+@pytest.mark.process
 def test_cached__functions_of_others_stay_out_of_its_folder(tmp_path):
     (tmp_path / "stranger.py").write_text(
         "from numba import njit\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"

@@ -38,8 +38,10 @@ def test_census__worked_example():
     assert reference.census(pixels, 3).sum(axis=2).tolist() == [[2, 1]]
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("window", WINDOWS)
+# float64 with codes of 8 bits and of 120: what it changes is the comparison of two pixels, whatever the window.
+@pytest.mark.parametrize(
+    ("window", "dtype"), [*((window, np.float32) for window in WINDOWS), (3, np.float64), (11, np.float64)]
+)
 @bounded
 @given(data=st.data())
 def test_census__distances_equal_reference(window, dtype, data):
@@ -94,14 +96,14 @@ def test_census__state_worked_example():
 
 @bounded
 @given(
-    pixels=hnp.arrays(np.float64, (9, 13), elements=GREY, fill=GREY),
+    pixels=hnp.arrays(np.float32, (9, 13), elements=GREY, fill=GREY),
     offset=st.integers(-1000, 1000),
     factor=st.sampled_from([0.25, 1, 3]),
     window=st.sampled_from(WINDOWS[:4]),
 )
 def test_census__unchanged_by_offset_and_gain(pixels, offset, factor, window):
     codes = census(pixels, usable(pixels), window)
-    changed = census(pixels * factor + offset, usable(pixels), window)
+    changed = census(pixels * np.float32(factor) + np.float32(offset), usable(pixels), window)
     np.testing.assert_array_equal(codes.words, changed.words)
 
 

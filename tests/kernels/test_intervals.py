@@ -394,7 +394,8 @@ def view(image, state, window):
     """An image in a window that may go beyond it."""
     margin = 200
     there = window.relative_to(Window(-margin, -margin, 0, 0)).slices
-    return View(window, np.pad(image, margin)[there], np.pad(state, margin, constant_values=NO_DATA)[there])
+    image, state = np.pad(image, margin)[there], np.pad(state, margin, constant_values=NO_DATA)[there]
+    return View(window, image.copy(), state.copy())  # contiguous, as those that are read
 
 
 def check(bands, validity, expected, config):
