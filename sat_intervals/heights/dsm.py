@@ -17,7 +17,16 @@ from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
 from sat_intervals.heights.points import point_near_the_middle, triangulated
 from sat_intervals.machine import usable_cores
 from sat_intervals.progress import Progress
-from sat_intervals.raster import OutputWriter, Projection, is_surface, north_up, read_place, surface_file, utm_of
+from sat_intervals.raster import (
+    OutputWriter,
+    Projection,
+    is_surface,
+    north_up,
+    read_place,
+    surface_file,
+    utm_of,
+    watched_rasters,
+)
 from sat_intervals.results import Run
 from sat_intervals.tiling import Window
 
@@ -77,11 +86,11 @@ def make_surface(
         A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
-    like = resolution if isinstance(resolution, Path) else None
+    inputs = [*(Path(out) / "points.tif" for out in outs), geoid, resolution if isinstance(resolution, Path) else None]
+    check_unchanged = watched_rasters(inputs)
     grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius)
-    runs = triangulated([Path(out) for out in outs])
-    for run in runs:
-        run.check_kept([path], [run.out / "points.tif", geoid, like])
+    for run in (runs := triangulated([Path(out) for out in outs])):
+        run.check_kept([path], inputs)
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
@@ -97,13 +106,13 @@ def make_surface(
             tally.add(strip)
             writer.write(row, strip.bands)
             progress("cells", row + strip.bands.shape[1], cells.rows)
+        check_unchanged()
         progress("files", 0, 1)
         writer.publish()
         progress("files", 1, 1)
     return {
         "crs": projection.crs,
-        "rows": cells.rows,
-        "columns": cells.columns,
+        **{name: getattr(cells, name) for name in ("rows", "columns")},
         **{name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")},
         **tally.report(cells.rows * cells.columns),
         "bounds": choices.bounds,

@@ -119,9 +119,9 @@ def make_truth(
     path = run.out / "truth.tif" if path is None else path
     check_made_by(path, "reference", "REFERENCE")
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
+    check_unchanged = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])
     if registers:
         triangulated([run.out])
-    check_unchanged = watched_rasters([reference.path, run.out / "points.tif"])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))

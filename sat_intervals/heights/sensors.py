@@ -12,7 +12,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.grids import read_grid
 from sat_intervals.kernels.lattice import interpolate
-from sat_intervals.raster import Georeferencing
+from sat_intervals.raster import Georeferencing, watched_rasters
 from sat_intervals.tiling import Window
 
 try:
@@ -79,12 +79,15 @@ class Sensors:
         Raises
         ------
         SatIntervalsError
-            A file is missing or has another content.
+            A file is missing, has another content, or was replaced meanwhile.
         """
+        check_unchanged = watched_rasters([left_model, right_model, left_grid, right_grid])
         models = (_read(path, "RPC model", GeoModel) for path in (left_model, right_model))
         read = partial(read_grid, left=left or Georeferencing())
         grids = (_read(path, "epipolar grid", read) for path in (left_grid, right_grid))
-        return cls(*models, *grids)
+        sensors = cls(*models, *grids)
+        check_unchanged()
+        return sensors
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions, see `Points`.

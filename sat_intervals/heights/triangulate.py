@@ -93,9 +93,10 @@ def triangulate(
 def _check_own(out: Path) -> None:
     """Raise if ``points.tif`` or ``points.json`` exists and was not made by this tool."""
     path = out / POINTS_FILE
-    if published_points(out) is None and os.path.lexists(path):
+    published_points(out)  # raises for a points.json of others
+    if os.path.lexists(path):
         try:
-            is_own = "RUN" in read_tags(path)
+            is_own = "LEFT_MODEL" in read_tags(path)
         except SatIntervalsError:
             is_own = False
         if not is_own:

@@ -16,6 +16,7 @@ from sat_intervals.products import SURFACE
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
+from sat_intervals.raster.seal import check_seal
 from sat_intervals.tiling import Window
 
 
@@ -34,9 +35,10 @@ def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
     Raises
     ------
     SatIntervalsError
-        It has no CRS or is not north up.
+        It has no CRS, is not north up, or is damaged.
     """
     with opened(str(path)) as dataset:
+        check_seal(path, dataset.files)
         place = Georeferencing.of(dataset)
         if place.crs is None or place.transform is None or place.transform.b or place.transform.d:
             raise SatIntervalsError(f"{path} has no CRS or is not north up: give a north-up raster with a CRS")

@@ -12,6 +12,7 @@ from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_height_calibration
+from sat_intervals.evaluate import calibration
 from sat_intervals.evaluate.calibration import calibrate_surface
 
 TAGS = {
@@ -250,3 +251,18 @@ def test_load_height_calibration__what_it_cannot_use_is_one_line(tmp_path):
     assert invoke("match", "a", "b", tmp_path, "--coverage", 0.9, "--calibration", file).stderr.count(
         "is a calibration of heights: give it to dsm --calibration"
     )
+
+
+def test_calibrate_dsm_command__keeps_a_file_that_appears_meanwhile(tmp_path, monkeypatch):
+    model, reference = scene(tmp_path)
+    output = tmp_path / "heights.yaml"
+
+    def slow(*files, **options):
+        output.write_text("mine")
+        return calibrate_surface(*files, **options)
+
+    monkeypatch.setattr(calibration, "calibrate_surface", slow)
+    done = invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
+    assert done.exit_code == 2
+    assert f"{output} exists and was not made by sat-intervals calibrate: move it away" in done.stderr
+    assert output.read_text() == "mine"

@@ -19,6 +19,7 @@ from sat_intervals import SatIntervalsError
 from sat_intervals.config import load_calibration, load_height_calibration
 from sat_intervals.errors import RunError
 from sat_intervals.heights import cells
+from sat_intervals.heights import dsm as of_dsm
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
@@ -153,6 +154,24 @@ def test_make_surface__ends_where_points_are_replaced_meanwhile(tmp_path, monkey
 
     with pytest.raises(RunError, match=r"points.tif was replaced or changed while it was read: rerun the command"):
         surface_of([out], tmp_path, progress=replace)
+    assert not (tmp_path / "dsm.tif").exists()
+
+
+@pytest.mark.parametrize("name", ["points.tif", "geoid.tif"])
+def test_make_surface__ends_where_points_or_geoid_are_replaced_after_their_check(tmp_path, monkeypatch, name):
+    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
+    file = (out if name == "points.tif" else tmp_path) / name
+    triangulated = of_dsm.triangulated
+
+    def replacing(outs):
+        runs = triangulated(outs)
+        shutil.copy(file, tmp_path / "new.tif")
+        (tmp_path / "new.tif").replace(file)
+        return runs
+
+    monkeypatch.setattr(of_dsm, "triangulated", replacing)
+    with pytest.raises(RunError, match=rf"{name} was replaced or changed while it was read: rerun the command"):
+        surface_of([out], tmp_path, geoid=write_geoid(tmp_path / "geoid.tif", 49.5))
     assert not (tmp_path / "dsm.tif").exists()
 
 

@@ -2,7 +2,9 @@
 
 import csv
 import json
+import shutil
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +15,14 @@ from helpers import invoke, write_pair
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
-from sat_intervals import SatIntervalsError, match_pair
+from sat_intervals import RunError, SatIntervalsError, match_pair
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.tiling import Window
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
+    from sat_intervals.heights import sensors as of_sensors
     from sat_intervals.heights.sensors import Lattice, Sensors
     from sat_intervals.heights.triangulate import triangulate
 
@@ -347,8 +350,49 @@ def test_triangulate__keeps_foreign_points(level_run):
         assert path.read_bytes() == content
     path.unlink()
     triangulate(out, *files)
+    for content in foreign:
+        path.write_bytes(content)  # beside the report of the points
+        with pytest.raises(SatIntervalsError, match=r"points.tif exists and was not made by triangulate"):
+            triangulate(out, *files)
+        assert path.read_bytes() == content
+    path.unlink()
+    triangulate(out, *files)
     (out / "points.json").unlink()  # of an earlier version
     triangulate(out, *files)
+
+
+@pytest.mark.parametrize("place", range(4))
+def test_triangulate__ends_where_a_model_or_grid_is_replaced_meanwhile(level_run, monkeypatch, place):
+    out, files = level_run
+    read_grid = of_sensors.read_grid
+
+    def replacing(path, **options):
+        found = read_grid(path, **options)
+        if Path(path) == files[3]:  # the last that is read
+            shutil.copy(files[place], out / "copy")
+            (out / "copy").replace(files[place])
+        return found
+
+    monkeypatch.setattr(of_sensors, "read_grid", replacing)
+    with pytest.raises(RunError, match=rf"{files[place].name} was replaced or changed while it was read: rerun"):
+        triangulate(out, *files)
+    assert not (out / "points.tif").exists()
+
+
+@pytest.mark.parametrize("name", ["intervals.tif", "validity.tif"])
+def test_triangulate__ends_where_a_raster_of_the_run_is_replaced_meanwhile(level_run, monkeypatch, name):
+    out, files = level_run
+    load = Sensors.load
+
+    def replacing(*arguments, **options):
+        shutil.copy(out / name, out / "copy")
+        (out / "copy").replace(out / name)
+        return load(*arguments, **options)
+
+    monkeypatch.setattr(Sensors, "load", replacing)
+    with pytest.raises(RunError, match=r"the run in .* was replaced while it was read: rerun the command"):
+        triangulate(out, *files)
+    assert not (out / "points.tif").exists()
 
 
 def test_triangulate_command__needs_a_run(tmp_path):

@@ -1,0 +1,82 @@
+"""Keep the CRC-32 of a GeoTIFF in its ghost area, where GDAL ignores the lines that it does not know.
+
+Tools that make another file of it copy its tags, but not this area. Files beside it, which GDAL reads too, are refused.
+"""
+
+import os
+import re
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from sat_intervals.errors import SatIntervalsError
+
+_SIZE = re.compile(rb"GDAL_STRUCTURAL_METADATA_SIZE=(\d{6}) bytes\n")
+# An even number of bytes: directories begin at even places.
+_LINE, _ZEROS = b"SAT_INTERVALS_CRC_32=", b"00000000"
+_SEAL = re.compile(_LINE + rb"([0-9a-f]{8})\n")
+# Bytes of a file among which the line is.
+_BEGINNING = 1024
+# Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes.
+_STATISTICS = {
+    *("PAMDataset", "PAMRasterBand", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax", "BucketCount"),
+    *("IncludeOutOfRange", "Approximate", "HistCounts"),
+}
+
+
+def with_room(ghost: bytes) -> bytes:
+    """Return a ghost area with a line for a CRC-32, which is 0."""
+    size = _SIZE.match(ghost)
+    assert size
+    line = _LINE + _ZEROS + b"\n"
+    return b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % (int(size[1]) + len(line)) + line + ghost[size.end() :]
+
+
+def sealed(head: bytes, checksum: int) -> bytes:
+    """Return the beginning of a file with its CRC-32, which is that of the file `with_room`."""
+    return head.replace(_LINE + _ZEROS, _LINE + b"%08x" % checksum, 1)
+
+
+def check_seal(path: str | Path, files: Iterable[str]) -> None:
+    """Raise if the bytes of a file differ from the CRC-32 in it; one without a CRC-32, or not local, passes.
+
+    GDAL decodes most flipped bits of a compressed block without an error. ``files``: see `check_beside`.
+
+    Raises
+    ------
+    SatIntervalsError
+        Names the file and both checksums, or a file beside it.
+    """
+    if not os.path.isfile(path):
+        return
+    with open(path, "rb") as stream:
+        beginning = stream.read(_BEGINNING)
+        if not (seal := _SEAL.search(beginning)):
+            return
+        checksum = zlib.crc32(beginning[: seal.start(1)] + _ZEROS + beginning[seal.end(1) :])
+        while block := stream.read(1 << 20):
+            checksum = zlib.crc32(block, checksum)
+    if checksum != int(seal[1], 16):
+        raise SatIntervalsError(
+            f"{path} is damaged or was changed: its CRC-32 is {checksum:08x}, but {seal[1].decode()} was written: make "
+            "it again, or copy it with gdal_translate if you changed it"
+        )
+    check_beside(path, files)
+
+
+def check_beside(path: str | Path, files: Iterable[str]) -> None:
+    """Raise if GDAL reads one of our rasters from more ``files``: masks, overviews, or more than statistics.
+
+    Raises
+    ------
+    SatIntervalsError
+        Names the first such file.
+    """
+    for file in files:
+        if Path(file) != Path(path) and not (file.endswith(".aux.xml") and _has_statistics_only(Path(file))):
+            raise SatIntervalsError(f"{file} changes what is read from {path}: move it away")
+
+
+def _has_statistics_only(file: Path) -> bool:
+    text = file.read_text(encoding="utf-8", errors="replace")
+    return set(re.findall(r"<(\w+)", text)) <= _STATISTICS and text.count("<MDI") == text.count('<MDI key="STATISTICS_')
