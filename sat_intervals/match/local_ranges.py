@@ -3,11 +3,13 @@
 import base64
 import zlib
 from dataclasses import dataclass
+from operator import index
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Config, MccnnSgm
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.tiling import Window
 
@@ -72,11 +74,20 @@ class LocalRanges:
 
     @classmethod
     def of_report(cls, report: dict[str, Any]) -> "LocalRanges":
-        """Read the mapping that `report` makes."""
-        shape = report["rows"], report["columns"]
-        bounds = (zlib.decompress(base64.b64decode(report[name])) for name in ("minimum", "maximum"))
-        minimum, maximum = (np.frombuffer(bound, "<i2").astype(np.int16).reshape(shape) for bound in bounds)
-        return cls(minimum, maximum, report["height"], report["width"])
+        """Read the mapping that `report` makes.
+
+        Raises
+        ------
+        SatIntervalsError
+            It is damaged.
+        """
+        try:
+            rows, columns, *sides = (index(report[name]) for name in ("rows", "columns", "height", "width"))
+            bounds = (zlib.decompress(base64.b64decode(report[name])) for name in ("minimum", "maximum"))
+            minimum, maximum = (np.frombuffer(bound, "<i2").astype(np.int16).reshape(rows, columns) for bound in bounds)
+        except (ValueError, LookupError, TypeError, zlib.error) as error:
+            raise SatIntervalsError("the local ranges of the run are damaged: rerun match with --overwrite") from error
+        return cls(minimum, maximum, *sides)
 
     @property
     def share(self) -> float:

@@ -1,6 +1,7 @@
 """Read any window of an image, with the states of its pixels."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from rasterio.windows import Window as RasterioWindow
@@ -40,7 +41,7 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
         Pixels cannot be read, as in a truncated file; names the file, rows and columns.
     """
     inside = window.clipped(Window(0, 0, image.height, image.width))
-    pixels = np.zeros((window.height, window.width), np.float32 if image.dtype in _FLOAT32_HOLDS else np.float64)
+    pixels = np.zeros((window.height, window.width), _pixel_type(image))
     state = np.full(pixels.shape, NO_DATA, np.uint8)
     if inside.height and inside.width:
         place = inside.relative_to(window).slices
@@ -52,6 +53,20 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
         if unusable.any():
             pixels[place][unusable] = 0
     return pixels, state
+
+
+def _pixel_type(image: Image) -> type[np.floating[Any]]:
+    return np.float32 if image.dtype in _FLOAT32_HOLDS else np.float64
+
+
+def kept_view(image: Image, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of a view in the file's type, which holds them, and the states, empty if all are usable."""
+    return view.pixels.astype(image.dtype), view.state if view.state.any() else view.state[:0]
+
+
+def restored_view(image: Image, window: Window, pixels: np.ndarray, state: np.ndarray) -> View:
+    """Return the view of a window that `kept_view` took apart."""
+    return View(window, pixels.astype(_pixel_type(image)), state if state.size else np.zeros(pixels.shape, np.uint8))
 
 
 def _check_exact(path: str, values: np.ndarray, usable: np.ndarray) -> None:

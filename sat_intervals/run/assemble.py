@@ -12,11 +12,12 @@ from importlib.metadata import version
 from typing import Any
 
 from sat_intervals.config import Config, calibration_of
-from sat_intervals.errors import RunError
+from sat_intervals.errors import RemovedTilesError, RunError
 from sat_intervals.match.postprocess import ConfidenceScale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
+from sat_intervals.raster.identity import differing
 from sat_intervals.run.copying import assemble_files
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
@@ -85,6 +86,8 @@ def assemble(
             job.check_inputs()
             steps = len(files) * len(parts)
             progress("files", steps, steps)  # a last chance to interrupt the run before it publishes
+        with logged_stage(seconds, "inputs"):
+            _check_content(job)
         _add_seconds(seconds, records)
         report = _report(job, records, scale, parts.values(), seconds, writer.build())
         for line in report["warnings"]:
@@ -92,6 +95,18 @@ def assemble(
         _publish(job, writer, report, keep_tiles=keep_tiles)
         progress("files", steps, steps)
     return report
+
+
+def _check_content(job: Job) -> None:
+    """Raise if the content of an input differs. If its times do not, no tile can be trusted: all are removed."""
+    name = differing(job.files)
+    if name is not None:
+        job.check_inputs()
+        job.store.remove()
+        raise RemovedTilesError(
+            f"{name} was changed during the run, though its times were not, as with a memory map: the tiles of the run "
+            "are deleted: rerun the command when the file is complete"
+        )
 
 
 def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> None:
@@ -180,7 +195,7 @@ def _report(
     counts = _counts(config, parts)
     quality = quality_of(job, records)
     return {
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "finished": datetime.now(UTC).isoformat(timespec="microseconds"),  # tells runs apart
         "settings": config.model_dump(mode="json"),
         "requested": {"disparity": job.requested},
         "search": job.found and job.found.report(),

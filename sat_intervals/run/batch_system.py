@@ -12,6 +12,7 @@ from distributed import Client, Status
 
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.run.workers import readers
 
 # Seconds after the last worker of a batch system left, at which a run ends.
 WORKERS_GONE = 300.0
@@ -65,6 +66,9 @@ def _given(settings: Cluster, own_logs: str | None, logs: Path) -> dict[str, Any
             f"cluster {settings.kind} needs the memory of a job: set cluster.memory, such as 4GB, or "
             f"jobqueue.{settings.kind}.memory of dask's configuration"
         )
+    if more := readers(settings):
+        own = dask.config.get(f"jobqueue.{settings.kind}.worker-extra-args", None) or []
+        options["worker_extra_args"] = [*own, "--nthreads", str(settings.cores + more)]
     given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
     if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
         given["scheduler_options"] = {"dashboard_address": f"{LOOPBACK}:0"}

@@ -5,6 +5,7 @@ import logging
 import signal
 import socket
 import threading
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -12,7 +13,8 @@ from functools import partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 
-from distributed import Client, LocalCluster, Worker, WorkerPlugin
+import dask
+from distributed import Client, LocalCluster, Nanny, Status, Worker, WorkerPlugin
 from distributed.comm.addressing import resolve_address
 from distributed.utils import silence_logging_cmgr
 
@@ -20,12 +22,15 @@ from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import LOOPBACK, batch_system
+from sat_intervals.run.workers import readers
 
 # Seconds for local worker processes to start.
 STARTING = 120.0
 # Seconds without an answer of a scheduler before a warning.
 _WARN_AFTER = 3.0
 _LOOPBACK_TIMEOUT = 5.0
+# What dask watches of itself, for dashboards. By default it takes 2 % of a core in each process.
+_WATCHING = {"distributed.admin.tick.interval": "1s", "distributed.worker.profile.enabled": False}
 
 _LOG = logging.getLogger(__name__)
 
@@ -42,7 +47,7 @@ def connected(settings: Cluster, out: Path) -> Iterator[Client]:
     SatIntervalsError
         A scheduler does not answer, or the extra for batch systems is not installed.
     """
-    with _asyncio_timeouts_hidden(), _client(settings, out) as client:
+    with dask.config.set(_WATCHING), _asyncio_timeouts_hidden(), _client(settings, out) as client:
         _LOG.info("connected to %s", client)
         is_debug = logging.getLogger("sat_intervals").isEnabledFor(logging.DEBUG)
         is_debug = is_debug and settings.kind != "address"  # the user's own workers
@@ -120,8 +125,24 @@ def _client_of(address: str) -> Client:
         warning.cancel()
 
 
+class _Nanny(Nanny):
+    """Starts a worker process, and says how it ended if it never worked."""
+
+    _ended: int | None = None
+
+    def _on_worker_exit_sync(self, exitcode: int) -> None:
+        self._ended = exitcode
+        super()._on_worker_exit_sync(exitcode)  # type: ignore[no-untyped-call]
+
+    async def instantiate(self) -> Status:
+        status = await super().instantiate()
+        if status != Status.running and self._ended is not None:
+            raise RuntimeError(f"a worker process ended at once, with exit status {self._ended}")
+        return status
+
+
 def _local(settings: Cluster) -> LocalCluster:
-    workers = settings.workers or usable_cores()
+    workers, start = settings.workers or usable_cores(), time.monotonic()
     _check_loopback()
     with warnings.catch_warnings():
         # no network is needed
@@ -129,8 +150,8 @@ def _local(settings: Cluster) -> LocalCluster:
         try:
             return LocalCluster(
                 n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
+                threads_per_worker=1 + readers(settings),
+                worker_class=_Nanny,
                 host=LOOPBACK,
                 dashboard_address=f"{LOOPBACK}:0",
                 worker_dashboard_address=f"{LOOPBACK}:0",
@@ -141,10 +162,11 @@ def _local(settings: Cluster) -> LocalCluster:
             cause: BaseException = error
             while cause.__cause__ is not None:
                 cause = cause.__cause__
-            why = " ".join(str(cause).split()) or type(cause).__name__
+            late = f"not within {STARTING:.0f} s" if time.monotonic() - start > STARTING else ""
+            why = late or " ".join(str(cause).split()) or type(cause).__name__
             raise RunError(
-                f"the {workers} worker processes did not start within {STARTING:.0f} s ({why}): give fewer --workers, "
-                "more room in /dev/shm or another DASK_TEMPORARY_DIRECTORY, or use --cluster threads"
+                f"the {workers} worker processes did not start ({why}): give fewer --workers, more room in "
+                "/dev/shm or another DASK_TEMPORARY_DIRECTORY, or use --cluster threads"
             ) from error
 
 

@@ -14,7 +14,7 @@ from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.mccnn import load_network
-from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
+from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes, waiting_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import (
@@ -36,7 +36,7 @@ from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
 from sat_intervals.run.parts import codecs_of, parts_of, rows_of_levels
 from sat_intervals.run.schedule import blocks_of, handed_bytes
-from sat_intervals.run.workers import parse_memory
+from sat_intervals.run.workers import parse_memory, readers
 from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
@@ -133,7 +133,7 @@ class Job:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
             self.store.write_search(search, _origin(self.inputs))
         if waiting := self.waiting():
-            self.store.steps.check_space(handed_bytes(self.store.grid, self.config))
+            self.store.steps.check_space(self._handed_bytes())
         if self.has_files:
             self.check_space(waiting, len(self.parts().done()))
 
@@ -162,7 +162,7 @@ class Job:
         share = 1 - parts / sum(rows_of_levels(region))
         before = self.store.stored_bytes(tiles) + round(share * part_bytes(files, region.height, region.width))
         if tiles:
-            before += self.store.steps.missing_bytes(handed_bytes(self.store.grid, self.config))
+            before += self.store.steps.missing_bytes(self._handed_bytes())
         if self.store.elsewhere is None:
             check_space(self.out, before + final, "tiles, files and their parts")
             return
@@ -170,6 +170,9 @@ class Job:
         place = self.store.folder.place("")
         if isinstance(place, Path):
             check_space(place, before, "tiles and parts of files")
+
+    def _handed_bytes(self) -> int:
+        return handed_bytes(self.store.grid, self.config, (self.left, self.right))
 
     def check_inputs(self) -> None:
         """Raise if an input changed since the start of the run, or this process has other weights.
@@ -334,13 +337,15 @@ def fitted_to_jobs(config: Config) -> Config:
     ConfigError
         See `fitted` and `parse_memory`.
     """
-    memory = _job_bytes(config)
-    return config if memory is None or config.disparity.is_auto else fitted(config, memory, config.cluster.cores)
+    memory = None if config.disparity.is_auto else _job_bytes(config)
+    return config if memory is None else fitted(config, memory, config.cluster.cores)
 
 
 def _job_bytes(config: Config) -> int | None:
-    """Return the usable memory of a job of a batch system: dask kills workers at 95 %."""
-    return None if config.cluster.memory is None else 9 * parse_memory(config.cluster.memory) // 10
+    """Return the memory of a job of a batch system for the tiles being matched: dask kills workers at 95 %."""
+    if config.cluster.memory is None:
+        return None
+    return 9 * parse_memory(config.cluster.memory) // 10 - readers(config.cluster) * waiting_bytes(config)
 
 
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:

@@ -9,7 +9,7 @@ from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
-from sat_intervals.raster import Image, check_marked, open_image, other_files, read_shape, read_window, write_rows
+from sat_intervals.raster import Image, check_made_by, open_image, other_files, read_shape, read_window, write_rows
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.tiling import Window
 
@@ -17,6 +17,8 @@ from sat_intervals.tiling import Window
 _CELL = 64
 # Minimum and maximum.
 _BANDS = 2
+# Tag of the rasters that `write_ranges` may replace: the image.
+_OF = "RANGES_OF"
 # Rows written at a time.
 _STRIP = 256
 
@@ -60,9 +62,7 @@ def check_replaceable(path: Path, left: Image, right: Image) -> None:
     """
     names = [name for image in (left, right) for name in (image.path, image.mask) if name]
     check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
-    check_marked(path)
-    if path.is_file() and not path.is_symlink() and read_shape(path)[0] != _BANDS:
-        raise SatIntervalsError(f"{path} exists and has no local ranges: choose another --output")
+    check_made_by(path, "range", _OF)
 
 
 def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
@@ -71,7 +71,7 @@ def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
         np.stack(ranges.at(Window(row, 0, min(_STRIP, left.height - row), left.width)))
         for row in range(0, left.height, _STRIP)
     )
-    write_rows(path, rows, (_BANDS, left.height, left.width), left.georeferencing)
+    write_rows(path, rows, (_BANDS, left.height, left.width), left.georeferencing, {_OF: left.path})
 
 
 def read_ranges(path: str, left: Image) -> LocalRanges:

@@ -119,7 +119,7 @@ def _match_pair(
         job.begin(overwrite=overwrite)
         with logged_stage(seconds, "kernels"):
             progress("kernels", 0, 1)
-            compile_kernels(job.config)
+            compile_kernels(job.config, hands_states_on=job.hands_states_on)
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
             match()
@@ -255,7 +255,7 @@ def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iter
         progress("tiles", done, total)
         if not schedules[i]:
             if not matched[i].failures:
-                jobs[i].store.steps.drop_costs()
+                jobs[i].store.steps.drop_sources()
             yield matched[i]
     assert not any(schedules)  # else steps would wait for each other
 

@@ -1,24 +1,30 @@
 """Plan a run: tiles, work, memory, disk, and the time estimated from a sample."""
 
+import logging
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from sat_intervals.config import Cluster, Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.machine import usable_cores, usable_memory
 from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
 from sat_intervals.match.patch import Frame, path_window
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes, run_files
+from sat_intervals.run import assemble
 from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
-from sat_intervals.run.workers import readers, reason, tiles_at_once
+from sat_intervals.run.workers import cores_of_process, readers, reason, tiles_at_once
 from sat_intervals.store.zarr_arrays import STORED_BYTES
 from sat_intervals.tiling import Grid, Window
 
@@ -107,7 +113,7 @@ def plan(
     compile_kernels(config)
     seconds, extra = _expected(left, right, config, workers, grid)
     pixels, files = region.height * region.width, run_files(config.products.compression)
-    together = {"threads": workers, "processes": 1, "address": 1}.get(config.cluster.kind, config.cluster.cores)
+    together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
     task = max(tile_bytes(config), strip_bytes(*strip, config.products.compression))
     return Plan(
         tile_size=config.tiles.size,
@@ -120,7 +126,7 @@ def plan(
         disk_bytes=pixels * (STORED_BYTES + 2 * config.subpixel_levels)
         + part_bytes(files, region.height, region.width)
         + file_bytes(files, region.height, region.width)
-        + handed_bytes(grid, config),
+        + handed_bytes(grid, config, (left, right)),
         seconds=seconds,
     )
 
@@ -165,31 +171,57 @@ def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
 
 
 def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
-    """Estimate the seconds of a run from a sample, and its extra work: tiles scaled by work, the rest by pixels."""
+    """Estimate the seconds of a run from a sample, and its extra work: tiles scaled by work, the rest by pixels.
+
+    As many samples at once as this machine has workers slow each other as these will.
+    """
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
     shape = SAMPLE, SAMPLE
     if config.hands_states_on:  # two tiles, since the sample needs a seam; whole ones, since each takes time of its own
         size = min(SAMPLE if config.cost.precomputed else 2 * SAMPLE, config.tiles.size)
         one = one.model_copy(update={"tiles": config.tiles.model_copy(update={"size": size})})
         shape = size, 2 * size
-    with tempfile.TemporaryDirectory() as folder:
-        window, seconds = _sampled(left, right, Path(folder) / "sample", one, grid.region, shape)
+    local = workers if config.cluster.kind in ("threads", "processes") else cores_of_process(config.cluster)
+    fitting = usable_memory() // (PROCESS_BYTES + tile_bytes(one))
+    together = range(max(1, min(local, usable_cores(), fitting)))
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(len(together)) as threads, _warned_once():
+        outs = [Path(folder) / f"sample{i}" for i in together]
+        samples = list(threads.map(lambda out: _sampled(left, right, out, one, grid.region, shape), outs))
+    window = samples[0][0]
+    seconds = {stage: fmean(each[stage] for _, each in samples) for stage in samples[0][1]}
     sample = Grid(window, one.tiles.size)
     pixels, sampled = (there.height * there.width for there in (grid.region, window))
     whole = Window(0, 0, left.height, left.width)
     work = _work(grid, whole, config)
-    of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "costs", "match", "write"))
+    of_tiles = sum(seconds.get(f"tiles.{stage}", 0.0) for stage in ("read", "pixels", "costs", "match", "write"))
     tiles = of_tiles * work / _work(sample, whole, one)
     # Of two tiles the first one's states of the last wavefront are traced, too: no tile is ready before.
     traced = max(1, 4 * _traced(sample, whole, one) // 3)
     paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
     strips = seconds["bands"] * pixels / sampled / min(workers, -(-grid.region.height // BLOCK))
     files = seconds["files"] * pixels / sampled
-    images = seconds["tiles.images"]  # the sample already measures whole images
+    images = seconds["tiles.images"] + seconds["inputs"]  # the sample already reads whole images
     blocks = blocks_of(grid, config)
     parallel = time_of(blocks, min(workers, len(grid)), paths / max(1, 3 * len(blocks)), tiles / len(blocks))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
     return float(seconds["start"] + seconds["kernels"] + images + parallel + strips + files), extra
+
+
+@contextmanager
+def _warned_once() -> Iterator[None]:
+    """Drop a warning that another sample has given, all being of the same window."""
+    logger, given = logging.getLogger(assemble.__name__), set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        is_given = record.getMessage() in given
+        given.add(record.getMessage())
+        return not is_given
+
+    logger.addFilter(is_new)
+    try:
+        yield
+    finally:
+        logger.removeFilter(is_new)
 
 
 def _sampled(

@@ -15,6 +15,8 @@ from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS
 from sat_intervals.match.borders import sources
 from sat_intervals.match.memory import tiles_together
+from sat_intervals.raster import Image
+from sat_intervals.run.workers import is_remote
 from sat_intervals.tiling import Grid, Tile
 
 # Blocks along each side of the grid, at least, if there are as many tiles: for several workers.
@@ -165,12 +167,21 @@ def time_of(blocks: Grid, workers: int, trace: float, match: float) -> float:
     return now
 
 
-def handed_bytes(grid: Grid, config: Config) -> int:
-    """Return the bytes that steps hand to each other: path states on the tiles' borders, and precomputed costs."""
+def handed_bytes(grid: Grid, config: Config, images: Iterable[Image]) -> int:
+    """Return the bytes, at most, that steps hand to each other: path states on borders, pixels, precomputed costs."""
     if not config.hands_states_on or len(grid) == 1:
         return 0
-    height, width = grid.region.height, grid.region.width
+    height, width, count = grid.region.height, grid.region.width, config.disparity.count
+    views = 1 + config.matches_right_view
     lines = grid.columns * height + grid.rows * width
-    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(config.disparity.count) * np.dtype(np.uint16).itemsize
-    costs = config.cost.precomputed * height * width * config.disparity.count
-    return (1 + config.matches_right_view) * (states + costs)
+    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(count) * np.dtype(np.uint16).itemsize
+    costs = config.cost.precomputed * height * width * count
+    kept = 0
+    if not is_remote(config.cluster):
+        blocks, support = blocks_of(grid, config), 2 * config.tiles.support
+        around = 2 * (config.cost.window // 2 + 1)
+        for image in images:
+            rows = min(image.height, height + support) + blocks.rows * around
+            columns = min(image.width, width + support) + blocks.columns * (around + views * count)
+            kept += rows * columns * (np.dtype(image.dtype).itemsize + 1)  # with its state
+    return views * (states + costs) + kept

@@ -3,38 +3,36 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels.confidence import ambiguity_histogram
-from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.borders import Border, Place, borders_of, in_order, rehulled, sources, trace_area
 from sat_intervals.match.local_ranges import LocalRanges, narrowed
-from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
-from sat_intervals.match.normalization import Moments, PairStatistics, moments
+from sat_intervals.match.normalization import Moments, moments
 from sat_intervals.match.patch import (
     Frame,
     Patch,
     frame_area,
     frames_of,
     match_costed,
-    patch_areas,
     path_window,
 )
 from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
-from sat_intervals.raster import Image, read_views, read_window
+from sat_intervals.raster import Image, read_window
 from sat_intervals.raster.identity import check_unchanged
 from sat_intervals.run.job import Job
 from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
+from sat_intervals.run.source import Source, costed, frame_of, read_source
 from sat_intervals.run.workers import computing
-from sat_intervals.store.removal import BORDERS, COSTS
-from sat_intervals.tiling import Tile, Views, Window, hull
+from sat_intervals.store.removal import BORDERS
+from sat_intervals.tiling import Tile, Views, Window
 
 # Tiles along each side of the grid, at most, in which the quality of a pair is looked at.
 _LOOKS = 4
@@ -85,7 +83,7 @@ def _match_block(job: Job, block: Tile) -> None:
     tiles, ranges = job.store.grid.within(block.core), job.ranges()
     for tile in tiles:
         job.store.check_space(tile)
-    source = _read(job, tiles, ranges, read)
+    source = read_source(job, block, ranges, read)
     handed: list[Handed] = []
     if job.hands_states_on:
         with timed(read, "read"):
@@ -102,13 +100,13 @@ def _match_block(job: Job, block: Tile) -> None:
 
 
 def _match_tile(
-    job: Job, tile: Tile, source: "_Source", handed: list[Handed], ranges: LocalRanges | None, seconds: dict[str, float]
+    job: Job, tile: Tile, source: Source, handed: list[Handed], ranges: LocalRanges | None, seconds: dict[str, float]
 ) -> None:
     """Match a tile and write its products; add the states of the last wavefront that it hands on to ``handed``."""
     with computing(job.config.cluster):
-        views, costs = _costed(job, tile, source, ranges, seconds)
+        views, costs = costed(job, tile, source, ranges, seconds)
         seconds["match"] = seconds.get("match", 0.0) + seconds.pop("costs", 0.0)
-        frame, borders = _frame(job, tile), None
+        frame, borders = frame_of(job, tile), None
         with timed(seconds, "match"):
             if job.hands_states_on:
                 borders = [_borders(job, tile, view, handed, ranges) for view in range(len(costs))]
@@ -139,11 +137,11 @@ def _trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
     seconds: dict[str, float] = {}
     with timed(seconds, "trace"):
         tiles, ranges = job.store.grid.within(block.core), job.ranges()
-        source = _read(job, tiles, ranges, seconds)
+        source = read_source(job, block, ranges, seconds)
         handed = _handed(job, block, wavefront)
     with computing(job.config.cluster), timed(seconds, "trace"):
         for tile in in_order(wavefront, tiles):
-            _, costs = _costed(job, tile, source, ranges, seconds)
+            _, costs = costed(job, tile, source, ranges, seconds)
             of_wavefronts = [handed if other == wavefront else {} for other in range(len(WAVEFRONTS))]
             handed[_place(tile)] = [
                 trace_area(cost, frame, _borders(job, tile, view, of_wavefronts, ranges), wavefront, job.config, ranges)
@@ -151,74 +149,16 @@ def _trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
             ]
     with timed(seconds, "trace"):
         _write_states(job, block, wavefront, handed)
-    costs_seconds = seconds.get("costs", 0.0)
-    return {"tiles.costs": costs_seconds, "tiles.trace": seconds["trace"] - costs_seconds}
+    once = {"tiles.pixels": seconds["read"], "tiles.costs": seconds.get("costs", 0.0)}  # kept for other steps
+    return once | {"tiles.trace": seconds["trace"] - sum(once.values())}
 
 
 def _place(tile: Tile) -> Place:
     return tile.grid_row, tile.grid_column
 
 
-def _frame(job: Job, tile: Tile) -> Frame:
-    return Frame(tile.core, job.store.grid.region, Window(0, 0, job.left.height, job.left.width))
-
-
 def _frames(job: Job, tile: Tile) -> list[Frame]:
-    return frames_of(_frame(job, tile), job.config)
-
-
-# ---- Pixels and costs --------------------------------------------------------------------------------------
-class _Source(NamedTuple):
-    """Both images in windows that contain those of some tiles, and the image statistics if the cost needs these."""
-
-    views: Views
-    statistics: PairStatistics | None
-
-
-def _areas(job: Job, tile: Tile, ranges: LocalRanges | None) -> list[Area]:
-    return patch_areas(_frame(job, tile), job.config, ranges)
-
-
-def _read(job: Job, tiles: Sequence[Tile], ranges: LocalRanges | None, seconds: dict[str, float]) -> _Source:
-    """Read both images in the windows of tiles."""
-    job.store.check(job.manifest)
-    job.check_inputs()  # before any work
-    statistics = job.statistics()
-    windows = [view_windows(_areas(job, tile, ranges), job.config) for tile in tiles]
-    try:
-        with timed(seconds, "read"):
-            views = read_views((job.left, job.right), map(hull, zip(*windows, strict=True)))
-    finally:  # a changed input explains a read error
-        job.check_inputs()
-    return _Source(views, statistics)
-
-
-def _costed(
-    job: Job, tile: Tile, source: _Source, ranges: LocalRanges | None, seconds: dict[str, float]
-) -> tuple[Views, list[MatchingCost]]:
-    """Crop both images to a tile, and compute the costs of its areas.
-
-    Precomputed costs take longer than SGM: the first of the tile's steps keeps them for the others, uncompressed, since
-    those of noisy images hardly shrink.
-    """
-    areas, statistics, config, name = _areas(job, tile, ranges), source.statistics, job.config, tile.name
-    left, right = zip(source.views, view_windows(areas, config), strict=True)
-    views = left[0].cropped(left[1]), right[0].cropped(right[1])
-    if not (config.cost.precomputed and job.hands_states_on):
-        with timed(seconds, "match"):
-            return views, cost_areas(views, areas, config, statistics)
-    with timed(seconds, "read"):
-        kept = job.store.steps.read(COSTS, name)
-    if kept is None:
-        with timed(seconds, "costs"):
-            costed = cost_areas(views, areas, config, statistics)
-            kept = [cost.costs.left[:, :, : area.disparities] for area, cost in zip(areas, costed, strict=True)]
-            job.store.steps.write(COSTS, name, *kept)
-        return views, costed
-    missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
-    made = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
-    with timed(seconds, "match"):
-        return views, cost_areas(views, areas, config, statistics, made)
+    return frames_of(frame_of(job, tile), job.config)
 
 
 # ---- Path states -------------------------------------------------------------------------------------------

@@ -63,18 +63,22 @@ class Workers(Protocol):
 
 
 def readers(settings: Cluster) -> int:
-    """Return how many threads read and write while the others compute: one if tiles are in a bucket or the like.
+    """Return how many threads of a process read and write while the others compute: one if tiles are in a bucket.
 
     With 0.3 s for each tile read or written, this shortens the tiles of one worker from 43 s to 28 s. On a local disk
-    it saves nothing.
+    it saves nothing. The threads of an existing scheduler's workers are the user's.
     """
-    is_remote = settings.store is not None and not isinstance(folder_at(settings.store), LocalFolder)
-    return int(settings.kind == "threads" and is_remote)
+    return int(settings.kind != "address" and is_remote(settings))
+
+
+def is_remote(settings: Cluster) -> bool:
+    """Return whether tiles are in a bucket or the like."""
+    return settings.store is not None and not isinstance(folder_at(settings.store), LocalFolder)
 
 
 def computing(settings: Cluster) -> AbstractContextManager[Any]:
     """Return a context for the kernels of a tile or strip: no more threads are in it at once than without `readers`."""
-    return _turns(_cores(settings)) if readers(settings) else nullcontext()
+    return _turns(cores_of_process(settings)) if readers(settings) else nullcontext()
 
 
 @cache
@@ -82,8 +86,11 @@ def _turns(count: int) -> BoundedSemaphore:
     return BoundedSemaphore(count)
 
 
-def _cores(settings: Cluster) -> int:
-    return settings.workers or usable_cores()
+def cores_of_process(settings: Cluster) -> int:
+    """Return how many tiles a process matches at once."""
+    if settings.kind == "threads":
+        return settings.workers or usable_cores()
+    return 1 if settings.kind in ("processes", "address") else settings.cores
 
 
 class Threads:
@@ -139,7 +146,7 @@ def _tried(task: Task) -> Any:
 def connected(settings: Cluster, out: Path) -> Iterator[Workers]:
     """Start or connect to the workers of the settings; close what was started at the end; see `cluster.connected`."""
     if settings.kind == "threads":
-        threads = Threads(_cores(settings), readers(settings))
+        threads = Threads(cores_of_process(settings), readers(settings))
         try:
             yield threads
         finally:

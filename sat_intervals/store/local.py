@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from glob import escape
 from itertools import groupby
 from pathlib import Path
 
@@ -222,7 +223,7 @@ class LocalFolder:
 
         Those of this name that killed processes left are deleted before. They are known by the lock file that is left.
         """
-        for left in self.path.glob(f".{name}-*"):
+        for left in self.path.glob(f".{escape(name)}-*"):
             with suppress(OSError, SatIntervalsError):  # it is in use, or cannot be deleted
                 lock = (left / _LOCK).lstat()
                 if not left.is_symlink() and stat.S_ISREG(lock.st_mode) and not lock.st_size:

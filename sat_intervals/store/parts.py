@@ -12,7 +12,7 @@ from typing import Any
 from sat_intervals.errors import RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, digest, sealed, unsealed
-from sat_intervals.store.removal import PARTS, final_name
+from sat_intervals.store.removal import PARTS, final_name, is_part
 from sat_intervals.store.tiles import DamagedTilesError, Store
 from sat_intervals.store.zarr_arrays import checksum
 
@@ -134,9 +134,10 @@ class Parts:
 
     def drop(self) -> None:
         """Delete the parts of all runs of the owner, such as those of earlier settings; call it after publishing."""
-        names = self.folder.inside(PARTS).sizes()
+        names = (f"{PARTS}/{name}" for name in self.folder.inside(PARTS).sizes())
+        owned = f"{PARTS}/{self._owner}"
         self.folder.delete_all(
-            [f"{PARTS}/{name}" for name in names if final_name(name).startswith(self._owner)], [PARTS]
+            [name for name in names if is_part(name) and final_name(name).startswith(owned)], [PARTS]
         )
 
 

@@ -6,25 +6,25 @@ from contextlib import suppress
 from sat_intervals.store.folder import Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, is_sealed, parsed
 
-ARRAYS, RECORDS, FAILURES, BORDERS, COSTS = "arrays.zarr", "records", "failures", "borders", "costs"
-PARTS = "parts"
-FOLDERS = RECORDS, FAILURES, BORDERS, COSTS, PARTS
+ARRAYS, RECORDS, FAILURES = "arrays.zarr", "records", "failures"
+BORDERS, PIXELS, COSTS, PARTS = "borders", "pixels", "costs", "parts"
+FOLDERS = RECORDS, FAILURES, BORDERS, PIXELS, COSTS, PARTS
 NORMALIZATION, SEARCH = "normalization.json", "range.json"
 # Empty file that says that a run made the folder: its name outlasts a power loss, which truncates other files.
 MADE = ".sat-intervals.tiles"
 _OF_RUN = re.compile(
     rf"{re.escape(MADE)}|{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
-    rf"|{PARTS}/(?:[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)|[0-9a-f]{{8}}_current)"
 )
+_PART = re.compile(rf"{PARTS}/(?:[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)|[0-9a-f]{{8}}_current)")
 _OF_TILE = re.compile(
     rf"(?:{RECORDS}|{FAILURES})/(\d+)_(\d+)\.json"
     rf"|{BORDERS}/(\d+)_(\d+)_[0-3]"
-    rf"|{COSTS}/(\d+)_(\d+)"
+    rf"|(?:{PIXELS}|{COSTS})/(\d+)_(\d+)"
     rf"|{ARRAYS}/(?:u?int\d+/c/0|right/c|seams/c|histogram/c)/(\d+)/(\d+)(?:/0)*"
 )
 # Folders of a run. If one of them were a link, writing would replace the user's files behind it.
 _FOLDER = re.compile(
-    rf"{RECORDS}|{FAILURES}|{BORDERS}|{COSTS}|{PARTS}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
+    rf"{'|'.join(FOLDERS)}|{ARRAYS}(?:/(?:u?int\d+(?:/c(?:/0(?:/\d+)?)?)?|(?:right|seams|histogram)(?:/c(?:/\d+)?)?))?"
 )
 # Temporary names of `LocalFolder` and of zarr, which a killed process leaves, with the final name as group.
 _UNFINISHED = re.compile(r"(?:(?<=/)|^)\.([^/]+)\.[0-9a-f]{32}$"), re.compile(r"()\.[0-9a-f]{32}\.partial$")
@@ -76,8 +76,9 @@ def _names(folder: Folder) -> dict[str, int]:
 
     def is_named(name: str) -> bool:
         name = final_name(name)
-        if _OF_RUN.fullmatch(name) or (found := _OF_TILE.fullmatch(name)) is None:
-            return _OF_RUN.fullmatch(name) is not None
+        is_found = bool(_OF_RUN.fullmatch(name) or _PART.fullmatch(name))
+        if is_found or (found := _OF_TILE.fullmatch(name)) is None:
+            return is_found
         row, column = (int(number) for number in found.groups() if number is not None)
         return grid is None or (row < grid.rows and column < grid.columns)
 
@@ -87,6 +88,11 @@ def _names(folder: Folder) -> dict[str, int]:
 def is_of_tile(name: str) -> bool:
     """Return whether a name is that of a tile's file, finished or not."""
     return _OF_TILE.fullmatch(final_name(name)) is not None
+
+
+def is_part(name: str) -> bool:
+    """Return whether a name is that of a file of a part, finished or not."""
+    return _PART.fullmatch(final_name(name)) is not None
 
 
 def final_name(name: str) -> str:

@@ -1,4 +1,4 @@
-"""What steps of a run hand to later ones, path states and matching costs: one file each, with its own checksums."""
+"""What steps of a run hand to later ones: path states, pixels and costs; one file each, with its own checksums."""
 
 import struct
 import zlib
@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.store.folder import Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, sealed, unsealed
-from sat_intervals.store.removal import BORDERS, COSTS, is_of_tile
+from sat_intervals.store.removal import BORDERS, COSTS, PIXELS, is_of_tile
 
 # A file is the length of its header, the header, a sealed text, and the bytes of all arrays.
 _LENGTH = struct.Struct("<I")
@@ -32,7 +32,7 @@ class Steps:
     run: str
 
     def write(self, kind: str, name: str, *arrays: np.ndarray) -> None:
-        """Write arrays as a whole; ``kind`` is their folder, BORDERS or COSTS."""
+        """Write arrays as a whole; ``kind`` is their folder, such as BORDERS."""
         whole = [np.ascontiguousarray(array) for array in arrays]
         about = [[array.dtype.str, list(array.shape), zlib.crc32(array.data)] for array in whole]
         header, file = sealed({"arrays": about}, f"{self.run}/{kind}/{name}").encode(), f"{kind}/{name}"
@@ -59,15 +59,15 @@ class Steps:
 
         return is_intact
 
-    def drop_costs(self) -> None:
-        """Delete precomputed costs, which nothing needs once all tiles are matched."""
-        names = (f"{COSTS}/{name}" for name in self.folder.inside(COSTS).sizes())
-        self.folder.delete_all([name for name in names if is_of_tile(name)], [COSTS])
+    def drop_sources(self) -> None:
+        """Delete pixels and precomputed costs, which nothing needs once all tiles are matched."""
+        names = (f"{kind}/{name}" for kind in (PIXELS, COSTS) for name in self.folder.inside(kind).sizes())
+        self.folder.delete_all([name for name in names if is_of_tile(name)])  # damaged tiles need the folders again
 
     def missing_bytes(self, needed: int) -> int:
         """Return the bytes that a run has yet to write of those that it needs for its steps."""
-        there = sum(sum(self.folder.inside(kind).sizes().values()) for kind in (BORDERS, COSTS)) if needed else 0
-        return max(0, needed - there)
+        kinds = (BORDERS, PIXELS, COSTS) if needed else ()
+        return max(0, needed - sum(sum(self.folder.inside(kind).sizes().values()) for kind in kinds))
 
     def check_space(self, needed: int) -> None:
         """Raise if the disk has no room for the bytes that a run needs for its steps and does not have yet.
@@ -81,7 +81,7 @@ class Steps:
         free = self.folder.free_bytes()
         if free is not None and free < needed:
             raise StoreError(
-                f"{self.folder} has {free / 1e6:,.1f} MB free, path states and matching costs need {needed / 1e6:,.1f} "
+                f"{self.folder} has {free / 1e6:,.1f} MB free, what tiles hand to each other needs {needed / 1e6:,.1f} "
                 "MB: free disk space and rerun; or, with --overwrite, choose another --store or --overlap 100"
             )
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import RunError
+from sat_intervals.errors import RemovedTilesError, RunError
 from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
@@ -192,8 +192,7 @@ class Store:
         StoreError
             It belongs to another run.
         """
-        there = self.folder.read(MANIFEST)
-        if there is None:
+        if (there := self.folder.read(MANIFEST)) is None:
             raise RunError(
                 f"the tiles in {self.folder} are gone: another run of the same images and settings may have removed "
                 "them: rerun the same command: it matches them again"
@@ -205,9 +204,10 @@ class Store:
         """If the block fails because the store is gone, raise the error of `check` instead."""
         try:
             yield
-        except Exception:
+        except Exception as error:
             with suppress(OSError):
-                self.check(manifest)
+                if not isinstance(error, RemovedTilesError):
+                    self.check(manifest)
             raise
 
     def done(self) -> set[str]:

@@ -219,15 +219,21 @@ class TileArrays:
             top, bottom = max(start, first), min(start + step, last)
             strip: dict[str, np.ndarray] = {}
             for dtype, planes in _planes(self.levels).items():
-                read = self._rows(dtype, len(planes), top, bottom, checksums)[:, :, : self.grid.region.width]
+                read = self._rows(dtype, len(planes), top, bottom, checksums)
                 strip |= {name: plane.view(of) for (name, of), plane in zip(planes.items(), read, strict=True)}
             yield strip | {"right_winner": self._merged(self._rows(_RIGHT, 1, top, bottom, checksums)[0])}
 
     def _rows(self, name: str, planes: int, top: int, bottom: int, checksums: Checksums) -> np.ndarray:
-        """Read the rows ``[top, bottom)`` of an array with one shard a tile: ``(planes, rows, columns)``."""
+        """Read the rows ``[top, bottom)`` of an array with one shard a tile: ``(planes, rows, columns)``.
+
+        The columns are those of the region, or the reaches of all tiles. Planes are contiguous: for any other layout
+        kernels would be compiled again.
+        """
         size, together = self.grid.size, _together(self.grid)
-        dtype, width = (np.dtype(np.uint32), self._reach) if name == _RIGHT else (np.dtype(name), size)
-        found = np.empty((planes, bottom - top, self.grid.columns * width), dtype)
+        dtype, width, columns = np.dtype(np.uint32), self._reach, self.grid.columns * self._reach
+        if name != _RIGHT:
+            dtype, width, columns = np.dtype(name), size, self.grid.region.width
+        found = np.empty((planes, bottom - top, columns), dtype)
         for row in range(top // size, -(-bottom // size)):
             start, stop = max(top - row * size, 0), min(bottom - row * size, size)  # rows of the tile
             pieces = range(start // together, -(-stop // together))
@@ -235,7 +241,8 @@ class TileArrays:
             target = found[:, row * size + start - top : row * size + stop - top]
             for column, read in enumerate(self._read(name, row, pieces, dtype, checksums)):
                 rows = np.concatenate([piece.reshape(planes, together, width) for piece in read], axis=1)
-                target[:, :, column * width : (column + 1) * width] = rows[:, inside]
+                here = target[:, :, column * width : (column + 1) * width]
+                here[...] = rows[:, inside, : here.shape[2]]
         return found
 
     def _row_of_tables(self, name: str, row: int, checksums: Checksums) -> np.ndarray:

@@ -23,7 +23,6 @@ from sat_intervals.store.tiles import Store
 SETTINGS = {
     "satellite": {"preset": "satellite"},
     "gradients": {"sgm": {"penalty": "negative", "alpha": 0.5, "gamma": 40}, "cross_check": None},
-    "window 3": {"cost": {"window": 3}},
     "no SGM": {"sgm": None},
     "accurate": {"cross_check": {"method": "accurate"}},
 }
@@ -148,12 +147,27 @@ def damage_once(monkeypatch, names, how):
     monkeypatch.setattr(run, "match_block", damage_and_match)
 
 
+@pytest.mark.parametrize("names", [["borders/1_0_0", "borders/1_1_0", "borders/1_1_1"], ["pixels/1_1", "pixels/1_2"]])
 @pytest.mark.parametrize("how", DAMAGES)
-def test_match_pair__traces_damaged_path_states_again(folder, whole, tmp_path, monkeypatch, how):
-    damage_once(monkeypatch, ["borders/1_0_0", "borders/1_1_0", "borders/1_1_1"], how)
+def test_match_pair__makes_damaged_path_states_and_pixels_again(folder, whole, tmp_path, monkeypatch, how, names):
+    damage_once(monkeypatch, names, how)
     match(folder, tmp_path / "out", 64, {"cluster": {"workers": 1}})
     assert hashes(tmp_path / "out") == hashes(whole)
     assert (tmp_path / "out" / "damaged").exists()
+
+
+def test_match_pair__matches_a_damaged_tile_again(folder, whole, tmp_path, monkeypatch):
+    assemble = run.assemble
+
+    def damage_and_assemble(job, *arguments, **more):
+        monkeypatch.setattr(run, "assemble", assemble)
+        for file in job.store.home.glob("arrays.zarr/*/c/0/1/1"):
+            file.write_bytes(b"")
+        return assemble(job, *arguments, **more)
+
+    monkeypatch.setattr(run, "assemble", damage_and_assemble)
+    match(folder, tmp_path / "out", 64, {})
+    assert hashes(tmp_path / "out") == hashes(whole)
 
 
 def test_match_pair__that_resumes_traces_damaged_path_states_again(folder, whole, tmp_path, monkeypatch):
@@ -171,7 +185,7 @@ def test_match_pair__that_resumes_traces_damaged_path_states_again(folder, whole
 
 def test_match_pair__needs_space_for_path_states_before_it_starts(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(LocalFolder, "free_bytes", lambda folder: 10**5)
-    with pytest.raises(SatIntervalsError, match=r"has 0\.1 MB free, path states and matching costs need 0\.4 MB"):
+    with pytest.raises(SatIntervalsError, match=r"has 0\.1 MB free, what tiles hand to each other needs 0\.7 MB"):
         match(folder, tmp_path / "out", 64, {})
 
 

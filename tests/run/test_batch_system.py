@@ -1,6 +1,7 @@
 """A real SLURM of one node on loopback: cancelled jobs, and jobs that reach their time limit."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
+import dask
 import psutil
 import pytest
 import yaml
@@ -162,6 +164,16 @@ def test_job_script__says_what_is_set_as_each_batch_system_takes_it(tmp_path, ki
     with pytest.raises(SatIntervalsError, match=rf"cluster {kind} needs the memory of a job: set cluster\.memory"):
         job_script(Cluster(kind=kind), tmp_path / "out")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.peer("dask_jobqueue")
+@pytest.mark.parametrize(("store", "threads"), [(None, ["2"]), ("s3://bucket/tiles", ["2", "3"])])
+def test_job_script__has_one_more_thread_that_reads_and_writes_tiles_in_a_bucket(tmp_path, store, threads):
+    with dask.config.set({"jobqueue.slurm.worker-extra-args": ["--lifetime", "1h"]}):
+        script = job_script(Cluster(kind="slurm", cores=2, memory="4GB", store=store), tmp_path / "out")
+    assert re.findall(r"--nthreads (\d+)", script) == threads  # the last one holds
+    assert "--cpus-per-task=2" in script
+    assert "--lifetime 1h" in script
 
 
 def sbatch(folder: Path, script: str) -> str:

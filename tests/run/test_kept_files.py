@@ -1,8 +1,10 @@
 """Files of the user are never lost: inputs, unrelated files in a folder, and a finished run."""
 
+import html
 import itertools
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -22,16 +24,21 @@ from helpers import COMMAND, PLACE, hashes, invoke, write_pair
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.heights import dsm
 from sat_intervals.interop.export import export
 from sat_intervals.raster import (
+    MARK,
     RUN_FILES,
     Georeferencing,
+    InputError,
     OutputError,
     OutputWriter,
+    layers,
     open_image,
     other_files,
     publishing,
     put_back,
+    read_layers,
     watched_rasters,
     write_layer,
 )
@@ -42,6 +49,7 @@ from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.tile import match_block
+from sat_intervals.show.canvas import page
 from sat_intervals.show.profile import draw_profile
 from sat_intervals.show.report import write_report
 from sat_intervals.store.folder import LocalFolder
@@ -167,6 +175,45 @@ def test_other_files__are_those_of_the_sources_of_a_virtual_raster_too(pair):
     assert other_files(str(folder / "mask.vrt")) == [str(folder / "mask.tif"), str(folder / "mask.tif.msk")]
 
 
+@pytest.mark.parametrize("source", ["vrt://{}?bands=1", "GTIFF_DIR:1:{}", "{}.vrt"])
+def test_other_files__are_those_of_sources_with_other_names_than_files(pair, source):
+    folder, _ = pair
+    inner = (folder / "mask.vrt").read_text().replace("mask.tif", str(folder / "left.tif"))
+    inner = inner.replace('relativeToVRT="1"', 'relativeToVRT="0"').replace("Byte", "UInt16")
+    name = html.escape(inner if source == "{}.vrt" else source.format(folder / "left.tif"))
+    outer = re.sub(r"(<SourceFilename[^>]*>)[^<]*", lambda found: found[1] + name, inner)
+    (folder / "outer.vrt").write_text(outer)
+    np.testing.assert_array_equal(read_layers(folder / "outer.vrt"), read_layers(folder / "left.tif"))
+    assert str(folder / "left.tif") in other_files(str(folder / "outer.vrt"))
+
+
+def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
+    folder, _ = pair
+    with rasterio.open(folder / "left.zarr", "w", driver="Zarr", width=100, height=80, count=1, dtype="uint16") as file:
+        file.write(np.ones((1, 80, 100), np.uint16))
+    with pytest.raises(InputError, match=r"left\.zarr is read from files that GDAL does not list, .*: convert it"):
+        open_image(folder / "left.zarr")
+
+
+def test_match_pair__ends_where_a_memory_map_changes_an_input(pair, monkeypatch):
+    folder, settings = pair
+    with (folder / "left.tif").open("ab") as file:
+        file.write(b"not of the image")
+    image = np.memmap(folder / "left.tif", np.uint8, "r+")
+
+    def change(job, block):
+        match_block(job, block)
+        image[-1] += 1  # changes no time, since the page is dirty already
+
+    image[-1] += 1
+    before = os.stat(folder / "left.tif").st_mtime_ns
+    monkeypatch.setattr("sat_intervals.run.pair.match_block", change)
+    with pytest.raises(RunError, match="was changed during the run, though its times were not"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert os.stat(folder / "left.tif").st_mtime_ns == before
+    assert not list(folder.glob("out/tiles/records/*"))
+
+
 @pytest.mark.parametrize("name", ["mask.tif", "points.tif"])
 def test_watched_rasters__sees_a_changed_source_and_a_new_file(pair, name):
     folder, _ = pair
@@ -204,7 +251,7 @@ def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
     job = prepare(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     job.begin()
     (folder / "left.tif").unlink()
-    monkeypatch.setattr("sat_intervals.run.tile.cost_areas", None)
+    monkeypatch.setattr("sat_intervals.run.source.cost_areas", None)
     with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed"):
         match_block(job, next(iter(job.store.grid)))
 
@@ -659,6 +706,26 @@ def test_demo__replaces_links_and_does_not_follow_them(tmp_path):
     assert precious.read_text() == "mine"
 
 
+def test_page__keeps_a_file_that_appears_while_it_is_drawn(tmp_path):
+    path = tmp_path / "overview.png"
+    with (
+        pytest.raises(SatIntervalsError, match=r"overview\.png exists and was not made by"),
+        page(path, (1, 1), 50, ""),
+    ):
+        path.write_text("mine")
+    assert contents(tmp_path) == {str(path): b"mine"}
+
+
+def test_write_rows__keeps_a_file_that_appears_while_it_is_written(tmp_path):
+    def rows():
+        yield np.zeros((2, 9, 9), np.int16)
+        (tmp_path / "ranges.tif").write_text("mine")
+
+    with pytest.raises(SatIntervalsError, match=r"ranges\.tif exists and was not made by"):
+        layers.write_rows(tmp_path / "ranges.tif", rows(), (2, 9, 9), PLACE, {})
+    assert contents(tmp_path) == {str(tmp_path / "ranges.tif"): b"mine"}
+
+
 def test_put_back__leaves_what_is_published(tmp_path):
     file, report = tmp_path / "left.tif", tmp_path / "run.json"
     file.write_text("before")
@@ -675,6 +742,17 @@ def test_put_back__leaves_what_is_published(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert contents(tmp_path) == {str(file): b"new", str(report): b"new"}
+
+
+def test_put_back__of_a_killed_process_keeps_a_file_that_came_after_it(tmp_path):
+    file, report = tmp_path / "left.tif", tmp_path / "run.json"
+    write_layer(file, np.ones((9, 9), np.uint16), 0, PLACE, MARK)
+    report.write_text("before")
+    os.rename(file, layers._aside(file, report))  # as a killed process leaves it
+    file.write_text("mine")
+    with pytest.raises(SatIntervalsError, match=r"left\.tif exists and was not made by"), put_back([file], report):
+        pass
+    assert file.read_text() == "mine"
 
 
 def test_match_batch__that_fails_to_overwrite_keeps_the_runs(pair, monkeypatch):
@@ -961,3 +1039,18 @@ def test_commands__say_that_the_working_directory_is_gone(tmp_path, words):
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == "sat-intervals: the working directory was deleted: change to another folder"
     assert "Traceback" not in done.stderr
+
+
+def test_dsm__says_that_the_working_directory_was_deleted_meanwhile(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+
+    def deleted(*arguments, **options):
+        (tmp_path / "gone").rmdir()
+        return triangulated(*arguments, **options)
+
+    triangulated = dsm.triangulated
+    monkeypatch.setattr(dsm, "triangulated", deleted)
+    result = invoke("dsm", "out", "--resolution", "1")
+    assert result.exit_code == 1
+    assert result.stderr.endswith("; the working directory was deleted: change to another folder\n")

@@ -55,6 +55,18 @@ def test_match_pair__equals_match_arrays_in_one_tile(pair, tmp_path, more):
     np.testing.assert_array_equal(validity, whole["validity"])
 
 
+def test_match_pair__compiles_the_tracing_of_path_states_for_several_tiles_only(pair, tmp_path, monkeypatch):
+    left, right, settings = pair
+
+    def traced(*arguments):
+        raise RunError("traced")
+
+    monkeypatch.setattr("sat_intervals.match.warm_up.trace_area", traced)
+    match_pair(left, right, tmp_path / "one", in_tiles(settings, 512, "exact"))
+    with pytest.raises(RunError, match="traced"):
+        match_pair(left, right, tmp_path / "many", in_tiles(settings, 64, "exact"))
+
+
 @pytest.mark.parametrize("interval", [{"alpha": 0.9, "bounds": "subpixel"}, {"coverage": 0.8}])
 def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_path, interval):
     left, right, settings = pair

@@ -12,7 +12,8 @@ from matplotlib.image import imread
 
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
-from sat_intervals.raster import MARK, write_layer
+from sat_intervals.products import BANDS
+from sat_intervals.raster import MARK, File, OutputWriter, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
 from sat_intervals.run import schedule
@@ -149,12 +150,16 @@ def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
     result = invoke("range", *images, "--output", tmp_path / "other.tif")
     assert result.exit_code == 2
     assert "was not made by sat-intervals" in result.stderr
-    write_layer(tmp_path / "truth.tif", np.zeros((9, 9), np.float32), np.nan, PLACE, MARK)
-    before = (tmp_path / "truth.tif").read_bytes()
-    result = invoke("range", *images, "--output", tmp_path / "truth.tif")
+    with OutputWriter(tmp_path, [File("disparity.tif", "float32", None, BANDS[:2])], 9, 9, PLACE, MARK) as writer:
+        writer.write(0, np.zeros((2, 9, 9)))
+        writer.publish()  # as export --to otb
+    before = (tmp_path / "disparity.tif").read_bytes()
+    result = invoke("range", *images, "--output", tmp_path / "disparity.tif")
     assert result.exit_code == 2
-    assert "truth.tif exists and has no local ranges" in result.stderr
-    assert (tmp_path / "truth.tif").read_bytes() == before
+    assert "disparity.tif exists and was not made by sat-intervals range, or by an earlier version" in result.stderr
+    assert (tmp_path / "disparity.tif").read_bytes() == before
+    for _ in range(2):
+        assert invoke("range", *images, "--output", tmp_path / "range.tif").exit_code == 0
 
 
 def test_match__keeps_the_raster_of_ranges(folder, tmp_path):

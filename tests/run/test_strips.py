@@ -58,6 +58,21 @@ def with_tiles(tall, out: Path) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def stopped(tall):
+    """A folder of a run that was stopped when all its parts were done."""
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    out = with_tiles(tall, tall[0] / "stopped")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OutputWriter, "assemble", stop)
+        with pytest.raises(KeyboardInterrupt):
+            matched(tall, out)
+    return out
+
+
 def parts(out: Path, kind: str = "*.json") -> dict[str, int]:
     """Times of the parts that are done, by name."""
     return {file.name: file.stat().st_mtime_ns for file in (out / "tiles" / "parts").glob(f"[!.]{kind}")}
@@ -228,16 +243,8 @@ def test_finish_strips__names_the_rows_that_could_not_be_finished(tall, tmp_path
 
 @pytest.mark.parametrize("kind", ["0_1_half", "1_0_intervals", "0_3_validity", "0_1.json"])
 @pytest.mark.parametrize("how", ["gone", "cut short", "bit"])
-def test_finish_strips__makes_damaged_parts_again(tall, tmp_path, monkeypatch, kind, how):
-    out = with_tiles(tall, tmp_path / "out")
-
-    def stop(*arguments):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(OutputWriter, "assemble", stop)
-        with pytest.raises(KeyboardInterrupt):
-            matched(tall, out)
+def test_finish_strips__makes_damaged_parts_again(tall, stopped, tmp_path, kind, how):
+    out = shutil.copytree(stopped, tmp_path / "out")
     if kind.endswith("half"):  # so that it is needed again
         next((out / "tiles" / "parts").glob("*_1_0.json")).unlink()
     damage(out, kind, how)
@@ -408,8 +415,12 @@ def test_drop__leaves_tiles_only_and_the_parts_of_other_runs(tall, tmp_path, mon
                 matched(tall, tmp_path / name, cluster=store, median=median)
     there = {file.name for file in tmp_path.glob("store/*/parts/*")}
     assert len({name[:8] for name in there}) == 2
+    mine = [file.with_name(f"{file.name}.bak") for file in tmp_path.glob("store/*/parts/*.json")]
+    for file in mine:
+        file.write_text("mine")
     matched(tall, tmp_path / "one", cluster=store, keep_tiles=True)  # with another median than before
-    left = {file.name for file in tmp_path.glob("store/*/parts/*")}
+    assert all(file.read_text() == "mine" for file in mine)
+    left = {file.name for file in tmp_path.glob("store/*/parts/*")} - {file.name for file in mine}
     assert left < there
     assert len(left) == len(there) / 2
     assert read_status(tmp_path / "two" / "tiles", store["store"]).strips_done == 4

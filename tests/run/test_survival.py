@@ -424,7 +424,7 @@ def test_match__is_not_stalled_by_a_tile_at_which_dask_pauses_its_worker(uneven,
 
 
 def test_match__ends_where_the_disk_is_full_and_goes_on_after(pair, tmp_path, disk):
-    place = disk(16 << 20)
+    place = disk(18 << 20)
     out, ballast = place / "out", place / "ballast"
     with started(pair, out) as command:
         command.wait_for_tiles(5)

@@ -12,7 +12,7 @@ from helpers import hashes, wait_until, write_pair
 from sat_intervals import match_pair
 from sat_intervals.config import Cluster
 from sat_intervals.demo import make_scene
-from sat_intervals.run import tile, workers
+from sat_intervals.run import cluster, source, tile, workers
 from sat_intervals.run.workers import Task, Threads, connected
 
 
@@ -66,6 +66,7 @@ def test_threads__keep_two_tasks_per_thread_in_flight_and_drop_the_rest_at_the_e
     assert started == [0, 1]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("module", ["sat_intervals.run.pair", "sat_intervals.run.batch"])
 def test_threads__need_neither_dask_nor_xarray(module):
     code = f"import sys, {module}; print(*{{'dask', 'distributed', 'xarray'}} & sys.modules.keys())"
@@ -73,11 +74,18 @@ def test_threads__need_neither_dask_nor_xarray(module):
     assert found.stdout.split() == []
 
 
+@pytest.mark.process
+@pytest.mark.parametrize(("store", "threads"), [(None, 1), ("memory://tiles", 2)])
+def test_connected__gives_processes_a_thread_that_reads_and_writes_tiles_in_a_bucket(tmp_path, store, threads):
+    with cluster.connected(Cluster(kind="processes", workers=1, store=store), tmp_path) as client:
+        assert list(client.nthreads().values()) == [threads]
+
+
 def test_computing__lets_one_more_thread_read_while_kernels_run(tmp_path, monkeypatch):
     settings = write_pair(tmp_path, make_scene(140, 70, seed=1), tiles={"size": 64, "overlap": 10})
     pair = tmp_path / "left.tif", tmp_path / "right.tif"
     match_pair(*pair, tmp_path / "local", settings)
-    read_views = tile.read_views
+    read_views = source.read_views
     reads, at_work, most = [], [], []
 
     def read(*arguments):
@@ -98,7 +106,7 @@ def test_computing__lets_one_more_thread_read_while_kernels_run(tmp_path, monkey
 
         return work
 
-    monkeypatch.setattr(tile, "read_views", read)
+    monkeypatch.setattr(source, "read_views", read)
     for kernel in ("match_costed", "look_in_tile", "ambiguity_histogram"):
         monkeypatch.setattr(tile, kernel, counted(getattr(tile, kernel)))
     match_pair(*pair, tmp_path / "out", settings | {"cluster": {"workers": 1, "store": "memory://tiles"}})

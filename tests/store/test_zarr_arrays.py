@@ -43,6 +43,20 @@ def test_strips__have_the_rows_that_were_written(arrays, first, last):
         np.testing.assert_array_equal(found[name], band[first:last])
 
 
+def test_strips__are_contiguous_where_the_tile_is_wider_than_the_image(tmp_path):
+    """Kernels are compiled again for any other layout."""
+    grid = Grid(Window(0, 0, 40, 100), SIZE)
+    arrays = TileArrays(LocalFolder(tmp_path), grid, COUNT, 20, 0, has_seams=False)
+    arrays.create()
+    kinds = {"winner": np.int16, "lower": np.int16, "upper": np.int16, "validity": np.uint16}
+    kinds |= {"disparity": np.float32, "ambiguity": np.uint32}
+    bands = {name: np.full((40, 100), 7, kind) for name, kind in kinds.items()}
+    checksums = arrays.write(grid.tile(0, 0), bands | {"histogram": np.zeros(21)})
+    (strip,) = arrays.strips(64, checksums)
+    assert all(plane.flags.c_contiguous for plane in strip.values())
+    assert {strip[name].shape for name in bands} == {(40, 100)}
+
+
 def test_write__makes_arrays_that_zarr_reads(arrays):
     arrays, _, whole = arrays
     group = zarr.open_group(arrays.folder.path, mode="r")

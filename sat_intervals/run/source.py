@@ -1,0 +1,97 @@
+"""What a step computes with: the pixels of a block and the costs of its tiles, new or kept by an earlier step."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sat_intervals.kernels.cost import padded_to_lanes
+from sat_intervals.match.local_ranges import LocalRanges
+from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
+from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.patch import Frame, patch_areas
+from sat_intervals.progress import timed
+from sat_intervals.raster import read_views
+from sat_intervals.raster.windows import kept_view, restored_view
+from sat_intervals.run.job import Job
+from sat_intervals.run.workers import is_remote
+from sat_intervals.store.removal import COSTS, PIXELS
+from sat_intervals.tiling import Tile, Views, Window, hull
+
+
+class Source(NamedTuple):
+    """Both images in windows that contain those of some tiles, and the image statistics if the cost needs these."""
+
+    views: Views
+    statistics: PairStatistics | None
+
+
+def frame_of(job: Job, tile: Tile) -> Frame:
+    """Return a tile or block in its region and image."""
+    return Frame(tile.core, job.store.grid.region, Window(0, 0, job.left.height, job.left.width))
+
+
+def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict[str, float]) -> Source:
+    """Read both images in the windows of a block's tiles."""
+    job.store.check(job.manifest)
+    job.check_inputs()  # before any work
+    statistics = job.statistics()
+    windows = [view_windows(_areas(job, tile, ranges), job.config) for tile in job.store.grid.within(block.core)]
+    left, right = map(hull, zip(*windows, strict=True))
+    with timed(seconds, "read"):
+        return Source(_views(job, block, (left, right)), statistics)
+
+
+def _views(job: Job, block: Tile, windows: tuple[Window, Window]) -> Views:
+    """Read windows of both images.
+
+    The first of the block's steps keeps them for the others, in the file's type and uncompressed. A bucket would be no
+    faster than the images.
+    """
+    images = job.left, job.right
+    are_kept = job.hands_states_on and not is_remote(job.config.cluster)
+    if are_kept and (kept := job.store.steps.read(PIXELS, block.name)) is not None:
+        left, right = (
+            restored_view(image, window, *kept[2 * i : 2 * i + 2])
+            for i, (image, window) in enumerate(zip(images, windows, strict=True))
+        )
+        return left, right
+    try:
+        views = read_views(images, windows)
+    finally:  # a changed input explains a read error
+        job.check_inputs()
+    if are_kept:
+        arrays = (array for image, view in zip(images, views, strict=True) for array in kept_view(image, view))
+        job.store.steps.write(PIXELS, block.name, *arrays)
+    return views
+
+
+def _areas(job: Job, tile: Tile, ranges: LocalRanges | None) -> list[Area]:
+    return patch_areas(frame_of(job, tile), job.config, ranges)
+
+
+def costed(
+    job: Job, tile: Tile, source: Source, ranges: LocalRanges | None, seconds: dict[str, float]
+) -> tuple[Views, list[MatchingCost]]:
+    """Crop both images to a tile, and compute the costs of its areas.
+
+    Precomputed costs take longer than SGM: the first of the tile's steps keeps them for the others, uncompressed, since
+    those of noisy images hardly shrink.
+    """
+    areas, statistics, config, name = _areas(job, tile, ranges), source.statistics, job.config, tile.name
+    left, right = zip(source.views, view_windows(areas, config), strict=True)
+    views = left[0].cropped(left[1]), right[0].cropped(right[1])
+    if not (config.cost.precomputed and job.hands_states_on):
+        with timed(seconds, "match"):
+            return views, cost_areas(views, areas, config, statistics)
+    with timed(seconds, "read"):
+        kept = job.store.steps.read(COSTS, name)
+    if kept is None:
+        with timed(seconds, "costs"):
+            made = cost_areas(views, areas, config, statistics)
+            kept = [cost.costs.left[:, :, : area.disparities] for area, cost in zip(areas, made, strict=True)]
+            job.store.steps.write(COSTS, name, *kept)
+        return views, made
+    missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
+    padded = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
+    with timed(seconds, "match"):
+        return views, cost_areas(views, areas, config, statistics, padded)
