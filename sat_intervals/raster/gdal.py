@@ -5,7 +5,7 @@ import re
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -23,20 +23,30 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
+# A failure without a message is none to rasterio: it returns zeros. Failures in GDAL's own threads have no message in
+# this one, and a source of a VRT that one thread cannot open fails in another without any.
+_ONE_THREAD = {"GDAL_NUM_THREADS": "1", "VRT_NUM_THREADS": "1"}
+_OF_SOURCES = threading.RLock()
+
 
 @contextmanager
 def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
-    """Open a raster for reading; thread-safe."""
+    """Open a raster for reading; thread-safe. Only one thread of a process reads VRTs."""
     _accept_no_georeferencing()
     # rasterio casts the no-data value to the type: -1.8e308, of ArcGIS, overflows float32
-    with Env(), np.errstate(over="ignore"), DatasetReader(path, **options) as dataset:
+    with (
+        Env(**_ONE_THREAD),
+        np.errstate(over="ignore"),
+        DatasetReader(path, **options) as dataset,
+        _OF_SOURCES if dataset.driver == "VRT" else nullcontext(),
+    ):
         yield dataset
 
 
 def create(path: str, **options: Any) -> DatasetWriter:
     """Create a GeoTIFF; call it inside a `rasterio.Env`."""
     _accept_no_georeferencing()
-    return DatasetWriter(path, "w", driver="GTiff", **options)
+    return DatasetWriter(path, "w", driver="GTiff", endianness="LITTLE", **options)
 
 
 def reason(error: BaseException) -> str:

@@ -4,6 +4,7 @@ import itertools
 import os
 import pickle
 import subprocess
+import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -41,7 +42,8 @@ from sat_intervals.raster import (
     write_layer,
     write_rows,
 )
-from sat_intervals.tiling import Window
+from sat_intervals.raster.windows import kept_view, restored_view
+from sat_intervals.tiling import View, Window
 
 UTM = {"crs": "EPSG:32631", "transform": Affine(0.5, 0, 360000.1, 0, -0.5, 4800000.3)}
 POINTS = [
@@ -301,6 +303,21 @@ def test_read_window__keeps_every_value_of_the_type(tmp_path, dtype, expected):
     assert not state.any()
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32", "int32", "float64", "uint64"])
+def test_restored_view__is_the_view_that_was_kept(tmp_path, dtype):
+    limits = np.finfo(dtype) if "float" in dtype else np.iinfo(np.int32 if dtype == "uint64" else dtype)
+    values = np.array([[max(limits.min, 0), 1, 2, limits.max]], dtype)
+    image = open_image(make(tmp_path / "left.tif", values), nodata=1)
+    for window, sizes in (Window(0, 0, 1, 4), (4, 4)), (Window(0, 2, 1, 2), (2, 0)):  # the latter is usable everywhere
+        view = View(window, *read_window(image, window))
+        pixels, state = kept_view(image, view)
+        assert (pixels.dtype, pixels.size, state.size) == (dtype, *sizes)
+        found = restored_view(image, window, pixels, state)
+        assert found.pixels.dtype == view.pixels.dtype
+        np.testing.assert_array_equal(found.pixels, view.pixels)
+        np.testing.assert_array_equal(found.state, view.state)
+
+
 def test_read_window__takes_nan_and_infinity_for_no_data(tmp_path):
     values = np.array([[np.nan, np.inf, -np.inf, 1]], np.float32)
     image = open_image(make(tmp_path / "left.tif", values, nodata=-1))
@@ -399,6 +416,58 @@ def test_read_window__names_a_mask_cut_short(tmp_path):
     with pytest.raises(InputError) as failure:
         read_window(image, Window(240, 100, 10, 10))
     message(failure, tmp_path / "mask.tif", "rows 240 to 249")
+
+
+def mosaic(folder: Path, side: int) -> Image:
+    """Write a VRT of two images side by side, of which the right one has no file any more."""
+    sources = ""
+    for number, name in enumerate(("west.tif", "east.tif")):
+        make(folder / name, np.full((side, side), 7, np.uint8))
+        sources += (
+            f'<SimpleSource><SourceFilename relativeToVRT="1">{name}</SourceFilename>'
+            f'<SrcRect xOff="0" yOff="0" xSize="{side}" ySize="{side}"/>'
+            f'<DstRect xOff="{number * side}" yOff="0" xSize="{side}" ySize="{side}"/></SimpleSource>'
+        )
+    path = folder / "mosaic.vrt"
+    band = f'<VRTRasterBand dataType="Byte" band="1">{sources}</VRTRasterBand>'
+    path.write_text(f'<VRTDataset rasterXSize="{2 * side}" rasterYSize="{side}">{band}</VRTDataset>')
+    image = open_image(path)
+    (folder / "east.tif").unlink()
+    return image
+
+
+def test_read_window__names_a_mosaic_whose_source_is_missing(tmp_path):
+    image = mosaic(tmp_path, 800)  # GDAL reads more than a million pixels of several sources in threads of its own
+    with pytest.raises(InputError) as failure:
+        read_window(image, Window(0, 0, 800, 1600))
+    message(failure, "mosaic.vrt")
+
+
+def test_read_window__of_a_mosaic_fails_in_every_thread(tmp_path):
+    image = mosaic(tmp_path, 16)
+
+    def fails(_: int) -> bool:
+        try:
+            read_window(image, Window(0, 0, 16, 32))
+        except InputError:
+            return True
+        return False
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(fails, range(1000)))
+
+
+def test_read_window__names_a_jpeg_2000_cut_short(tmp_path):
+    noise = np.random.default_rng(0).integers(1, 255, (2000, 2000), np.uint8)
+    path = tmp_path / "left.jp2"
+    options = {"driver": "JP2OpenJPEG", "count": 1, "dtype": "uint8", "quality": 100, "reversible": "yes", **UTM}
+    with rasterio.open(path, "w", width=2000, height=2000, **options) as dataset:
+        dataset.write(noise, 1)
+    os.truncate(path, path.stat().st_size * 2 // 3)
+    image = open_image(path)
+    with pytest.raises(InputError) as failure, rasterio.Env(GDAL_NUM_THREADS="ALL_CPUS"):
+        read_window(image, Window(0, 0, 2000, 2000))
+    message(failure, path)
 
 
 def test_read_window__is_quiet_and_right_in_many_threads(tmp_path):
@@ -718,7 +787,7 @@ def test_write_rows__leaves_no_damaged_file_on_a_full_disk(disk):
     place = disk(8 << 10)
     (place / "other").write_bytes(bytes(8 << 10))
     with pytest.raises(OutputError, match=r"ranges.tif cannot be written"):
-        write_rows(place / "ranges.tif", [np.ones((2, 9, 9), np.int16)], (2, 9, 9), Georeferencing())
+        write_rows(place / "ranges.tif", [np.ones((2, 9, 9), np.int16)], (2, 9, 9), Georeferencing(), {})
     assert left_behind(place) == ["other"]
 
 
@@ -727,3 +796,16 @@ def test_whole_file__names_the_file_that_cannot_be_written(tmp_path):
     for path in (tmp_path / "missing" / "a.txt", tmp_path):
         with pytest.raises(OutputError, match=rf"{path} cannot be written: .*: make room or"), whole_file(path) as new:
             new.write_text("a")
+
+
+def test_whole_file__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
+    path, foreign = tmp_path / "a[1].txt", tmp_path / ".a[1].txt-mine"
+    foreign.write_text("mine")
+    code = "import os, sys\nfrom sat_intervals.raster import whole_file\n"
+    code += "with whole_file(sys.argv[1]) as new:\n    new.write_text('half')\n    os._exit(9)"
+    assert subprocess.run([sys.executable, "-c", code, path]).returncode == 9
+    assert len(list(tmp_path.iterdir())) == 2
+    with whole_file(path) as new:
+        new.write_text("whole")
+    assert sorted(tmp_path.iterdir()) == [foreign, path]
+    assert (path.read_text(), foreign.read_text()) == ("whole", "mine")
