@@ -42,6 +42,7 @@ _ITEM = "\n  "
 # Exit status of a process ended by SIGPIPE.
 READER_GONE = 141
 _NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
+_NOWHERE = "the working directory was deleted: change to another folder"
 RESUMED = ("match", "demo", "batch", "surface")
 STEPS: dict[str, tuple[click.Command, ...]] = {
     "Try and prepare": (demo, search_range, plan, config),
@@ -80,10 +81,8 @@ class _Commands(click.Group):
             raise click.exceptions.Exit(READER_GONE) from None
 
     def invoke(self, context: click.Context) -> Any:
-        try:
-            os.getcwd()
-        except OSError:
-            _end(USER_ERROR, "the working directory was deleted: change to another folder")
+        if _is_nowhere():
+            _end(USER_ERROR, _NOWHERE)
         # The libraries create two hundred thousand permanent objects. Garbage collection among them takes 0.2 s during
         # imports and 0.5 s at the end.
         gc.set_threshold(5000)
@@ -108,7 +107,17 @@ class _Commands(click.Group):
                 if isinstance(error, BrokenPipeError):
                     raise click.exceptions.Exit(READER_GONE) from None
                 return _end(FAILED, f"stdout cannot be written: {error.strerror}")
-            return _end(*_explained(error))
+            status, message = _explained(error)
+            return _end(status, f"{message}; {_NOWHERE}" if _is_nowhere() else message)
+
+
+def _is_nowhere() -> bool:
+    """Return whether the working directory was deleted."""
+    try:
+        os.getcwd()
+    except OSError:
+        return True
+    return False
 
 
 def _write_steps(formatter: click.HelpFormatter, chosen: Sequence[click.Command]) -> None:
@@ -153,6 +162,8 @@ def _explained(error: Exception) -> tuple[int, str]:
     line = " ".join(str(error).split())
     if isinstance(error, SystemError):  # raised by Python for a library that fails without an exception
         return FAILED, f"a library failed without a reason, probably for lack of memory: {_NO_MEMORY} ({line})"
+    if isinstance(error, RuntimeError) and line.startswith("Symlink loop"):
+        return USER_ERROR, f"{line}: it is a link to itself, choose another path"
     if isinstance(error, ValueError) and line.startswith("A dask config file"):
         return USER_ERROR, f"{line}: fix it, or set DASK_CONFIG to another"
     return FAILED, f"{type(error).__name__}: {line} (this should not happen; --debug shows where)"

@@ -27,5 +27,6 @@ def write(output: Path, head: str, content: dict[str, Any]) -> None:
     from sat_intervals.raster import whole_file
 
     assert _MARK in head.partition("\n")[0]
+    checked_folder(output)  # again, after hours
     with whole_file(output) as new:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")

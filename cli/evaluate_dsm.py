@@ -113,6 +113,7 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
     content = json.dumps({"software": _SOFTWARE} | report, indent=1), surface_markdown(str(given.dsm), report)
+    _check_texts(folder)  # again: a file may have appeared meanwhile
     for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
         with whole_file(path) as new:
             new.write_text(text, encoding="utf-8")
@@ -124,7 +125,6 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
 
 def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
     """Raise if there is no such folder, or if files there would be replaced that are inputs or without a mark."""
-    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.show.marks import check_made_here
 
@@ -132,6 +132,13 @@ def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
         raise click.UsageError(f"--pictures {folder} is no folder: give an existing one.")
     check_not_replaced(inputs, [folder / name for name in (*_TEXTS, *_PICTURES)])
     check_made_here(folder / name for name in _PICTURES)
+    _check_texts(folder)
+
+
+def _check_texts(folder: Path) -> None:
+    """Raise if a text file exists there without a mark."""
+    from sat_intervals.errors import SatIntervalsError
+
     for path in (folder / name for name in _TEXTS):
         if path.exists() and not path.read_bytes().startswith(tuple(mark.encode() for mark in _MARKS)):
             raise SatIntervalsError(f"{path} exists and was not made by sat-intervals: move it away")

@@ -19,6 +19,10 @@ class RunError(SatIntervalsError):
     """A run that failed although its arguments are correct; finished tiles are kept, so it can be resumed."""
 
 
+class RemovedTilesError(RunError):
+    """Tiles that the run itself removed, since they cannot be trusted."""
+
+
 def check_regular(path: str | os.PathLike[str], way_out: str = "give a regular file") -> None:
     """Raise if a path is a local pipe, socket or device: reading it could block forever, and it must not be replaced.
 

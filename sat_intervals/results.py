@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, NonNegativeInt, PositiveInt, ValidationError
 
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
@@ -17,6 +18,7 @@ from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import (
     Georeferencing,
     Image,
+    check_alone,
     open_image,
     read_layers,
     read_shape,
@@ -24,13 +26,57 @@ from sat_intervals.raster import (
     read_small_layers,
     read_window,
 )
-from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, watched
+from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, stamp_of, watched
 from sat_intervals.tiling import Window, strips
 
 # Pixels in a strip, and band count of each file.
 _STRIP = 1 << 23
 _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
 _REGION = ("row", "column", "height", "width")
+# Digits of integers in a report: longer ones fit no type of an array.
+_DIGITS = 18
+
+
+class _Section(BaseModel, strict=True):
+    """What commands need of a section of ``run.json``; what has a default, earlier versions did not write."""
+
+
+class _File(_Section):
+    path: str
+
+
+class _Input(_File):
+    band: PositiveInt
+    height: PositiveInt
+    width: PositiveInt
+    nodata: str | None
+    mask: _File | None
+
+
+class _Counts(_Section):
+    pixels: PositiveInt
+    valid: NonNegativeInt
+    low_confidence: NonNegativeInt
+    causes: dict[str, NonNegativeInt] = {}
+    range_ends: dict[str, NonNegativeInt] = {}
+    median_interval_width: float | None
+
+
+class _Search(_Section):
+    matched: float
+    levels: list[dict[str, float]]
+    histogram: dict[str, list[float]]
+    cells: dict[str, Any] = {}
+
+
+class _Report(_Section):
+    finished: str
+    inputs: dict[str, _Input]
+    counts: _Counts
+    versions: dict[str, Any]
+    search: _Search | None = None
+    local_ranges: dict[str, Any] | None = None
+    normalization: dict[str, dict[str, float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -63,14 +109,14 @@ class Run:
     region
         The pixels of the left image that were matched. Rows and columns of the results count from its first pixel.
     which
-        Identity of ``run.json``, see `_which`. A new run removes that file first and writes it last.
+        Stamps of ``run.json`` and the rasters, which change when they are replaced.
     """
 
     out: Path
     report: dict[str, Any]
     config: Config
     region: Window
-    which: tuple[int, int] | None
+    which: tuple[str | None, ...]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -102,7 +148,7 @@ class Run:
         try:
             yield
         finally:
-            if _which(self.out / "run.json") != self.which:
+            if _which(self.out) != self.which:
                 raise RunError(f"the run in {self.out} was replaced while it was read: rerun the command")
         check_others()
 
@@ -218,11 +264,14 @@ def open_run(out: str | Path) -> Run:
     file = out / "run.json"
     try:
         check_regular(file)
-        which = _which(file)
-        report = json.loads(file.read_text(encoding="utf-8"))
+        which = _which(out)
+        report = json.loads(file.read_text(encoding="utf-8"), parse_int=_integer)
+        json.dumps(report, ensure_ascii=False, allow_nan=False).encode()  # raises for NaN and lone surrogates
         config = load_config(report["settings"])
-        for side in ("left", "right"):
-            _check_input(report["inputs"][side])
+        images = {side: report["inputs"][side] for side in ("left", "right")}  # MC-CNN has weights, too
+        _Report.model_validate(report | {"inputs": images})
+        for image in images.values():
+            _nodata(image)
         region = Window(**{name: index(report["tiles"]["region"][name]) for name in _REGION})
         files = {
             name: {key: index(file[key]) for key in ("bytes", "crc32")}
@@ -233,18 +282,16 @@ def open_run(out: str | Path) -> Run:
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
-        raise SatIntervalsError(f"{file} is not the report of a run: rerun match with --overwrite") from error
+        where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
+        raise SatIntervalsError(f"{file} is not the report of a run{where}: rerun match with --overwrite") from error
     for name, bands in _BANDS.items():
         _check_raster(out / name, bands, region, files.get(name))
     return Run(out, report, config, region, which)
 
 
-def _which(file: Path) -> tuple[int, int] | None:
-    """Return the identity of a file, which changes when it is replaced; None if it is missing."""
-    with suppress(OSError):
-        status = file.stat()
-        return status.st_ino, status.st_mtime_ns
-    return None
+def _which(out: Path) -> tuple[str | None, ...]:
+    """Return the stamps of the files of a run, None for one that is missing."""
+    return tuple(stamp_of(str(out / name)) for name in ("run.json", *_BANDS))
 
 
 def _input_files(inputs: Any) -> Iterator[str]:
@@ -255,14 +302,11 @@ def _input_files(inputs: Any) -> Iterator[str]:
         yield inputs["path"]
 
 
-def _check_input(record: dict[str, Any]) -> None:
-    """Raise if a report lacks what is needed to reopen an image."""
-    Path(record["path"])
-    for name in ("band", "height", "width"):
-        index(record[name])
-    _nodata(record)
-    if record["mask"] is not None:
-        Path(record["mask"]["path"])
+def _integer(text: str) -> int:
+    """Return an integer of a report; raise if it is too long to be one."""
+    if len(text) > _DIGITS:
+        raise ValueError(text)
+    return int(text)
 
 
 def _nodata(record: dict[str, Any]) -> float | None:
@@ -280,6 +324,7 @@ def _check_raster(file: Path, bands: int, region: Window, published: dict[str, i
         raise _damaged(file, f"has {file.stat().st_size} bytes, by run.json {published['bytes']}")
     if published and published != checksum_of(file):
         raise _damaged(file, "is not what the run published")
+    check_alone(file)
     found, needed = read_shape(file), (bands, region.height, region.width)
     if found != needed:
         raise SatIntervalsError(

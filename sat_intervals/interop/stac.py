@@ -69,6 +69,7 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
         item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
     with whole_file(file) as new:
         new.write_text(json.dumps(item, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        _check_own(file)  # again: a file may have appeared meanwhile
     return file
 
 

@@ -10,6 +10,7 @@ from sat_intervals.raster.heightfield import HeightRaster
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files, watched_rasters
 from sat_intervals.raster.layers import (
     MARK,
+    check_alone,
     check_made_by,
     check_marked,
     is_marked,
@@ -55,6 +56,7 @@ __all__ = [
     "Part",
     "Projection",
     "Vertical",
+    "check_alone",
     "check_made_by",
     "check_marked",
     "check_pair",

@@ -23,6 +23,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.blocks import AROUND, BLOCK, factors, tiled
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.seal import sealed, with_room
 
 # Side of a block of the template, the smallest of GDAL's COG driver: larger ones take time and hold nothing.
 _SMALL = 128
@@ -62,7 +63,7 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch
     predictor = {"PREDICTOR": file.predictor} if file.compression in ("deflate", "zstd") else {}
     options = {"COMPRESS": file.compression.upper(), "OVERVIEW_RESAMPLING": "NEAREST", "BLOCKSIZE": _SMALL, **predictor}
     kind |= tiled(file) | {"blockxsize": _SMALL, "blockysize": _SMALL, "height": _SMALL + 1, "width": _SMALL + 1}
-    with Env():
+    with Env(GDAL_TIFF_ENDIANNESS="LITTLE"):
         with gdal.create(str(small), **kind, **place.creation_options()) as dataset:
             dataset.update_tags(**tags)
             file.describe(dataset)
@@ -74,7 +75,13 @@ def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch
 
 
 def assemble(
-    path: Path, made: bytes, shape: tuple[int, int], levels: Sequence[Sequence[Part]], copy_parts: CopyParts
+    path: Path,
+    made: bytes,
+    shape: tuple[int, int],
+    levels: Sequence[Sequence[Part]],
+    copy_parts: CopyParts,
+    *,
+    is_sealed: bool = False,
 ) -> dict[str, int]:
     """Write a file from the rows of blocks of each level, see `factors`; return its size and CRC-32.
 
@@ -90,12 +97,17 @@ def assemble(
         Rows of blocks of each level, from the top.
     copy_parts
         Writes them into the file.
+    is_sealed
+        Whether the file gets its CRC-32, see `seal`.
     """
-    head = header(made, shape, [[size for part in level for size in part.sizes] for level in levels])
+    sizes = [[size for part in level for size in part.sizes] for level in levels]
+    head = header(made, shape, sizes, is_sealed=is_sealed)
     parts = [part for level in reversed(levels) for part in level]
-    checksum = zlib.crc32(head)
+    body = length = 0
     for part in parts:
-        checksum = combined(checksum, part.checksum, part.length)
+        body, length = combined(body, part.checksum, part.length), length + part.length
+    if is_sealed:
+        head = sealed(head, combined(zlib.crc32(head), body, length))
     *offsets, size = accumulate((part.length for part in parts), initial=len(head))
     with open(path, "wb") as stream:
         stream.write(head)
@@ -105,10 +117,10 @@ def assemble(
         os.fsync(stream.fileno())
     if (found := path.stat().st_size) != size:
         raise OSError(errno.EIO, f"{found} of {size} bytes were written")
-    return {"bytes": size, "crc32": checksum}
+    return {"bytes": size, "crc32": combined(zlib.crc32(head), body, length)}
 
 
-def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) -> bytes:
+def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]], *, is_sealed: bool = False) -> bytes:
     """Return all that comes before the first block of a file.
 
     Parameters
@@ -119,8 +131,11 @@ def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) 
         Rows and columns.
     sizes
         Bytes of the blocks of each level, row by row.
+    is_sealed
+        Whether there is room for the CRC-32 of the file.
     """
     ghost, (whole, overview) = _parsed(made)
+    ghost = with_room(ghost) if is_sealed else ghost
     directories = []
     for factor, of_level in zip(factors(*shape), sizes, strict=True):
         height, width = (-(-side // factor) for side in shape)

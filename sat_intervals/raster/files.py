@@ -10,7 +10,10 @@ from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, TRUTH
 
 @dataclass(frozen=True)
 class File:
-    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression."""
+    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression.
+
+    One that ``is_sealed`` has its CRC-32 in it, see `seal`; those of the others are in reports.
+    """
 
     name: str
     dtype: str
@@ -20,6 +23,7 @@ class File:
     predictor: str = "NO"
     driver: str = "COG"
     compression: str = "deflate"
+    is_sealed: bool = False
 
     @property
     def kind(self) -> str:
@@ -56,9 +60,9 @@ def run_files(compression: str) -> tuple[File, File]:
 
 def surface_file(name: str) -> File:
     """Return the properties of a surface model's file."""
-    return File(name, "float32", float("nan"), SURFACE)
+    return File(name, "float32", float("nan"), SURFACE, is_sealed=True)
 
 
 def truth_file(name: str) -> File:
     """Return the properties of a file of true disparities."""
-    return File(name, "float32", float("nan"), TRUTH)
+    return File(name, "float32", float("nan"), TRUTH, is_sealed=True)

@@ -168,6 +168,31 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
             )
 
 
+def differing(files: Mapping[str, Mapping[str, Any]]) -> str | None:
+    """Return the first local input of a run, by name, whose content is not that of its `identity`; None if none is.
+
+    It reads all files: a memory map may change a file without its times.
+
+    Raises
+    ------
+    RunError
+        A file cannot be read.
+    """
+    for name, known in files.items():
+        if "sha256" in known and (file := _local_file(name)):
+            try:
+                with open(file, "rb") as stream:
+                    found = hashlib.file_digest(stream, "sha256").hexdigest()
+            except OSError as error:
+                raise RunError(
+                    f"{name} cannot be read: {error.strerror}: rerun the same command: it resumes"
+                ) from error
+            if found != known["sha256"]:
+                _sha256.cache_clear()
+                return name
+    return None
+
+
 def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
     """Return a function that raises if a file was made, replaced or changed since; None and remote files are ignored.
 

@@ -1,7 +1,9 @@
 """Open images, and check that two make an epipolar pair."""
 
+import html
 import logging
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -15,10 +17,13 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import stamp_of, watched
+from sat_intervals.raster.seal import check_seal
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
+# Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
+_IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
 
@@ -99,6 +104,8 @@ def open_image(
     name = _absolute(path)
     stamp = stamp_of(name)
     with opened(name) as dataset:
+        _check_watched(name, dataset)
+        check_seal(name, dataset.files)
         bands, alphas = _kinds(dataset)
         band = _chosen(name, bands, band)
         for file in dataset.files:
@@ -223,18 +230,47 @@ def _check_mask(image: Image, mask: str) -> None:
             )
 
 
+def _check_watched(name: str, dataset: DatasetReader) -> None:
+    """Raise if a raster is read from files that GDAL does not list: nobody would notice that they change."""
+    if any(map(os.path.isdir, (name, *dataset.files))) or dataset.driver == "GTI" or "/vsisparse/" in name:
+        raise InputError(
+            f"{name} is read from files that GDAL does not list, which may change during a run: convert it with "
+            "gdal_translate"
+        )
+
+
+def _sources(path: str) -> list[str]:
+    """Return the sources of a virtual raster, or of its text, that are no plain files: GDAL does not list these."""
+    text = path
+    if path.endswith((".vrt", ".VRT")) and os.path.isfile(path):
+        text = Path(path).read_text(encoding="utf-8", errors="replace")
+    found = re.findall(r"<Source(?:Filename|Dataset)\b[^>]*>([^<]+)<", text) if "<VRTDataset" in text else []
+    return [name for name in map(html.unescape, found) if _IN_ANOTHER.match(name)]
+
+
 def other_files(name: str) -> list[str]:
-    """Return the other files that a raster is read from: its mask file, sources of a virtual raster and their masks."""
+    """Return the other files that a raster is read from: its mask file, sources of a virtual raster and their masks.
+
+    Raises
+    ------
+    InputError
+        GDAL does not list all of them.
+    """
     seen: list[str] = []
+    asked: list[str] = []
     waiting = [name]
     while waiting:
         path = waiting.pop()
         _check_beside(path)
         try:
             with gdal.reading(path) as dataset:
+                _check_watched(path, dataset)
                 files = dataset.files
         except gdal.GDAL_ERRORS:  # a sidecar file that is not a raster
             continue
+        found = [source for source in _sources(path) if source not in asked]
+        asked += found
+        waiting += found
         new = [file for file in files if file not in seen and Path(file).resolve() != Path(name).resolve()]
         seen += new
         # no pipes, since opening one could block; of remote files only virtual rasters

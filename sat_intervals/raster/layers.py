@@ -4,7 +4,6 @@ import errno
 import os
 import re
 import shutil
-import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +21,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.publishing import OutputError, stamps
+from sat_intervals.raster.seal import check_beside
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
 
@@ -45,7 +45,8 @@ def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give the block a temporary file to write; rename it to ``path`` at the end, or delete it on failure.
 
-    A symbolic link at ``path`` is replaced, not followed.
+    A symbolic link at ``path`` is replaced, not followed. What a killed process left is deleted, see
+    `LocalFolder.scratch`.
 
     Raises
     ------
@@ -53,16 +54,13 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         Names ``path`` and the system's reason.
     """
     path = Path(path)
-    new = path.with_name(f".{uuid.uuid4().hex}-{path.name}")
     try:
-        yield new
-        os.replace(new, path)
+        with LocalFolder(path.parent).scratch(path.name) as folder:
+            yield folder / path.name
+            os.replace(folder / path.name, path)
     except (*gdal.GDAL_ERRORS, OSError) as error:
         reason = getattr(error, "strerror", None) or gdal.reason(error)
         raise OutputError(f"{path} cannot be written: {reason}: make room or check its rights") from error
-    finally:
-        with suppress(OSError):
-            new.unlink()
 
 
 @contextmanager
@@ -91,6 +89,7 @@ def _settle(files: Sequence[Path], report: Path) -> None:
         ours = re.compile(rf"\.sat-intervals\.(?:[0-9a-f]+-[0-9a-f]+|none)\.{re.escape(file.name)}")
         for kept in [other for other in file.parent.iterdir() if ours.fullmatch(other.name)]:
             if kept == _aside(file, report):
+                check_marked(file)  # of the user's, since the process was killed
                 os.replace(kept, file)
             kept.unlink(missing_ok=True)  # os.replace does nothing between links to the same file
 
@@ -117,12 +116,13 @@ def write_rows(
     rows: Iterable[np.ndarray],
     shape: tuple[int, int, int],
     georeferencing: Georeferencing,
+    tags: Mapping[str, str],
 ) -> None:
-    """Write int16 rows, ``(bands, some, columns)`` from the top, as a tiled, compressed GeoTIFF with `MARK`.
+    """Write int16 rows, ``(bands, some, columns)`` from the top, as a tiled, compressed GeoTIFF with `MARK` and tags.
 
     ``shape`` has the numbers of bands, rows and columns.
     """
-    _write(path, rows, np.dtype(np.int16), shape, georeferencing, MARK)
+    _write(path, rows, np.dtype(np.int16), shape, georeferencing, {**MARK, **tags})
 
 
 def _write(
@@ -151,6 +151,8 @@ def _write(
                 difference -= sum_of_bits(dataset.read(window=RasterioWindow(0, window.row, width, window.height)))
         if difference % SUM_WRAPS:
             raise OSError(errno.EIO, "the content read back differs from that written")
+        if MARK.items() <= tags.items():
+            check_marked(Path(path))  # again: a file may have appeared meanwhile
 
 
 def sum_of_bits(bands: np.ndarray) -> int:
@@ -222,6 +224,12 @@ def check_made_by(path: Path, command: str, tag: str, value: str | None = None) 
             raise SatIntervalsError(
                 f"{path} exists and was not made by sat-intervals {command}, or by an earlier version: move it away"
             )
+
+
+def check_alone(path: str | os.PathLike[str]) -> None:
+    """Raise if files beside one of our rasters change what GDAL reads from it, see `check_beside`."""
+    with opened(str(path)) as dataset:
+        check_beside(os.fspath(path), dataset.files)
 
 
 def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:

@@ -164,7 +164,7 @@ class OutputWriter:
             made = template(file, self._georeferencing, self._tags, self._scratch / name)
             # a name of its own: a worker that was lost must not write into the file of a later run
             path = self._scratch / f"strips-{uuid.uuid4().hex}-{name}"
-            self._made[name] = assemble(path, made, self._shape, levels, copy_parts)
+            self._made[name] = assemble(path, made, self._shape, levels, copy_parts, is_sealed=file.is_sealed)
             os.replace(path, self._scratch / name)
 
     def build(self) -> dict[str, dict[str, int]]:

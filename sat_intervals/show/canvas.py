@@ -12,6 +12,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import whole_file
+from sat_intervals.show.marks import check_made_here
 
 try:
     from matplotlib import rc_context
@@ -34,13 +35,14 @@ _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 
 
 @contextmanager
 def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterator[Figure]:
-    """Yield a figure of ``size`` inches and write it as a PNG file at the end."""
+    """Yield a figure of ``size`` inches and write it as a PNG file at the end; a foreign file is kept."""
     with rc_context(_STYLE):
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
         with whole_file(path) as new:
             figure.savefig(new, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
+            check_made_here([path])  # again: a file may have appeared meanwhile
 
 
 def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:

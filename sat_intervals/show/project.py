@@ -104,6 +104,7 @@ def write_project(out: str | Path) -> Written:
         with whole_file(file) as new, zipfile.ZipFile(new, "w") as archive:
             # stored, so that the mark is in the first bytes
             archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(_project(run, layers), _HEAD))
+            check_made_here([file])  # again: a file may have appeared meanwhile
     return Written([*written.files, file], written.notes)
 
 

@@ -82,6 +82,7 @@ def test_batch__prints_the_state_of_each_pair_as_json(pair, tmp_path):
     assert "nowhere.tif" in found[str(tmp_path / "out" / "b")]["error"]
 
 
+@pytest.mark.process
 def test_completion__knows_commands_and_options():
     for words, expected in (
         ("sat-intervals pro", "plain,project\n"),

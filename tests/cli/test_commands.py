@@ -112,7 +112,7 @@ def assert_nothing_final(out):
 def done(folder, tmp_path_factory):
     """A run with nothing out of the ordinary: its folder and what it printed."""
     out = tmp_path_factory.mktemp("done") / "out"
-    return out, command(*matching(folder, out, "--tile-size", 64, "--overlap", 20))
+    return out, invoke(*matching(folder, out, "--tile-size", 64, "--overlap", 20))
 
 
 # ---- What is refused before a pixel is read -------------------------------------------------------------------
@@ -534,7 +534,7 @@ def test_match__on_a_disk_without_room_for_the_files_is_refused_and_goes_on_once
 # ---- What a run prints ------------------------------------------------------------------------------------------
 def test_match__prints_plain_lines_and_a_table(done):
     out, result = done
-    assert (result.returncode, result.stderr) == (0, "")
+    assert (result.exit_code, result.stderr) == (0, "")
     assert "\x1b" not in result.stdout
     lines = result.stdout.splitlines()
     assert lines[0].startswith("preparing kernels")

@@ -15,7 +15,7 @@ from sat_intervals.demo import make_scene
 def pair(tmp_path_factory):
     """A pair with truth; beside it settings with an alpha, and a calibration."""
     folder = tmp_path_factory.mktemp("pair")
-    settings = write_pair(folder, make_scene(200, 260), interval={"alpha": 0.8})
+    settings = write_pair(folder, make_scene(120, 160), interval={"alpha": 0.8})
     own = calibration(load_config(settings), 36.25, 12.5, 0.9)
     (folder / "own.yaml").write_text(yaml.safe_dump(own))
     return folder

@@ -113,6 +113,7 @@ def test_open__refuses_what_is_no_run(tmp_path):
         sat_intervals.open(tmp_path)
 
 
+@pytest.mark.process
 def test_accessor__is_registered_on_first_use_only() -> None:
     code = "import sat_intervals, xarray as xr; a = hasattr(xr.Dataset, 'intervals'); sat_intervals.open; "
     code += "print(a, hasattr(xr.Dataset, 'intervals'))"

@@ -233,7 +233,7 @@ def test_draw_errors__holds_a_strip_at_a_time(tmp_path, unrendered):
     height, width = 6_000, 200
     (tmp_path / "small").mkdir()
     small = open_results(write_run(tmp_path / "small", *random_bands(60, 50)))
-    draw_errors(small, tmp_path / "errors.png", dpi=50)  # what is imported and kept is not counted
+    draw_errors(small, tmp_path / "small" / "errors.png", dpi=50)  # what is imported and kept is not counted
     results = open_results(write_run(tmp_path, *random_bands(height, width)))
     tracemalloc.start()
     draw_errors(results, tmp_path / "errors.png", dpi=50)

@@ -40,6 +40,7 @@ def write_report(results: Results) -> Path:
     page = re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], page)
     with whole_file(path) as new:
         new.write_text(page, encoding="utf-8")
+        check_made_here([path])  # again: a file may have appeared meanwhile
     return path
 
 

@@ -1,0 +1,42 @@
+"""A run.json that was edited by hand: one line that names it, whatever reads it."""
+
+import json
+
+import pytest
+from finished import random_bands, write_run
+from helpers import invoke
+
+EDITS = {
+    "finished": 7,
+    "inputs.left.path": "\ud800.tif",
+    "inputs.right.width": True,
+    "inputs.left.height": 10**400,
+    "tiles.region.row": 10**400,
+    "counts": [1],
+    "counts.pixels": "abc",
+    "counts.causes": {"occlusion": "many"},
+    "counts.median_interval_width": float("nan"),
+    "versions": "0.1",
+    "versions.python": float("inf"),
+    "local_ranges": {"rows": "abc"},
+    "search": {"matched": 0.5, "levels": [], "histogram": {"edges": ["a"], "counts": []}},
+    "normalization": {"left": 5},
+}
+
+
+@pytest.mark.parametrize("place", EDITS)
+def test_commands__name_a_report_that_was_edited(tmp_path, place):
+    out = write_run(tmp_path, *random_bands(20, 30))
+    report = json.loads((out / "run.json").read_text())
+    *sections, name = place.split(".")
+    section = report
+    for key in sections:
+        section = section[key]
+    section[name] = EDITS[place]
+    (out / "run.json").write_text(json.dumps(report))
+    commands = ["report", out], ["stac", out], ["export", out, tmp_path / "to", "--to", "otb"]
+    for command in commands[:1] if place == "local_ranges" else commands:
+        done = invoke(*command)
+        assert done.exit_code == 2
+        assert done.stderr.count("\n") == 1
+        assert "run.json is not the report of a run" in done.stderr or "local ranges of the run are dam" in done.stderr
