@@ -23,6 +23,7 @@ from sat_intervals.raster import (
     is_surface,
     north_up,
     read_place,
+    stamps,
     surface_file,
     utm_of,
     watched_rasters,
@@ -88,9 +89,9 @@ def make_surface(
     path, geoid = Path(path), None if geoid is None else Path(geoid)
     inputs = [*(Path(out) / "points.tif" for out in outs), geoid, resolution if isinstance(resolution, Path) else None]
     check_unchanged = watched_rasters(inputs)
+    there = stamps(path.parent, [path.name])
     grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius)
-    for run in (runs := triangulated([Path(out) for out in outs])):
-        run.check_kept([path], inputs)
+    runs = _runs(outs, path, inputs)
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
@@ -108,17 +109,28 @@ def make_surface(
             progress("cells", row + strip.bands.shape[1], cells.rows)
         check_unchanged()
         progress("files", 0, 1)
-        writer.publish()
+        writer.publish(replaceable=there)
         progress("files", 1, 1)
     return {
         "crs": projection.crs,
-        **{name: getattr(cells, name) for name in ("rows", "columns")},
-        **{name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")},
+        **_counts(cells, clouds),
         **tally.report(cells.rows * cells.columns),
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
         "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
     }
+
+
+def _counts(cells: Cells, clouds: Sequence[PointCloud]) -> dict[str, int]:
+    points = {name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")}
+    return {"rows": cells.rows, "columns": cells.columns, **points}
+
+
+def _runs(outs: Sequence[str | Path], path: Path, inputs: Sequence[Path | None]) -> list[Run]:
+    runs = triangulated([Path(out) for out in outs])
+    for run in runs:
+        run.check_kept([path], inputs)
+    return runs
 
 
 def checked_cells(

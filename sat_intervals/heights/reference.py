@@ -28,6 +28,7 @@ from sat_intervals.raster import (
     Projection,
     Vertical,
     check_made_by,
+    stamps,
     truth_file,
     utm_of,
     watched_rasters,
@@ -117,6 +118,7 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
+    there = stamps(path.parent, [path.name])
     check_made_by(path, "reference", "REFERENCE")
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     check_unchanged = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])
@@ -138,7 +140,7 @@ def make_truth(
         check_unchanged()
         tally.check(reference.path, work.place)
         progress("files", 0, 1)
-        writer.publish()
+        writer.publish(replaceable=there)
         progress("files", 1, 1)
     return tally.report() | {"row_misfit": work.row_misfit, "registration": found and found.report()}
 

@@ -67,7 +67,6 @@ def triangulate(
     from sat_intervals.heights.sensors import Lattice, Sensors  # needs the extra `dsm`
 
     run = open_run(out)
-    _check_own(run.out)
     run.check_kept(
         [run.out / name for name in (POINTS_FILE, POINTS_REPORT)], [left_model, right_model, left_grid, right_grid]
     )
@@ -79,6 +78,7 @@ def triangulate(
     tags = {"RUN": run.report["finished"], "LEFT_MODEL": str(left_model), "RIGHT_MODEL": str(right_model)}
     tally = _Tally()
     with OutputWriter(run.out, POINT_FILES, *run.shape, run.georeferencing, tags) as writer:
+        _check_own(run.out)  # now that the writer knows which files there are: it replaces no others
         for window, disparities in _strips(run):
             bands = _bands(lattice, window, disparities)
             writer.write(window.row, bands)

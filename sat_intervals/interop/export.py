@@ -114,10 +114,10 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     rasters = FORMATS[form](prefix, run.config)
     files = [file for file, _ in rasters]
     run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
-    for file in files:
-        check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
     place = Georeferencing(transform=run.left_georeferencing.transform if form == "otb" else None)
     with OutputWriter(folder, files, *shape, place, {**MARK, _FORMAT: form}) as writer:
+        for file in files:  # now that the writer knows which files there are: it replaces no others
+            check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))

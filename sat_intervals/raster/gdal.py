@@ -24,7 +24,7 @@ _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__
 _LOCK = threading.Lock()
 
 # A failure without a message is none to rasterio: it returns zeros. Failures in GDAL's own threads have no message in
-# this one, and a source of a VRT that one thread cannot open fails in another without any.
+# this one. A source of a VRT that cannot be opened fails without any in each other dataset until the first is closed.
 _ONE_THREAD = {"GDAL_NUM_THREADS": "1", "VRT_NUM_THREADS": "1"}
 _OF_SOURCES = threading.RLock()
 
@@ -34,13 +34,10 @@ def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
     """Open a raster for reading; thread-safe. Only one thread of a process reads VRTs."""
     _accept_no_georeferencing()
     # rasterio casts the no-data value to the type: -1.8e308, of ArcGIS, overflows float32
-    with (
-        Env(**_ONE_THREAD),
-        np.errstate(over="ignore"),
-        DatasetReader(path, **options) as dataset,
-        _OF_SOURCES if dataset.driver == "VRT" else nullcontext(),
-    ):
-        yield dataset
+    with Env(**_ONE_THREAD), np.errstate(over="ignore"):
+        dataset = DatasetReader(path, **options)
+        with _OF_SOURCES if dataset.driver == "VRT" else nullcontext(), dataset:
+            yield dataset
 
 
 def create(path: str, **options: Any) -> DatasetWriter:

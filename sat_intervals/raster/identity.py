@@ -4,12 +4,14 @@ import hashlib
 import os
 import re
 import zlib
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import lru_cache
 from http.client import HTTPException
 from pathlib import Path
+from threading import Event
 from typing import Any
 from urllib.request import Request, urlopen
 
@@ -92,9 +94,15 @@ def _of_file(file: Path, before: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _stamp(file: str | Path) -> str:
-    """Return inode, size and times of a file: any change of the file changes them."""
-    status = os.stat(file)
-    return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}"
+    """Return inode, size and times of a file, and those of links on its path: any change of the file changes them."""
+    status, place = os.stat(file), Path(file)
+    links = [os.lstat(link) for link in (place, *place.parents) if os.path.islink(link)]
+    return "".join(
+        [
+            f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}",
+            *(f"/{link.st_ino:x}-{link.st_ctime_ns:x}" for link in links),
+        ]
+    )
 
 
 def _hashed(file: str | Path) -> tuple[str, str]:
@@ -168,28 +176,57 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
             )
 
 
-def differing(files: Mapping[str, Mapping[str, Any]]) -> str | None:
-    """Return the first local input of a run, by name, whose content is not that of its `identity`; None if none is.
-
-    It reads all files: a memory map may change a file without its times.
+@contextmanager
+def unchanged(files: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
+    """Raise after the block, which reads inputs of a run, if they are not those of before.
 
     Raises
     ------
+    ChangedInputError
+        See `check_unchanged`.
     RunError
-        A file cannot be read.
+        An input has its content of before, but was touched meanwhile: it may have been another one for a moment.
     """
+    before = {name: stamp_of(name) for name in files}
+    try:
+        yield
+    finally:  # a changed input explains a read error
+        check_unchanged(files)
+        for name, stamp in before.items():
+            if stamp_of(name) != stamp:
+                raise RunError(f"{name} was touched or replaced while it was read: rerun the same command: it resumes")
+
+
+@contextmanager
+def compared(files: Mapping[str, Mapping[str, Any]]) -> Iterator[Callable[[], str | None]]:
+    """Compare the content of inputs of a run with their `identity` during the block, in a thread.
+
+    It reads all local files: a memory map may change a file without its times. The function given waits for the end and
+    returns the name of the first file that differs, None if none does. It raises RunError if a file cannot be read.
+    """
+    is_over = Event()
+    with ThreadPoolExecutor(1) as thread:
+        found = thread.submit(_differing, files, is_over)
+        try:
+            yield found.result
+        finally:
+            is_over.set()
+
+
+def _differing(files: Mapping[str, Mapping[str, Any]], is_over: Event) -> str | None:
     for name, known in files.items():
-        if "sha256" in known and (file := _local_file(name)):
-            try:
-                with open(file, "rb") as stream:
-                    found = hashlib.file_digest(stream, "sha256").hexdigest()
-            except OSError as error:
-                raise RunError(
-                    f"{name} cannot be read: {error.strerror}: rerun the same command: it resumes"
-                ) from error
-            if found != known["sha256"]:
-                _sha256.cache_clear()
-                return name
+        if "sha256" not in known or (file := _local_file(name)) is None:
+            continue
+        digest = hashlib.sha256()
+        try:
+            with open(file, "rb") as stream:
+                while not is_over.is_set() and (block := stream.read(1 << 20)):
+                    digest.update(block)
+        except OSError as error:
+            raise RunError(f"{name} cannot be read: {error.strerror}: rerun the same command: it resumes") from error
+        if digest.hexdigest() != known["sha256"]:
+            _sha256.cache_clear()
+            return name
     return None
 
 

@@ -17,7 +17,7 @@ from sat_intervals.match.postprocess import ConfidenceScale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
-from sat_intervals.raster.identity import differing
+from sat_intervals.raster.identity import compared
 from sat_intervals.run.copying import assemble_files
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
@@ -78,7 +78,11 @@ def assemble(
     files = run_files(job.config.products.compression)
     records = job.store.records()
     scale = checked_scale(job, records)
-    with _resumable(), OutputWriter(job.out, files, region.height, region.width, place, _tags(job.config)) as writer:
+    with (
+        _resumable(),
+        OutputWriter(job.out, files, region.height, region.width, place, _tags(job.config)) as writer,
+        compared(job.files) as differing,  # no step reads images any more
+    ):
         with logged_stage(seconds, "bands"):
             parts, workers = finish_strips(job, client, scale, records, progress)
         with logged_stage(seconds, "files"):
@@ -87,7 +91,7 @@ def assemble(
             steps = len(files) * len(parts)
             progress("files", steps, steps)  # a last chance to interrupt the run before it publishes
         with logged_stage(seconds, "inputs"):
-            _check_content(job)
+            _check_content(job, differing())
         _add_seconds(seconds, records)
         report = _report(job, records, scale, parts.values(), seconds, writer.build())
         for line in report["warnings"]:
@@ -97,9 +101,8 @@ def assemble(
     return report
 
 
-def _check_content(job: Job) -> None:
+def _check_content(job: Job, name: str | None) -> None:
     """Raise if the content of an input differs. If its times do not, no tile can be trusted: all are removed."""
-    name = differing(job.files)
     if name is not None:
         job.check_inputs()
         job.store.remove()

@@ -175,6 +175,22 @@ def test_make_surface__ends_where_points_or_geoid_are_replaced_after_their_check
     assert not (tmp_path / "dsm.tif").exists()
 
 
+def test_make_surface__keeps_a_file_that_appears_after_the_check(tmp_path, monkeypatch):
+    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
+    triangulated = of_dsm.triangulated
+
+    def triangulated_late(outs):
+        (tmp_path / "dsm.tif").write_text("mine")
+        return triangulated(outs)
+
+    monkeypatch.setattr(of_dsm, "triangulated", triangulated_late)
+    with pytest.raises(
+        SatIntervalsError, match=r"dsm.tif is not of this run, or was changed since it started: move it"
+    ):
+        surface_of([out], tmp_path)
+    assert (tmp_path / "dsm.tif").read_text() == "mine"
+
+
 def test_point_cloud__ends_where_points_are_replaced_before_outliers_are_found(tmp_path, monkeypatch):
     x, y = np.meshgrid(np.arange(20.0), -np.arange(20.0))
     out = write_points(tmp_path / "a", x, y, 10 + 0 * x)

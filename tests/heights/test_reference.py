@@ -22,6 +22,7 @@ from sat_intervals.raster import MARK, Georeferencing, Projection, Vertical, wri
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
+    from sat_intervals.heights.sensors import Sensors
     from sat_intervals.heights.triangulate import triangulate
 
 pytestmark = [
@@ -376,6 +377,22 @@ def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_
     with pytest.raises(RunError, match=r"heights.tif was replaced or changed while it was read: rerun the command"):
         make_truth(out, SensorFiles(*files), given_heights, path=tmp_path / "truth.tif", progress=replace)
     assert not (tmp_path / "truth.tif").exists()
+
+
+def test_make_truth__keeps_a_file_that_appears_after_the_check(relief, tmp_path, monkeypatch):
+    out, files, reference = relief
+    truth = tmp_path / "truth.tif"
+    load = Sensors.load
+
+    def loaded_late(*files, **options):
+        truth.write_text("mine")
+        return load(*files, **options)
+
+    monkeypatch.setattr(Sensors, "load", loaded_late)
+    heights = Reference(reference, False, Vertical(True, None))
+    with pytest.raises(SatIntervalsError, match=r"truth.tif is not of this run, or was changed since it started"):
+        make_truth(out, SensorFiles(*files), heights, path=truth, registers=False)
+    assert truth.read_text() == "mine"
 
 
 def test_make_truth__deletes_the_points_that_a_killed_one_left(relief, tmp_path):

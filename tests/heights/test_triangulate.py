@@ -361,6 +361,20 @@ def test_triangulate__keeps_foreign_points(level_run):
     triangulate(out, *files)
 
 
+def test_triangulate__keeps_points_that_appear_after_the_models_are_read(level_run, monkeypatch):
+    out, files = level_run
+    read_grid = of_sensors.read_grid
+
+    def read_late(path, **options):
+        (out / "points.tif").write_bytes(b"mine")
+        return read_grid(path, **options)
+
+    monkeypatch.setattr(of_sensors, "read_grid", read_late)
+    with pytest.raises(SatIntervalsError, match=r"points.tif exists and was not made by triangulate"):
+        triangulate(out, *files)
+    assert (out / "points.tif").read_bytes() == b"mine"
+
+
 @pytest.mark.parametrize("place", range(4))
 def test_triangulate__ends_where_a_model_or_grid_is_replaced_meanwhile(level_run, monkeypatch, place):
     out, files = level_run

@@ -11,7 +11,10 @@ from helpers import invoke
 from numpy.testing import assert_array_equal
 from rasterio.transform import Affine
 
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.interop.export import export
 from sat_intervals.products import INVALID
+from sat_intervals.results import Run
 
 # Epipolar images have no georeferencing.
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -117,6 +120,20 @@ def test_export__a_region_lies_at_its_place_in_the_left_image(tmp_path, row):
     for name in ("disparity.tif", "mask.tif"):
         with rasterio.open(tmp_path / "otb" / name) as dataset:
             assert (dataset.transform, dataset.crs) == (PLACE.transform @ Affine.translation(-7, -row), None)
+
+
+def test_export__keeps_a_file_that_appears_after_the_run_is_opened(run, tmp_path, monkeypatch):
+    mine = tmp_path / "disparity.tif"
+    check_kept = Run.check_kept
+
+    def checked_late(*arguments):
+        check_kept(*arguments)
+        mine.write_text("mine")
+
+    monkeypatch.setattr(Run, "check_kept", checked_late)
+    with pytest.raises(SatIntervalsError, match=r"disparity.tif exists and was not made by sat-intervals export"):
+        export(run[0], "otb", tmp_path)
+    assert mine.read_text() == "mine"
 
 
 def test_export__refuses_what_is_no_run_and_what_it_does_not_know(run, tmp_path):

@@ -44,7 +44,7 @@ from sat_intervals.raster import (
 )
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.results import Run, open_results
-from sat_intervals.run import strips
+from sat_intervals.run import source, strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
@@ -140,6 +140,37 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     images = open_image(folder / "left.tif", mask=mask), open_image(right)
     match_pair(*images, folder / "out", settings)
     match_pair(*images, folder / "once", settings)
+    assert hashes(folder / "out") == hashes(folder / "once")
+
+
+@pytest.mark.parametrize("way", ["link", "rename"])
+def test_match_pair__reads_again_where_an_input_was_another_one_for_a_moment(pair, monkeypatch, way):
+    folder, settings = pair
+    settings = {**settings, "cluster": {"workers": 1, "retries": 2}}
+    (folder / "link.tif").symlink_to("right.tif")
+    images = folder / "left.tif", folder / "link.tif"
+    match_pair(*images, folder / "once", settings)
+    read_views, moments = source.read_views, iter(range(2))
+
+    def exchange():
+        for before, after in (("right.tif", "kept.tif"), ("other.tif", "right.tif"), ("kept.tif", "other.tif")):
+            os.rename(folder / before, folder / after)
+
+    def put(name):
+        (folder / "new").symlink_to(name)
+        os.replace(folder / "new", folder / "link.tif")
+
+    def blink(*arguments):
+        if next(moments, None) is None:
+            return read_views(*arguments)
+        exchange() if way == "rename" else put("other.tif")
+        views = read_views(*arguments)
+        exchange() if way == "rename" else put("right.tif")
+        return views
+
+    monkeypatch.setattr(source, "read_views", blink)
+    match_pair(*images, folder / "out", settings)
+    assert next(moments, None) is None
     assert hashes(folder / "out") == hashes(folder / "once")
 
 
