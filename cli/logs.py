@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -17,6 +18,7 @@ _OF_RUNS = ("intervals.tif", "validity.tif", "run.json", "points.tif", "points.j
 
 _LOG = logging.getLogger(__name__)
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
+_TIME = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ")
 
 
 def printable(text: str) -> str:
@@ -113,7 +115,7 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
     if log_file.is_file() or not log_file.exists():  # a pipe or terminal is none of these, and is not replaced
         check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
     try:
-        if log_file.is_file() and not _is_text(log_file):
+        if log_file.is_file() and not _is_log(log_file):
             raise SatIntervalsError(f"{log_file} exists and is not a log: choose another --log-file")
         file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1, opener=_at_once)  # noqa: SIM115
     except OSError as error:
@@ -125,11 +127,11 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
             file.close()
 
 
-def _is_text(file: Path) -> bool:
-    """Return whether a file may be a log: not a raster, nor JSON, HTML or XML as commands write."""
+def _is_log(file: Path) -> bool:
+    """Return whether a file is empty or begins with a line of a log: others may be inputs, named in other inputs."""
     with file.open("rb") as stream:
-        head = stream.read(4096).lstrip()
-    return b"\0" not in head and not head.startswith((b"{", b"[", b"<"))
+        head = stream.read(24)
+    return not head or _TIME.match(head) is not None
 
 
 def _at_once(path: str, flags: int) -> int:

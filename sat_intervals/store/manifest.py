@@ -39,15 +39,6 @@ def unsealed(text: str | None, of: str = "") -> dict[str, Any] | None:
     return content if is_whole else None
 
 
-def is_sealed(text: str) -> bool:
-    """Return whether a text looks like one of `sealed`, whatever it belongs to."""
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(content, dict) and isinstance(content.get(_SEAL), int)
-
-
 def _checksum(content: Mapping[str, Any], of: str) -> int:
     return zlib.crc32((of + json.dumps(content)).encode())
 

@@ -4,7 +4,7 @@ import re
 from contextlib import suppress
 
 from sat_intervals.store.folder import Folder
-from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, is_sealed, parsed
+from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed
 
 ARRAYS, RECORDS, FAILURES = "arrays.zarr", "records", "failures"
 BORDERS, PIXELS, COSTS, PARTS = "borders", "pixels", "costs", "parts"
@@ -103,10 +103,9 @@ def final_name(name: str) -> str:
 
 
 def is_of_run(folder: Folder) -> bool:
-    """Return whether a run made a folder: it has its mark, a manifest or a record."""
-    with suppress(StoreError):
-        if {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys():
-            return True
+    """Return whether a run made a folder: it has its mark or a manifest."""
     if folder.read(MADE) is not None:
         return True
-    return any(is_sealed(text) for text in folder.read_all(RECORDS).values())
+    with suppress(StoreError):
+        return {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys()
+    return False

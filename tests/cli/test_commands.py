@@ -379,14 +379,14 @@ def test_debug__shows_stages_tiles_and_workers_and_what_dask_says(folder, tmp_pa
 @pytest.mark.process
 def test_log_file__keeps_what_debug_shows_and_what_it_held(folder, tmp_path):
     log = tmp_path / "run.log"
-    log.write_text("mine\n")
+    log.write_text("2026-01-31 12:00:00,000 INFO    mine: before\n")
     options = ["--quiet", "--tile-size", 64, "--overlap", 5, "--cluster", "processes", "--workers", 1]
     arguments = matching(folder, tmp_path / "out", *options, "--log-file", log, left="cut.tif")
     result = command(*arguments)
     assert (result.returncode, result.stdout) == (1, "")
     assert all(line.startswith(("sat-intervals: ", "  tile ")) for line in result.stderr.splitlines())
     kept = log.read_text()
-    assert kept.startswith("mine\n")
+    assert kept.startswith("2026-01-31 12:00:00,000 INFO    mine: before\n2")
     words = logged(kept)
     assert {"sat_intervals.run.tile", "sat_intervals.run.submit", "distributed.scheduler"} <= {
         name for name, _ in words

@@ -582,11 +582,12 @@ def test_match__takes_the_tiles_of_a_user_for_no_run_of_its_own(pair):
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize("content", [b'{"finished": 1}', b"II*\0some raster", b"<html>"])
+@pytest.mark.parametrize("content", [b'{"finished": 1}', b"II*\0some raster", b"<html>", b"mine\n"])
 def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
     file = tmp_path / "file"
     file.write_bytes(content)
     refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", file], "is not a log", "--log-file")
+    assert file.read_bytes() == content
     assert file.read_bytes() == content
 
 
