@@ -23,9 +23,15 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
-# A failure without a message is none to rasterio: it returns zeros. Failures in GDAL's own threads have no message in
-# this one. A source of a VRT that cannot be opened fails without any in each other dataset until the first is closed.
-_ONE_THREAD = {"GDAL_NUM_THREADS": "1", "VRT_NUM_THREADS": "1"}
+# With these a damaged image is an error. A failure without a message is none to rasterio, which then returns zeros.
+_STRICT = {
+    "GDAL_NUM_THREADS": "1",  # a failure in another thread has no message in this one
+    "VRT_NUM_THREADS": "1",
+    "GTIFF_IGNORE_READ_ERRORS": "NO",
+    "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",  # reads what is missing from memory that was never written
+    "GDAL_ERROR_ON_LIBJPEG_WARNING": "YES",
+}
+# A source of a VRT that cannot be opened fails without a message in each other dataset until the first is closed.
 _OF_SOURCES = threading.RLock()
 
 
@@ -34,7 +40,7 @@ def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
     """Open a raster for reading; thread-safe. Only one thread of a process reads VRTs."""
     _accept_no_georeferencing()
     # rasterio casts the no-data value to the type: -1.8e308, of ArcGIS, overflows float32
-    with Env(**_ONE_THREAD), np.errstate(over="ignore"):
+    with Env(**_STRICT), np.errstate(over="ignore"):
         dataset = DatasetReader(path, **options)
         with _OF_SOURCES if dataset.driver == "VRT" else nullcontext(), dataset:
             yield dataset

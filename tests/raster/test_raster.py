@@ -467,16 +467,33 @@ def test_read_window__of_a_mosaic_fails_in_every_thread(tmp_path, monkeypatch):
         assert all(threads.map(fails, range(200)))
 
 
-def test_read_window__names_a_jpeg_2000_cut_short(tmp_path):
-    noise = np.random.default_rng(0).integers(1, 255, (2000, 2000), np.uint8)
-    path = tmp_path / "left.jp2"
-    options = {"driver": "JP2OpenJPEG", "count": 1, "dtype": "uint8", "quality": 100, "reversible": "yes", **UTM}
-    with rasterio.open(path, "w", width=2000, height=2000, **options) as dataset:
-        dataset.write(noise, 1)
-    os.truncate(path, path.stat().st_size * 2 // 3)
+@pytest.mark.parametrize(
+    ("driver", "options"),
+    [
+        ("GTiff", {}),
+        ("GTiff", {"compress": "deflate", "tiled": True}),
+        ("JP2OpenJPEG", {"quality": 100, "reversible": "yes"}),
+        ("PNG", {}),
+        ("JPEG", {}),
+    ],
+)
+def test_read_window__names_a_damaged_file_whatever_the_users_options(tmp_path, driver, options):
+    noise, path = np.random.default_rng(0).integers(1, 255, (188, 188), np.uint8), tmp_path / "left"
+    options = {"count": 1, "dtype": "uint8", "crs": UTM["crs"], "transform": UTM["transform"], **options}
+    with rasterio.open(path, "w", driver, 1500, 1500, **options) as dataset:
+        dataset.write(noise.repeat(8, 0).repeat(8, 1)[:1500, :1500], 1)
+    if driver == "JPEG":  # one cut short is an error with any options
+        with path.open("r+b") as file:
+            file.seek(path.stat().st_size // 2)
+            file.write(bytes(400))
+    else:
+        os.truncate(path, path.stat().st_size * 2 // 3)
     image = open_image(path)
-    with pytest.raises(InputError) as failure, rasterio.Env(GDAL_NUM_THREADS="ALL_CPUS"):
-        read_window(image, Window(0, 0, 2000, 2000))
+    with (
+        pytest.raises(InputError) as failure,
+        rasterio.Env(GDAL_NUM_THREADS="ALL_CPUS", GTIFF_IGNORE_READ_ERRORS="YES"),
+    ):
+        read_window(image, Window(0, 0, 1500, 1500))
     message(failure, path)
 
 
