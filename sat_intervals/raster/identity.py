@@ -12,7 +12,7 @@ from functools import lru_cache
 from http.client import HTTPException
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, TypeVar
 from urllib.request import Request, urlopen
 
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
@@ -24,8 +24,10 @@ _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
 _INSIDE = re.compile(r"/vsi\w+/(\d+(_\d+)?,)?")
 # Seconds until a server must answer.
 _TIMEOUT = 30
-# Attempts to hash a file that changes meanwhile.
+# Attempts to hash or read a file that changes meanwhile.
 _TRIES = 3
+
+_Read = TypeVar("_Read")
 
 
 class ChangedInputError(RunError):
@@ -176,25 +178,25 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
             )
 
 
-@contextmanager
-def unchanged(files: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
-    """Raise after the block, which reads inputs of a run, if they are not those of before.
+def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _Read]) -> _Read:
+    """Return what is read from inputs of a run; read again if one was touched: it may have been another for a moment.
 
     Raises
     ------
     ChangedInputError
         See `check_unchanged`.
     RunError
-        An input has its content of before, but was touched meanwhile: it may have been another one for a moment.
+        An input is touched all the time.
     """
-    before = {name: stamp_of(name) for name in files}
-    try:
-        yield
-    finally:  # a changed input explains a read error
-        check_unchanged(files)
-        for name, stamp in before.items():
-            if stamp_of(name) != stamp:
-                raise RunError(f"{name} was touched or replaced while it was read: rerun the same command: it resumes")
+    for _ in range(_TRIES):
+        before = [stamp_of(name) for name in files]
+        try:
+            content = read()
+        finally:  # a changed input explains a read error
+            check_unchanged(files)
+        if [stamp_of(name) for name in files] == before:
+            return content
+    raise RunError(f"one of {', '.join(files)} is touched again and again while it is read: end that, then rerun")
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from sat_intervals.match.search_range import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, read_window
-from sat_intervals.raster.identity import ChangedInputError, unchanged
+from sat_intervals.raster.identity import ChangedInputError, read_unchanged
 from sat_intervals.run.quality import COLLAR, is_plain
 from sat_intervals.run.workers import Connection, Task, Workers, reason
 from sat_intervals.tiling import Window
@@ -65,8 +65,7 @@ def look_at(left: Image, right: Image, sample: Sample, files: _Files) -> Look | 
 def _checked(work: Callable[[], _Result], files: _Files) -> _Result:
     """Do the work; raise if an input has changed meanwhile, and only errors that can be pickled."""
     try:
-        with unchanged(files):
-            return work()
+        return read_unchanged(files, work)
     except SatIntervalsError as error:
         error.__cause__ = error.__context__ = None
         raise

@@ -11,7 +11,7 @@ from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, patch_areas
 from sat_intervals.progress import timed
 from sat_intervals.raster import read_views
-from sat_intervals.raster.identity import unchanged
+from sat_intervals.raster.identity import read_unchanged
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.run.job import Job
 from sat_intervals.run.workers import is_remote
@@ -56,8 +56,7 @@ def _views(job: Job, block: Tile, windows: tuple[Window, Window]) -> Views:
             for i, (image, window) in enumerate(zip(images, windows, strict=True))
         )
         return left, right
-    with unchanged(job.files):
-        views = read_views(images, windows)
+    views = read_unchanged(job.files, lambda: read_views(images, windows))
     if are_kept:
         arrays = (array for image, view in zip(images, views, strict=True) for array in kept_view(image, view))
         job.store.steps.write(PIXELS, block.name, *arrays)

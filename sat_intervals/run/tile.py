@@ -25,7 +25,7 @@ from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
-from sat_intervals.raster.identity import unchanged
+from sat_intervals.raster.identity import read_unchanged
 from sat_intervals.run.job import Job
 from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
@@ -46,8 +46,7 @@ _LOG = logging.getLogger(__name__)
 def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]]) -> Moments:
     """Compute the moments of a block of an image, one of ``files``; runs on a worker."""
     try:
-        with unchanged(files):
-            return moments(*read_window(image, block))
+        return read_unchanged(files, lambda: moments(*read_window(image, block)))
     except SatIntervalsError as error:
         error.__cause__ = error.__context__ = None
         raise

@@ -131,7 +131,7 @@ def test_export__keeps_a_file_that_appears_after_the_run_is_opened(run, tmp_path
         mine.write_text("mine")
 
     monkeypatch.setattr(Run, "check_kept", checked_late)
-    with pytest.raises(SatIntervalsError, match=r"disparity.tif exists and was not made by sat-intervals export"):
+    with pytest.raises(SatIntervalsError, match=r"disparity.tif exists and was not made by sat-intervals"):
         export(run[0], "otb", tmp_path)
     assert mine.read_text() == "mine"
 

@@ -146,7 +146,6 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
 @pytest.mark.parametrize("way", ["link", "rename"])
 def test_match_pair__reads_again_where_an_input_was_another_one_for_a_moment(pair, monkeypatch, way):
     folder, settings = pair
-    settings = {**settings, "cluster": {"workers": 1, "retries": 2}}
     (folder / "link.tif").symlink_to("right.tif")
     images = folder / "left.tif", folder / "link.tif"
     match_pair(*images, folder / "once", settings)
