@@ -128,7 +128,7 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
 
 
 def _is_log(file: Path) -> bool:
-    """Return whether a file is empty or begins with a line of a log: others may be inputs, named in other inputs."""
+    """Return whether a file is empty or begins with a line of a log. Another may be an input, as a VRT's source."""
     with file.open("rb") as stream:
         head = stream.read(24)
     return not head or _TIME.match(head) is not None

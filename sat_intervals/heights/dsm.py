@@ -23,7 +23,7 @@ from sat_intervals.raster import (
     is_surface,
     north_up,
     read_place,
-    stamps,
+    replaceable,
     surface_file,
     utm_of,
     watched_rasters,
@@ -89,7 +89,7 @@ def make_surface(
     path, geoid = Path(path), None if geoid is None else Path(geoid)
     inputs = [*(Path(out) / "points.tif" for out in outs), geoid, resolution if isinstance(resolution, Path) else None]
     check_unchanged = watched_rasters(inputs)
-    there = stamps(path.parent, [path.name])
+    there = replaceable(path.parent, [surface_file(path.name)])
     grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius)
     runs = _runs(outs, path, inputs)
     intervals = [run.config.interval for run in runs]

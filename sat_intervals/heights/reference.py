@@ -28,7 +28,7 @@ from sat_intervals.raster import (
     Projection,
     Vertical,
     check_made_by,
-    stamps,
+    replaceable,
     truth_file,
     utm_of,
     watched_rasters,
@@ -118,7 +118,7 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    there = stamps(path.parent, [path.name])
+    there = replaceable(path.parent, [truth_file(path.name)])
     check_made_by(path, "reference", "REFERENCE")
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     check_unchanged = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])

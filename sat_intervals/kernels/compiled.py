@@ -60,11 +60,13 @@ def _healing(kernel):
     def load_or_drop(*arguments):
         try:
             return load(*arguments)
-        except (OSError, MemoryError):
+        except OSError:
             raise
-        except Exception:  # whatever unpickling damaged bytes raises
+        except Exception as error:  # whatever unpickling damaged bytes raises
             with suppress(OSError):  # then the next process compiles it again, too
                 cached.flush()
+            if isinstance(error, MemoryError):
+                raise
             return None
 
     cached.load_overload = load_or_drop

@@ -63,9 +63,9 @@ def tile_bytes(config: Config, size: int | None = None) -> int:
     return volume + paths + _PATCH_BYTES * patch * (patch + config.disparity.count) + _CORE_BYTES * size**2
 
 
-def waiting_bytes(config: Config) -> int:
+def waiting_bytes(config: Config, size: int | None = None) -> int:
     """Bytes of images and products of a tile that is read or written while others are matched."""
-    size = config.tiles.size
+    size = size or config.tiles.size
     side = size * tiles_together(config, size) + 2 * config.tiles.support
     return _VIEW_BYTES * side * (side + config.disparity.count) + _CORE_BYTES * size**2
 
@@ -77,22 +77,21 @@ def strip_bytes(rows: int, width: int, compression: str) -> int:
     return rows * width * _BAND_BYTES + max(piece, rows * (width * compressed + min(width, _COLUMNS) * _BLOCK_BYTES))
 
 
-def fitted(config: Config, memory: int, tiles_at_once: int = 1) -> Config:
-    """Reduce the tile size until ``tiles_at_once`` tiles fit in a process of ``memory`` bytes.
+def fitted(config: Config, memory: int, tiles_at_once: int = 1, waiting: int = 0) -> Config:
+    """Reduce the tile size until ``tiles_at_once`` tiles, and ``waiting`` ones, fit in a process of ``memory`` bytes.
 
     Raises
     ------
     ConfigError
         If the smallest tile does not fit; the search range is never reduced.
     """
-    sizes = range(config.tiles.size, 0, -64)
-    for size in sizes:
-        if PROCESS_BYTES + tiles_at_once * tile_bytes(config, size) <= memory:
+    for size in range(config.tiles.size, 0, -64):
+        tiles = tiles_at_once * tile_bytes(config, size) + waiting * waiting_bytes(config, size)
+        if PROCESS_BYTES + tiles <= memory:
             return config.model_copy(update={"tiles": config.tiles.model_copy(update={"size": size})})
-    needed = PROCESS_BYTES + tiles_at_once * tile_bytes(config, sizes[-1])
     raise ConfigError(
-        f"tiles of {sizes[-1]} pixels with overlap {config.tiles.overlap} and {config.disparity.count} disparities, "
-        f"{tiles_at_once} at once, need {needed / 1e6:.0f} MB, but {memory / 1e6:.0f} MB are given: "
+        f"tiles of {size} pixels with overlap {config.tiles.overlap} and {config.disparity.count} disparities, "
+        f"{tiles_at_once} at once, need {(PROCESS_BYTES + tiles) / 1e6:.0f} MB, but {memory / 1e6:.0f} MB are given: "
         "give more memory or fewer workers"
     )
 

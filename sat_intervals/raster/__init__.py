@@ -37,7 +37,7 @@ from sat_intervals.raster.surfaces import (
     resolution_of,
 )
 from sat_intervals.raster.windows import read_views, read_window
-from sat_intervals.raster.writer import OutputWriter, remove_scratch, restore
+from sat_intervals.raster.writer import OutputWriter, remove_scratch, replaceable, restore
 
 __all__ = [
     "BLOCK",
@@ -86,6 +86,7 @@ __all__ = [
     "read_views",
     "read_window",
     "remove_scratch",
+    "replaceable",
     "resolution_of",
     "restore",
     "run_files",

@@ -96,15 +96,23 @@ def _of_file(file: Path, before: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _stamp(file: str | Path) -> str:
-    """Return inode, size and times of a file, and those of links on its path: any change of the file changes them."""
-    status, place = os.stat(file), Path(file)
-    links = [os.lstat(link) for link in (place, *place.parents) if os.path.islink(link)]
-    return "".join(
-        [
-            f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}",
-            *(f"/{link.st_ino:x}-{link.st_ctime_ns:x}" for link in links),
-        ]
-    )
+    """Return inode, size and times of a file: any change of the file changes them."""
+    status = os.stat(file)
+    return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}"
+
+
+def _moment(path: str) -> list[str]:
+    """Return the stamp of a file, if it has one, and what changes if a link on its path does."""
+    file = _local_file(path)
+    return [] if file is None else [_stamp(file), *_links(file.absolute())]
+
+
+def _links(path: Path) -> Iterator[str]:
+    for place in (path, *path.parents):
+        if place.is_symlink():
+            status = place.lstat()
+            yield f"{status.st_ino:x}-{status.st_ctime_ns:x}"
+            yield from _links(place.parent / place.readlink())
 
 
 def _hashed(file: str | Path) -> tuple[str, str]:
@@ -189,14 +197,15 @@ def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _R
         An input is touched all the time.
     """
     for _ in range(_TRIES):
-        before = [stamp_of(name) for name in files]
+        before = {name: _moment(name) for name in files}
         try:
             content = read()
         finally:  # a changed input explains a read error
             check_unchanged(files)
-        if [stamp_of(name) for name in files] == before:
+        touched = [name for name, moment in before.items() if _moment(name) != moment]
+        if not touched:
             return content
-    raise RunError(f"one of {', '.join(files)} is touched again and again while it is read: end that, then rerun")
+    raise RunError(f"{touched[0]} is touched again and again while it is read: end that and rerun the same command")
 
 
 @contextmanager
@@ -238,11 +247,11 @@ def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
     Call it between reading several times from files and publishing what was made of them. Of rasters, see
     `watched_rasters`.
     """
-    before = {str(file): stamp_of(str(file)) for file in files if file is not None}
+    before = {str(file): _moment(str(file)) for file in files if file is not None}
 
     def check() -> None:
-        for file, stamp in before.items():
-            if stamp_of(file) != stamp:
+        for file, moment in before.items():
+            if _moment(file) != moment:
                 raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
 
     return check

@@ -1,6 +1,5 @@
 """Open images, and check that two make an epipolar pair."""
 
-import html
 import logging
 import os
 import re
@@ -8,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
@@ -240,12 +240,16 @@ def _check_watched(name: str, dataset: DatasetReader) -> None:
 
 
 def _sources(path: str) -> list[str]:
-    """Return the sources of a virtual raster, or of its text, that are no plain files: GDAL does not list these."""
-    text = path
-    if path.endswith((".vrt", ".VRT")) and os.path.isfile(path):
-        text = Path(path).read_text(encoding="utf-8", errors="replace")
-    found = re.findall(r"<Source(?:Filename|Dataset)\b[^>]*>([^<]+)<", text) if "<VRTDataset" in text else []
-    return [name for name in map(html.unescape, found) if _IN_ANOTHER.match(name)]
+    """Return the sources of a virtual raster, a file or its text, that are no plain files: GDAL does not list these."""
+    text = Path(path).read_bytes() if os.path.isfile(path) else path.encode()
+    if b"<VRTDataset" not in text:
+        return []
+    try:
+        elements = ElementTree.fromstring(text).iter()
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path} is not well-formed XML: {error}: write it with gdalbuildvrt") from error
+    found = [element.text for element in elements if element.tag in ("SourceFilename", "SourceDataset")]
+    return [name for name in found if name and _IN_ANOTHER.match(name)]
 
 
 def other_files(name: str) -> list[str]:
@@ -265,10 +269,10 @@ def other_files(name: str) -> list[str]:
         try:
             with gdal.reading(path) as dataset:
                 _check_watched(path, dataset)
-                files = dataset.files
+                files, sources = dataset.files, _sources(path) if dataset.driver == "VRT" else []
         except gdal.GDAL_ERRORS:  # a sidecar file that is not a raster
             continue
-        found = [source for source in _sources(path) if source not in asked]
+        found = [source for source in sources if source not in asked]
         asked += found
         waiting += found
         new = [file for file in files if file not in seen and Path(file).resolve() != Path(name).resolve()]

@@ -72,7 +72,9 @@ def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
     with LocalFolder(report.parent).locked():
         _settle(files, report)
         try:
-            for file in filter(os.path.lexists, files):
+            for file in files:
+                if not (file.is_symlink() or is_marked(file)):  # the block keeps it
+                    continue
                 try:
                     os.link(file, _aside(file, report), follow_symlinks=False)
                 except OSError:  # a file system without hard links

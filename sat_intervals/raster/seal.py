@@ -8,6 +8,7 @@ import re
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
+from xml.etree import ElementTree
 
 from sat_intervals.errors import SatIntervalsError
 
@@ -17,10 +18,10 @@ _LINE, _ZEROS = b"SAT_INTERVALS_CRC_32=", b"00000000"
 _SEAL = re.compile(_LINE + rb"([0-9a-f]{8})\n")
 # Bytes of a file among which the line is.
 _BEGINNING = 1024
-# Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes.
+# Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes. Names of bands are repeated.
 _STATISTICS = {
-    *("PAMDataset", "PAMRasterBand", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax", "BucketCount"),
-    *("IncludeOutOfRange", "Approximate", "HistCounts"),
+    *("PAMDataset", "PAMRasterBand", "Description", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax"),
+    *("BucketCount", "IncludeOutOfRange", "Approximate", "HistCounts"),
 }
 
 
@@ -78,5 +79,9 @@ def check_beside(path: str | Path, files: Iterable[str]) -> None:
 
 
 def _has_statistics_only(file: Path) -> bool:
-    text = file.read_text(encoding="utf-8", errors="replace")
-    return set(re.findall(r"<(\w+)", text)) <= _STATISTICS and text.count("<MDI") == text.count('<MDI key="STATISTICS_')
+    try:
+        elements = list(ElementTree.parse(file).iter())
+    except ElementTree.ParseError:
+        return False
+    keys = [element.get("key", "") for element in elements if element.tag == "MDI"]
+    return {element.tag for element in elements} <= _STATISTICS and all(key.startswith("STATISTICS_") for key in keys)

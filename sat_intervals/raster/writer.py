@@ -269,6 +269,12 @@ def restore(folder: Path, files: Sequence[File]) -> None:
         put_back(writer._scratch, folder, writer._names)
 
 
+def replaceable(folder: Path, files: Sequence[File]) -> dict[str, str]:
+    """Return the `stamps` of files that exist before a command, after `restore`."""
+    restore(folder, files)
+    return stamps(folder, [file.name for file in files])
+
+
 @contextmanager
 def _killed(folder: Path, files: Sequence[File]) -> Iterator[OutputWriter]:
     """Yield the writer of a killed process; afterwards delete its temporary files."""

@@ -14,7 +14,7 @@ from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.mccnn import load_network
-from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes, waiting_bytes
+from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import (
@@ -338,14 +338,14 @@ def fitted_to_jobs(config: Config) -> Config:
         See `fitted` and `parse_memory`.
     """
     memory = None if config.disparity.is_auto else _job_bytes(config)
-    return config if memory is None else fitted(config, memory, config.cluster.cores)
+    return config if memory is None else fitted(config, memory, config.cluster.cores, readers(config.cluster))
 
 
 def _job_bytes(config: Config) -> int | None:
     """Return the memory of a job of a batch system for the tiles being matched: dask kills workers at 95 %."""
     if config.cluster.memory is None:
         return None
-    return 9 * parse_memory(config.cluster.memory) // 10 - readers(config.cluster) * waiting_bytes(config)
+    return 9 * parse_memory(config.cluster.memory) // 10
 
 
 def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:

@@ -99,13 +99,12 @@ def plan(
     left, right = checked_pair(left, right, config)
     config, _, _ = searched(config, left, lambda: find_here(left, right, progress))
     checked_pair(left, right, config)
-    waiting = readers(config.cluster) * waiting_bytes(config)
-    config = fitted_to_jobs(config) if memory is None else fitted(config, memory - waiting)
+    config = fitted_to_jobs(config) if memory is None else fitted(config, memory, waiting=readers(config.cluster))
     workers = workers or tiles_at_once(config.cluster)
     region = checked_region(left, window)
     strip = min(BLOCK, region.height), region.width
     if memory is not None:
-        check_strips(*strip, config, memory - waiting)
+        check_strips(*strip, config, memory)
     check_tiles(config, region)
     grid = Grid(region, config.tiles.size)
     # Compiled once a machine: a part of the first plan, not of the run.
@@ -114,6 +113,7 @@ def plan(
     seconds, extra = _expected(left, right, config, workers, grid)
     pixels, files = region.height * region.width, run_files(config.products.compression)
     together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
+    waiting = readers(config.cluster) * waiting_bytes(config)
     task = max(tile_bytes(config), strip_bytes(*strip, config.products.compression))
     return Plan(
         tile_size=config.tiles.size,
@@ -200,11 +200,11 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     paths = seconds.get("tiles.trace", 0.0) * _traced(grid, whole, config) / traced
     strips = seconds["bands"] * pixels / sampled / min(workers, -(-grid.region.height // BLOCK))
     files = seconds["files"] * pixels / sampled
-    images = seconds["tiles.images"] + seconds["inputs"]  # the sample already reads whole images
+    images, inputs = seconds["tiles.images"], seconds["inputs"]  # the sample already reads whole images
     blocks = blocks_of(grid, config)
     parallel = time_of(blocks, min(workers, len(grid)), paths / max(1, 3 * len(blocks)), tiles / len(blocks))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
-    return float(seconds["start"] + seconds["kernels"] + images + parallel + strips + files), extra
+    return float(seconds["start"] + seconds["kernels"] + images + parallel + max(strips, inputs) + files), extra
 
 
 @contextmanager

@@ -191,6 +191,18 @@ def test_make_surface__keeps_a_file_that_appears_after_the_check(tmp_path, monke
     assert (tmp_path / "dsm.tif").read_text() == "mine"
 
 
+def test_make_surface__goes_on_where_it_was_killed_while_it_published(tmp_path):
+    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
+    surface_of([out], tmp_path)
+    whole = (tmp_path / "dsm.tif").read_bytes()
+    aside = tmp_path / ".unpublished-dsm.tif" / "files" / "replaced"
+    aside.mkdir(parents=True)
+    (tmp_path / "dsm.tif").rename(aside / "dsm.tif")
+    surface_of([out], tmp_path)
+    assert (tmp_path / "dsm.tif").read_bytes() == whole
+    assert not aside.exists()
+
+
 def test_point_cloud__ends_where_points_are_replaced_before_outliers_are_found(tmp_path, monkeypatch):
     x, y = np.meshgrid(np.arange(20.0), -np.arange(20.0))
     out = write_points(tmp_path / "a", x, y, 10 + 0 * x)

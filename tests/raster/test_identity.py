@@ -13,7 +13,8 @@ from helpers import COMMAND, OUTPUTS, hashes
 
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
-from sat_intervals.raster.identity import identity, is_changed
+from sat_intervals.errors import RunError
+from sat_intervals.raster.identity import ChangedInputError, identity, is_changed, read_unchanged
 from sat_intervals.tiling import Window
 
 SIDE = 1024
@@ -106,6 +107,30 @@ def test_identity__sees_a_change_at_equal_size_and_time_and_hashes_only_then(tmp
     time.sleep(0.02)
     file.write_bytes(b"one")
     assert not is_changed(str(file), before)
+
+
+def test_read_unchanged__reads_again_until_nothing_was_touched(tmp_path):
+    real, link = tmp_path / "real", tmp_path / "link.tif"
+    real.mkdir()
+    (real / "image.tif").write_bytes(b"one")
+    (tmp_path / "folder").symlink_to("real")
+    link.symlink_to("folder/image.tif")
+    files = {str(link): identity(str(link))}
+    touched = iter([True, True, False])
+
+    def read():
+        if next(touched, True):  # a link on the way to the file
+            (tmp_path / "new").symlink_to("real")
+            (tmp_path / "new").replace(tmp_path / "folder")
+        return link.read_bytes()
+
+    assert read_unchanged(files, read) == b"one"
+    assert next(touched, None) is None
+    with pytest.raises(RunError, match=r"link.tif is touched again and again while it is read"):
+        read_unchanged(files, read)
+    (real / "image.tif").write_bytes(b"two")
+    with pytest.raises(ChangedInputError, match=r"link.tif was replaced or changed during the run"):
+        read_unchanged(files, link.read_bytes)
 
 
 def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(web_server, images, tmp_path):

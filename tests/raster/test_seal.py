@@ -5,6 +5,7 @@ import pytest
 import rasterio
 from finished import FINISHED, PLACE, random_bands, write_points, write_run
 from helpers import flip_bit, invoke
+from rasterio.errors import RasterioDeprecationWarning
 from rasterio.shutil import copy
 from rio_cogeo.cogeo import cog_validate
 from surfaces import write_raster
@@ -114,12 +115,16 @@ def test_commands__refuse_files_beside_ours_that_change_them(whole, name):
         "<SRS>EPSG:4326</SRS>",
         key,
         '<PAMRasterBand band="1"><NoDataValue>1</NoDataValue></PAMRasterBand>',
+        '<PAMRasterBand band="1">< NoDataValue>1</ NoDataValue></PAMRasterBand>',  # GDAL reads it
     ):
         beside.write_text(f"<PAMDataset>{statistics}{content}</PAMDataset>")
         done = invoke(*command)
         assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
         assert f"{beside} changes what is read from {whole / name}: move it away" in done.stderr
-    beside.write_text(f"<PAMDataset>{statistics}</PAMDataset>")  # as QGIS
+    beside.unlink()
+    with rasterio.open(whole / name) as dataset, pytest.warns(RasterioDeprecationWarning):  # as QGIS
+        dataset.statistics(1, approx=False)
+    assert "STATISTICS_MEAN" in beside.read_text()
     assert invoke(*command).exit_code == 0
     beside.rename(beside.with_name("kept"))
     mask = whole / f"{name}.msk"

@@ -25,7 +25,7 @@ from sat_intervals.raster import write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import batch
 from sat_intervals.run.batch import match_batch
-from sat_intervals.run.job import prepare
+from sat_intervals.run.job import fitted_to_jobs, prepare
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_block
@@ -414,6 +414,19 @@ def test_fitted__takes_the_largest_tile_that_fits():
         assert size == base or tile_bytes(SETTINGS, size + 64) > memory - 3 * 10**8
     with pytest.raises(ConfigError, match=r"need .* MB, but 300 MB are given"):
         fitted(SETTINGS, 3 * 10**8)
+
+
+def test_fitted_to_jobs__counts_the_tiles_that_wait_in_the_size_that_fits():
+    def size(memory, **cluster):
+        jobs = {"kind": "slurm", "memory": memory, **cluster}
+        return fitted_to_jobs(load_config({"disparity": {"minimum": -63, "maximum": 64}, "cluster": jobs})).tiles.size
+
+    for memory in ("450MB", "600MB", "1GB"):
+        waiting = size(memory, store="memory://tiles")
+        assert 64 <= waiting <= size(memory)
+    assert size("600MB", store="memory://tiles") > 300
+    with pytest.raises(ConfigError, match="but 90 MB are given"):
+        size("100MB", store="memory://tiles")
 
 
 @pytest.mark.parametrize(
