@@ -35,13 +35,24 @@ _STRICT = {
 _OF_SOURCES = threading.RLock()
 
 
+class _Reader(DatasetReader):  # type: ignore[misc]
+    """A dataset of which no source fails without an error, as those of a VRT in a VRT do from the second time on."""
+
+    def read(self, indexes: int | None = None, *, out_shape: Any = None, **options: Any) -> np.ndarray:
+        values = super().read(indexes, out_shape=out_shape, **options)
+        if self.driver == "VRT" and out_shape is None:
+            for band in self.indexes if indexes is None else [indexes]:
+                self.checksum(band, window=options.get("window"))  # reads again, and says that it fails
+        return np.asarray(values)
+
+
 @contextmanager
 def reading(path: str, **options: Any) -> Iterator[DatasetReader]:
     """Open a raster for reading; thread-safe. Only one thread of a process reads VRTs."""
     _accept_no_georeferencing()
     # rasterio casts the no-data value to the type: -1.8e308, of ArcGIS, overflows float32
     with Env(**_STRICT), np.errstate(over="ignore"):
-        dataset = DatasetReader(path, **options)
+        dataset = _Reader(path, **options)
         with _OF_SOURCES if dataset.driver == "VRT" else nullcontext(), dataset:
             yield dataset
 

@@ -20,7 +20,6 @@ from rasterio.control import GroundControlPoint
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning
-from rasterio.io import DatasetReader
 from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
@@ -446,15 +445,34 @@ def test_read_window__names_a_mosaic_whose_source_is_missing(tmp_path):
     message(failure, "mosaic.vrt")
 
 
+def test_read_window__of_a_mosaic_in_a_mosaic_fails_every_time(tmp_path):
+    image = mosaic(tmp_path, 16)
+    source = (
+        "<ComplexSource><SourceFilename>{}</SourceFilename><SourceBand>1</SourceBand>"
+        '<SourceProperties RasterXSize="{}" RasterYSize="16" DataType="Byte" BlockXSize="128" BlockYSize="128"/>'
+        '<SrcRect xOff="0" yOff="0" xSize="{}" ySize="16"/><DstRect xOff="{}" yOff="0" xSize="{}" ySize="16"/>'
+        "</ComplexSource>"
+    )
+    inner = [source.format(tmp_path / f"{name}.tif", 16, 16, x, 16) for name, x in (("west", 0), ("east", 16))]
+    for path, sources in ((image.path, inner), (tmp_path / "outer.vrt", [source.format(image.path, 32, 32, 0, 32)])):
+        band = f'<VRTRasterBand dataType="Byte" band="1">{"".join(sources)}</VRTRasterBand>'
+        Path(path).write_text(f'<VRTDataset rasterXSize="32" rasterYSize="16">{band}</VRTDataset>')
+    outer = open_image(tmp_path / "outer.vrt")
+    read_window(outer, Window(0, 0, 16, 16))
+    for _ in range(5):
+        with pytest.raises(InputError):
+            read_window(outer, Window(0, 8, 16, 16))
+
+
 def test_read_window__of_a_mosaic_fails_in_every_thread(tmp_path, monkeypatch):
     image = mosaic(tmp_path, 16)
 
-    class ClosedLate(DatasetReader):
+    class ClosedLate(gdal._Reader):
         def close(self):
             time.sleep(0.001)
             super().close()
 
-    monkeypatch.setattr(gdal, "DatasetReader", ClosedLate)
+    monkeypatch.setattr(gdal, "_Reader", ClosedLate)
 
     def fails(_: int) -> bool:
         try:
