@@ -29,7 +29,6 @@ _STRICT = {
     "VRT_NUM_THREADS": "1",
     "GTIFF_IGNORE_READ_ERRORS": "NO",
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",  # reads what is missing from memory that was never written
-    "GDAL_ERROR_ON_LIBJPEG_WARNING": "YES",
 }
 # A source of a VRT that cannot be opened fails without a message in each other dataset until the first is closed.
 _OF_SOURCES = threading.RLock()

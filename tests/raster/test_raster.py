@@ -492,7 +492,6 @@ def test_read_window__of_a_mosaic_fails_in_every_thread(tmp_path, monkeypatch):
         ("GTiff", {"compress": "deflate", "tiled": True}),
         ("JP2OpenJPEG", {"quality": 100, "reversible": "yes"}),
         ("PNG", {}),
-        ("JPEG", {}),
     ],
 )
 def test_read_window__names_a_damaged_file_whatever_the_users_options(tmp_path, driver, options):
@@ -500,12 +499,7 @@ def test_read_window__names_a_damaged_file_whatever_the_users_options(tmp_path, 
     options = {"count": 1, "dtype": "uint8", "crs": UTM["crs"], "transform": UTM["transform"], **options}
     with rasterio.open(path, "w", driver, 1500, 1500, **options) as dataset:
         dataset.write(noise.repeat(8, 0).repeat(8, 1)[:1500, :1500], 1)
-    if driver == "JPEG":  # one cut short is an error with any options
-        with path.open("r+b") as file:
-            file.seek(path.stat().st_size // 2)
-            file.write(bytes(400))
-    else:
-        os.truncate(path, path.stat().st_size * 2 // 3)
+    os.truncate(path, path.stat().st_size * 2 // 3)
     image = open_image(path)
     with (
         pytest.raises(InputError) as failure,
