@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import Georeferencing, read_tags
+from sat_intervals.raster import Georeferencing, read_known, read_tags
 
 try:
     from scipy.interpolate import RegularGridInterpolator
@@ -25,8 +25,8 @@ def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
     Parameters
     ----------
     path
-        GeoTIFF: columns in band 1, rows in band 2. Files tagged by OTB have displacements from epipolar coordinates to
-        sensor positions, all others sensor positions.
+        GeoTIFF: columns in band 1, rows in band 2, no positions where there is no data. Files tagged by OTB have
+        displacements from epipolar coordinates to sensor positions, all others sensor positions.
     left
         Georeferencing of the whole left epipolar image. OTB takes it as the place of its pixels in epipolar
         coordinates, for the right image, too.
@@ -40,17 +40,18 @@ def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
     has_displacements = read_tags(path).get(_TAG) == _OTB
     columns, rows = grid.points
     nodes = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1)
-    sensor = np.stack([grid.col_positions, grid.row_positions], axis=-1) + (nodes if has_displacements else 0.0)
+    # shareloc takes no-data values for positions
+    sensor = read_known(path)[:2].T + (nodes if has_displacements else 0.0)
     scales = _scales(nodes, sensor)
     if not (_SCALES[0] <= scales[-1] and scales[0] <= _SCALES[1]):
         kind = f"displacements, as its tag {_TAG}={_OTB} says" if has_displacements else "sensor positions"
         raise SatIntervalsError(
             f"{path} does not contain {kind}: give the grid of CARS or shareloc, or that of OTB with tag {_TAG}={_OTB}"
         )
+    grid.col_positions, grid.row_positions = sensor[..., 0], sensor[..., 1]
     if has_displacements:
-        grid.col_positions, grid.row_positions = sensor[..., 0], sensor[..., 1]
         grid.points = _pixels(columns, rows, left)
-        grid.interpolator = RegularGridInterpolator(grid.points, sensor, bounds_error=False, fill_value=None)
+    grid.interpolator = RegularGridInterpolator(grid.points, sensor, bounds_error=False, fill_value=None)
     return grid
 
 

@@ -192,6 +192,12 @@ def read_layers(path: str | os.PathLike[str], window: Window | None = None, band
         return np.asarray(dataset.read(band, window=area))
 
 
+def read_known(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read all bands of a file, ``(bands, rows, columns)``; NaN where there is no data."""
+    with opened(str(path)) as dataset:
+        return np.where(dataset.read_masks() != 0, dataset.read(), np.nan)
+
+
 def read_shape(path: str | os.PathLike[str]) -> tuple[int, int, int]:
     """Return the numbers of bands, rows and columns of a file."""
     with opened(str(path)) as dataset:

@@ -298,19 +298,24 @@ def test_triangulate_command__warns_of_models_that_nearly_fit(level_run, tmp_pat
     assert invoke("triangulate", out, *sensor_words(files)).stderr == ""
 
 
-def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path):
+@pytest.mark.parametrize("hole", [np.nan, -9999.0])
+def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_run, tmp_path, hole):
     out, files = level_run
+    triangulate(out, *files)
+    whole = read(out / "points.tif")[BAND["height"]]
     files = [*files[:2], grid(tmp_path / "holed.tif", 40, 50, step=4), files[3]]
     with rasterio.open(files[2], "r+") as file:
         positions = file.read()
-        positions[:, 2, 2] = np.nan  # of epipolar row and column 0, a node of the lattice
+        positions[:, 2, 2] = hole  # of epipolar row and column 0, a node of the lattice
         file.write(positions)
+        file.nodata = None if np.isnan(hole) else hole
     result = invoke("triangulate", out, *sensor_words(files))
     assert result.exit_code == 0, result.output
     points = read(out / "points.tif")[BAND["height"]]
     lost = np.isnan(points)
     assert 0 < lost.sum() < lost.size
     assert f"{lost.sum()} valid pixels have no point" in result.stderr
+    np.testing.assert_allclose(points[~lost], whole[~lost], atol=1e-3)
 
 
 def test_triangulate__protects_the_points_by_a_checksum(level_run, tmp_path):
