@@ -18,13 +18,14 @@ from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import (
     Georeferencing,
     Image,
+    Layer,
     check_alone,
     open_image,
     read_layers,
     read_shape,
     read_small_image,
     read_small_layers,
-    read_window,
+    read_tags,
 )
 from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, stamp_of, watched
 from sat_intervals.tiling import Window, strips
@@ -77,21 +78,6 @@ class _Report(_Section):
     search: _Search | None = None
     local_ranges: dict[str, Any] | None = None
     normalization: dict[str, dict[str, float]] | None = None
-
-
-@dataclass(frozen=True)
-class Layer:
-    """A raster as large as a run's region or its left image, read by windows of the region."""
-
-    image: Image
-    row: int
-    column: int
-
-    def read(self, window: Window) -> np.ndarray:
-        """Read a window of the region as floats, NaN where no data."""
-        place = Window(self.row + window.row, self.column + window.column, window.height, window.width)
-        pixels, state = read_window(self.image, place)
-        return np.where(state == 0, pixels, np.nan)
 
 
 @dataclass(frozen=True)
@@ -166,6 +152,9 @@ class Run:
         """Open another raster of the same pixels, such as the truth."""
         image, left = open_image(path), self.report["inputs"]["left"]
         size = image.height, image.width
+        here = self.region.in_words
+        if size == self.shape and (there := read_tags(image.path).get("REGION", here)) != here:
+            raise SatIntervalsError(f"{image.path} is of {there}, {self.out} of {here}: give one of this run")
         if size == self.shape:
             return Layer(image, 0, 0)
         if size == (left["height"], left["width"]):

@@ -31,6 +31,11 @@ class Window:
         """Return the index of the window into a ``(row, column)`` array."""
         return slice(self.row, self.row_stop), slice(self.column, self.column_stop)
 
+    @property
+    def in_words(self) -> str:
+        """Return first and last rows and columns, for messages and tags."""
+        return f"rows {self.row} to {self.row_stop - 1}, columns {self.column} to {self.column_stop - 1}"
+
     def grown(self, rows: int, columns: int | tuple[int, int]) -> "Window":
         """Return the window grown by ``rows`` above and below and ``columns`` (or a pair) left and right."""
         left, right = columns if isinstance(columns, tuple) else (columns, columns)

@@ -305,7 +305,7 @@ class Cluster(Section):
     store: str | None = Field(
         None, description="folder or fsspec URL for tiles during the run; null: in the folder of the run"
     )
-    retries: int = Field(2, ge=0, description="how often a failed tile is tried again")
+    retries: int = Field(2, ge=0, le=100, description="how often a failed tile is tried again")
 
     @model_validator(mode="after")
     def _check_fit(self) -> Self:

@@ -15,8 +15,8 @@ from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.postprocess import cut_rows, with_halo
 from sat_intervals.products import Bands
-from sat_intervals.raster import watched_rasters
-from sat_intervals.results import Layer, Run, open_run
+from sat_intervals.raster import Layer, watched_rasters
+from sat_intervals.results import Run, open_run
 
 _PIXELS = 1 << 20  # evaluated at a time, 150 bytes each; pixels read ahead take 25 bytes
 

@@ -127,7 +127,7 @@ def make_truth(
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))
-    tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), **MARK}
+    tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), "REGION": run.region.in_words, **MARK}
     tags["SHIFT"] = " ".join(f"{part:.3f}" for part in shift) + " m"
     tally = _Tally(run)
     with (

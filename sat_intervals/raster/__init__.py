@@ -37,7 +37,7 @@ from sat_intervals.raster.surfaces import (
     read_place,
     resolution_of,
 )
-from sat_intervals.raster.windows import read_views, read_window
+from sat_intervals.raster.windows import Layer, read_views, read_window
 from sat_intervals.raster.writer import OutputWriter, remove_scratch, replaceable, restore
 
 __all__ = [
@@ -52,6 +52,7 @@ __all__ = [
     "HeightRaster",
     "Image",
     "InputError",
+    "Layer",
     "OutputError",
     "OutputWriter",
     "Part",

@@ -182,8 +182,7 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
                 f"{path} cannot be read: {reason}: give the path of a raster, such as a GeoTIFF"
             ) from error
         raise InputError(
-            f"{path} cannot be read at rows {window.row} to {window.row_stop - 1}, columns {window.column} to "
-            f"{window.column_stop - 1}: {reason}: the file may be truncated, give a complete copy"
+            f"{path} cannot be read at {window.in_words}: {reason}: the file may be truncated, give a complete copy"
         ) from error
 
 

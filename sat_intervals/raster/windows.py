@@ -1,6 +1,7 @@
 """Read any window of an image, with the states of its pixels."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,21 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 def _pixel_type(image: Image) -> type[np.floating[Any]]:
     return np.float32 if image.dtype in _FLOAT32_HOLDS else np.float64
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A raster as large as a run's region or its left image, read by windows of the region."""
+
+    image: Image
+    row: int
+    column: int
+
+    def read(self, window: Window) -> np.ndarray:
+        """Read a window of the region as floats, NaN where no data."""
+        place = Window(self.row + window.row, self.column + window.column, window.height, window.width)
+        pixels, state = read_window(self.image, place)
+        return np.where(state == 0, pixels, np.nan)
 
 
 def kept_view(image: Image, view: View) -> tuple[np.ndarray, np.ndarray]:

@@ -27,8 +27,7 @@ from sat_intervals.match.postprocess import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, open_image, watched_rasters
-from sat_intervals.results import Layer
+from sat_intervals.raster import Image, Layer, open_image, watched_rasters
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
 from sat_intervals.run.scale import checked_scale

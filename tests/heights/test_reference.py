@@ -314,6 +314,21 @@ def test_reference_command__writes_a_truth_for_evaluate_and_calibrate(relief):
     assert judged.stdout.splitlines()[2].split()[2:4] == [str(ROWS * COLUMNS), "1.000"]
 
 
+def test_reference_command__a_truth_of_another_window_is_refused(relief, tmp_path):
+    out, files, reference = relief
+    assert invoke("reference", out, "--heights", reference, "--ellipsoid", *sensor_words(files)).exit_code == 0
+    other = tmp_path / "other"
+    shutil.copytree(out, other)
+    report = json.loads((other / "run.json").read_text())
+    for side in report["inputs"].values():
+        side["height"] += 10
+    report["tiles"]["region"]["row"] += 10
+    (other / "run.json").write_text(json.dumps(report))
+    result = invoke("evaluate", other, "--truth", out / "truth.tif")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert f"truth.tif is of rows 0 to {ROWS - 1}, columns 0 to {COLUMNS - 1}, {other} of rows 10 to" in result.stderr
+
+
 def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
     out, files, reference = relief
     points = places(hills, 10)
