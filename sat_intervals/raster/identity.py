@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import stat
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -102,17 +103,20 @@ def _stamp(file: str | Path) -> str:
 
 
 def _moment(path: str) -> list[str]:
-    """Return the stamp of a file, if it has one, and what changes if a link on its path does."""
+    """Return the stamp of a file, if it has one, and what changes if a link or folder on its path is exchanged."""
     file = _local_file(path)
-    return [] if file is None else [_stamp(file), *_links(file.absolute())]
+    return [] if file is None else [_stamp(file), *_way_to(file.absolute())]
 
 
-def _links(path: Path) -> Iterator[str]:
+def _way_to(path: Path) -> Iterator[str]:
     for place in (path, *path.parents):
-        if place.is_symlink():
-            status = place.lstat()
+        status = place.lstat()
+        is_link = stat.S_ISLNK(status.st_mode)
+        # a folder that gets a new file has both times of that moment, one that is renamed only the latter
+        if is_link or (place != path and status.st_mtime_ns != status.st_ctime_ns):
             yield f"{status.st_ino:x}-{status.st_ctime_ns:x}"
-            yield from _links(place.parent / place.readlink())
+        if is_link:
+            yield from _way_to(place.parent / place.readlink())
 
 
 def _hashed(file: str | Path) -> tuple[str, str]:

@@ -22,6 +22,8 @@ from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
+# Formats of which GDAL takes missing data for zeros, or does not list the files.
+_UNCHECKED = {"ENVI", "GTI", "MRF", "netCDF", "PCIDSK", "PCRaster"}
 # Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
 _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
 # Relative difference below which pixel sizes are equal up to rounding.
@@ -230,10 +232,15 @@ def _check_mask(image: Image, mask: str) -> None:
 
 
 def _check_watched(name: str, dataset: DatasetReader) -> None:
-    """Raise if a raster is read from files that GDAL does not list: nobody would notice that they change."""
-    if any(map(os.path.isdir, (name, *dataset.files))) or dataset.driver == "GTI" or "/vsisparse/" in name:
+    """Raise if nobody would notice that files of a raster are incomplete, or change."""
+    if any(map(os.path.isdir, (name, *dataset.files))) or "/vsisparse/" in name:
         raise InputError(
             f"{name} is read from files that GDAL does not list, which may change during a run: convert it with "
+            "gdal_translate"
+        )
+    if dataset.driver in _UNCHECKED:
+        raise InputError(
+            f"{name} has the format {dataset.driver}, of which GDAL does not notice missing data: convert it with "
             "gdal_translate"
         )
 

@@ -19,6 +19,7 @@ from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
 from sat_intervals.raster.identity import compared
 from sat_intervals.run.copying import assemble_files
+from sat_intervals.run.inputs import appeared_mask
 from sat_intervals.run.job import Job
 from sat_intervals.run.output import OUTPUTS
 from sat_intervals.run.quality import quality_of, warnings_of
@@ -102,7 +103,7 @@ def assemble(
 
 
 def _check_content(job: Job, name: str | None) -> None:
-    """Raise if the content of an input differs. If its times do not, no tile can be trusted: all are removed."""
+    """Raise if the content of an input differs, or a mask is new. If no time differs, no tile can be trusted."""
     if name is not None:
         job.check_inputs()
         job.store.remove()
@@ -110,6 +111,9 @@ def _check_content(job: Job, name: str | None) -> None:
             f"{name} was changed during the run, though its times were not, as with a memory map: the tiles of the run "
             "are deleted: rerun the command when the file is complete"
         )
+    if mask := appeared_mask(job.left, job.right, job.files):
+        job.store.remove()
+        raise RemovedTilesError(f"{mask} appeared during the run, whose tiles are deleted: rerun the command")
 
 
 def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> None:

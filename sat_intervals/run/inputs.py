@@ -71,6 +71,12 @@ def _with_others(name: str, identified: Callable[[str], dict[str, Any]]) -> dict
     return {**identified(name), "files": [identified(file) for file in other_files(name)]}
 
 
+def appeared_mask(left: Image, right: Image, files: Mapping[str, Any]) -> str | None:
+    """Return the first mask file beside an image or its sources that is not among the inputs; None if none is."""
+    read = (file for image in (left, right) if image.use_mask for file in other_files(image.path))
+    return next((file for file in read if file.endswith(".msk") and file not in files), None)
+
+
 def _weights_identity(cost: Mccnn) -> dict[str, Any]:
     """Return the identity of the weights and the version of onnxruntime."""
     return {**identity(str(weights_file(cost.weights))), "onnxruntime": version("onnxruntime")}

@@ -143,16 +143,20 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     assert hashes(folder / "out") == hashes(folder / "once")
 
 
-@pytest.mark.parametrize("way", ["link", "rename"])
+@pytest.mark.parametrize("way", ["link", "rename", "folder"])
 def test_match_pair__reads_again_where_an_input_was_another_one_for_a_moment(pair, monkeypatch, way):
     folder, settings = pair
     (folder / "link.tif").symlink_to("right.tif")
-    images = folder / "left.tif", folder / "link.tif"
+    for name in ("right", "other"):
+        (folder / f"{name}s").mkdir()
+        shutil.copy(folder / f"{name}.tif", folder / f"{name}s" / "image.tif")
+    images = folder / "left.tif", folder / ("rights/image.tif" if way == "folder" else "link.tif")
     match_pair(*images, folder / "once", settings)
     read_views, moments = source.read_views, iter(range(2))
 
     def exchange():
-        for before, after in (("right.tif", "kept.tif"), ("other.tif", "right.tif"), ("kept.tif", "other.tif")):
+        right, other = ("right.tif", "other.tif") if way == "rename" else ("rights", "others")
+        for before, after in ((right, "kept"), (other, right), ("kept", other)):
             os.rename(folder / before, folder / after)
 
     def put(name):
@@ -162,9 +166,9 @@ def test_match_pair__reads_again_where_an_input_was_another_one_for_a_moment(pai
     def blink(*arguments):
         if next(moments, None) is None:
             return read_views(*arguments)
-        exchange() if way == "rename" else put("other.tif")
+        put("other.tif") if way == "link" else exchange()
         views = read_views(*arguments)
-        exchange() if way == "rename" else put("right.tif")
+        put("right.tif") if way == "link" else exchange()
         return views
 
     monkeypatch.setattr(source, "read_views", blink)
@@ -224,6 +228,35 @@ def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
         file.write(np.ones((1, 80, 100), np.uint16))
     with pytest.raises(InputError, match=r"left\.zarr is read from files that GDAL does not list, .*: convert it"):
         open_image(folder / "left.zarr")
+
+
+@pytest.mark.parametrize("driver", ["ENVI", "PCIDSK", "MRF"])
+def test_open_image__refuses_formats_of_which_gdal_does_not_notice_missing_data(tmp_path, driver):
+    path = tmp_path / "image"
+    kind = {"width": 30, "height": 20, "count": 1, "dtype": "uint8", "crs": "EPSG:32631", "transform": PLACE.transform}
+    with rasterio.open(path, "w", driver=driver, **kind) as file:
+        file.write(np.ones((1, 20, 30), np.uint8))
+    with pytest.raises(InputError, match=rf"image has the format {driver}, .*: convert it with gdal_translate"):
+        open_image(path)
+
+
+def test_match_pair__ends_where_a_mask_of_a_source_appears(pair, monkeypatch):
+    folder, settings = pair
+    band = f"<SimpleSource><SourceFilename>{folder / 'left.tif'}</SourceFilename><SourceBand>{{}}</SourceBand>"
+    band += "</SimpleSource></VRTRasterBand>"
+    (folder / "left.vrt").write_text(
+        f'<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType="UInt16" band="1">{band.format(1)}'
+        f'<MaskBand><VRTRasterBand dataType="Byte">{band.format("mask,1")}</MaskBand></VRTDataset>'
+    )
+
+    def match_and_mask(job, block):
+        match_block(job, block)
+        shutil.copy(folder / "mask.tif", folder / "left.tif.msk")
+
+    monkeypatch.setattr("sat_intervals.run.pair.match_block", match_and_mask)
+    with pytest.raises(RunError, match=r"left.tif.msk appeared during the run, whose tiles are deleted: rerun the com"):
+        match_pair(folder / "left.vrt", folder / "right.tif", folder / "out", settings)
+    assert not list(folder.glob("out/tiles/records/*"))
 
 
 def test_match_pair__ends_where_a_memory_map_changes_an_input(pair, monkeypatch):
