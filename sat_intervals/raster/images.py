@@ -246,7 +246,7 @@ def _check_watched(name: str, dataset: DatasetReader) -> None:
 
 
 def _sources(path: str) -> list[str]:
-    """Return the sources of a virtual raster, a file or its text, that are no plain files: GDAL does not list these."""
+    """Return all sources of a virtual raster, a file or its text: GDAL lists plain files only, none of masks."""
     text = Path(path).read_bytes() if os.path.isfile(path) else path.encode()
     if b"<VRTDataset" not in text:
         return []
@@ -254,8 +254,12 @@ def _sources(path: str) -> list[str]:
         elements = ElementTree.fromstring(text).iter()
     except ElementTree.ParseError as error:
         raise InputError(f"{path} is not well-formed XML: {error}: write it with gdalbuildvrt") from error
-    found = [element.text for element in elements if element.tag in ("SourceFilename", "SourceDataset")]
-    return [name for name in found if name and _IN_ANOTHER.match(name)]
+    found = []
+    for element in elements:
+        if element.tag in ("SourceFilename", "SourceDataset") and (name := element.text):
+            is_relative = element.get("relativeToVRT") == "1" and not _IN_ANOTHER.match(name)
+            found.append(os.path.join(os.path.dirname(path), name) if is_relative else name)
+    return found
 
 
 def other_files(name: str) -> list[str]:
@@ -267,29 +271,31 @@ def other_files(name: str) -> list[str]:
         GDAL does not list all of them.
     """
     seen: list[str] = []
-    asked: list[str] = []
+    asked: set[str] = set()
     waiting = [name]
     while waiting:
         path = waiting.pop()
+        if path in asked:
+            continue
+        asked.add(path)
         _check_beside(path)
         try:
             with gdal.reading(path) as dataset:
                 _check_watched(path, dataset)
-                files, sources = dataset.files, _sources(path) if dataset.driver == "VRT" else []
+                files = dataset.files
+                waiting += filter(_may_have_others, _sources(path) if dataset.driver == "VRT" else [])
         except gdal.GDAL_ERRORS:  # a sidecar file that is not a raster
             continue
-        found = [source for source in sources if source not in asked]
-        asked += found
-        waiting += found
         new = [file for file in files if file not in seen and Path(file).resolve() != Path(name).resolve()]
         seen += new
-        # no pipes, since opening one could block; of remote files only virtual rasters
-        waiting += [
-            file
-            for file in new
-            if os.path.isfile(file) or (file.endswith((".vrt", ".VRT")) and not os.path.exists(file))
-        ]
+        waiting += filter(_may_have_others, new)
     return sorted(seen)
+
+
+def _may_have_others(name: str) -> bool:
+    """Return whether to open a file for others: no pipe, which could block; of remote ones only virtual rasters."""
+    is_remote_vrt = name.endswith((".vrt", ".VRT")) and not os.path.exists(name)
+    return os.path.isfile(name) or is_remote_vrt or _IN_ANOTHER.match(name) is not None
 
 
 def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:

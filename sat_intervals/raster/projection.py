@@ -143,6 +143,8 @@ def geoid_grid(path: Path) -> Transformer:
     """Return a transformer from heights above the ellipsoid to heights above a geoid (degrees, metres)."""
     if not path.is_file():
         raise SatIntervalsError(f"{path}: no such file: give a grid of geoid heights")
+    if "," in str(path.resolve()):
+        raise SatIntervalsError(f"{path.resolve()}: PROJ reads no file with a comma in its path: rename it")
     radians = "+proj=unitconvert +xy_in=deg +xy_out=rad"
     degrees = "+proj=unitconvert +xy_in=rad +xy_out=deg"
     shift = f'+proj=vgridshift +grids="{path.resolve()}" +multiplier=-1'

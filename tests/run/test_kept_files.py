@@ -222,6 +222,15 @@ def test_other_files__are_those_of_sources_with_other_names_than_files(pair, sou
     assert str(folder / "left.tif") in other_files(str(folder / name))
 
 
+def test_other_files__are_those_of_mask_bands(pair):
+    folder, _ = pair
+    band = (folder / "mask.vrt").read_text().replace("mask.tif", "left.tif").replace("Byte", "UInt16")
+    mask = re.search("<VRTRasterBand.*</VRTRasterBand>", (folder / "mask.vrt").read_text(), re.DOTALL)[0]
+    mask = mask.replace(' band="1"', "")
+    (folder / "masked.vrt").write_text(band.replace("</VRTDataset>", f"<MaskBand>{mask}</MaskBand></VRTDataset>"))
+    assert other_files(str(folder / "masked.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
+
+
 def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
     folder, _ = pair
     with rasterio.open(folder / "left.zarr", "w", driver="Zarr", width=100, height=80, count=1, dtype="uint16") as file:
