@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config
+from sat_intervals.config import Config, resolved
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import Image
 from sat_intervals.results import open_run
@@ -26,7 +26,7 @@ def report_before(
     if not is_complete(folder):
         return None
     run = open_run(folder)
-    config = fitted_to_jobs(with_range_of(run.report, settings))
+    config = fitted_to_jobs(with_range_of(run.report, resolved(settings)))
     if changes := changes_since(run.report, left, right, config, window):
         raise SatIntervalsError(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"

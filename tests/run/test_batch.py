@@ -173,6 +173,12 @@ def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(imag
     assert {end["state"] for end in match_batch(pairs, tmp_path, config).values()} == {"done before"}
 
 
+def test_match_batch__knows_its_results_with_a_built_in_calibration_again(images, tmp_path):
+    pairs, config = read_batch(rows(images)), {"interval": {"coverage": 0.9}}
+    match_batch(pairs, tmp_path, config)
+    assert {end["state"] for end in match_batch(pairs, tmp_path, config).values()} == {"done before"}
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"settings": {}}', "\xff"])
 def test_match_batch__goes_on_with_the_others_where_a_report_cannot_be_read(images, tmp_path, text):
     pairs = read_batch(rows(images))
