@@ -174,8 +174,9 @@ def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(imag
 
 
 def test_match_batch__knows_its_results_with_a_built_in_calibration_again(images, tmp_path):
-    pairs, config = read_batch(rows(images)), {"interval": {"coverage": 0.9}}
-    match_batch(pairs, tmp_path, config)
+    pairs = [PairOfBatch("one", str(images / "left1.tif"), str(images / "right1.tif"))]
+    config = {"disparity": {"minimum": -18, "maximum": 40}, "interval": {"coverage": 0.9}}
+    assert match_batch(pairs, tmp_path, config)["one"]["state"] == "done"
     assert {end["state"] for end in match_batch(pairs, tmp_path, config).values()} == {"done before"}
 
 
