@@ -233,7 +233,7 @@ def _check_mask(image: Image, mask: str) -> None:
 
 def _check_watched(name: str, dataset: DatasetReader) -> None:
     """Raise if nobody would notice that files of a raster are incomplete, or change."""
-    if any(map(os.path.isdir, (name, *dataset.files))) or "/vsisparse/" in name:
+    if any(map(os.path.isdir, (name, *dataset.files))) or "/vsisparse/" in name or "/vsicached" in name:
         raise InputError(
             f"{name} is read from files that GDAL does not list, which may change during a run: convert it with "
             "gdal_translate"
@@ -256,7 +256,11 @@ def _sources(path: str) -> list[str]:
         raise InputError(f"{path} is not well-formed XML: {error}: write it with gdalbuildvrt") from error
     found = []
     for element in elements:
-        if element.tag in ("SourceFilename", "SourceDataset") and (name := element.text):
+        if element.get("subClass") == "VRTRawRasterBand":
+            raise InputError(
+                f"{path} has a raw band, of which GDAL does not notice missing data: convert it with gdal_translate"
+            )
+        if element.tag in ("SourceFilename", "SourceDataset", "DEMPath") and (name := element.text):
             is_relative = element.get("relativeToVRT") == "1" and not _IN_ANOTHER.match(name)
             found.append(os.path.join(os.path.dirname(path), name) if is_relative else name)
     return found

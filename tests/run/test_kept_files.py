@@ -231,6 +231,19 @@ def test_other_files__are_those_of_mask_bands(pair):
     assert other_files(str(folder / "masked.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
 
 
+def test_other_files__are_those_of_warping_too(pair):
+    folder, _ = pair
+    text = (folder / "mask.vrt").read_text()
+    dem = f"<Unused><DEMPath>{folder / 'left.tif'}</DEMPath></Unused></VRTDataset>"
+    (folder / "warped.vrt").write_text(text.replace("</VRTDataset>", dem))
+    assert other_files(str(folder / "warped.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
+    raw = text.replace('band="1"', 'band="1" subClass="VRTRawRasterBand"')
+    raw = re.sub("<SimpleSource>(.*)</SimpleSource>", r"\1", raw, flags=re.DOTALL)
+    (folder / "raw.vrt").write_text(raw)
+    with pytest.raises(InputError, match=r"raw\.vrt"):
+        other_files(str(folder / "raw.vrt"))
+
+
 def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
     folder, _ = pair
     with rasterio.open(folder / "left.zarr", "w", driver="Zarr", width=100, height=80, count=1, dtype="uint16") as file:
