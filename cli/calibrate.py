@@ -100,10 +100,9 @@ def calibrate(
     from sat_intervals.run.measure import measure_subjects
 
     subjects = _subjects(pairs, truth, _Judging(settings, **judging))
-    inputs = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
     described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
-    check_not_replaced([*inputs, *described, *truth, settings.file], [output])
-    folder = checked_folder(output)
+    check_not_replaced([*_inputs(subjects), *described, *truth, settings.file], [output])
+    folder = checked_folder(output, _SETTINGS if tune else _CALIBRATION)
     check_subjects(subjects)
     with Console(quiet or as_json) as console:
         if tune:
@@ -152,6 +151,13 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judgi
     ]
     check_names(subject.name for subject in subjects)
     return subjects
+
+
+def _inputs(subjects: "list[Subject]") -> list[str]:
+    """Return images and truths, and calibrations that the settings name."""
+    named = [one.config.interval.calibration for one in subjects if one.config.interval]
+    files = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
+    return files + [name for name in named if isinstance(name, str)]
 
 
 def _of_pair(pair: "Pair", truth: Path | None, judging: _Judging) -> "Subject":

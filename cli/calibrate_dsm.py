@@ -39,7 +39,7 @@ def calibrate_heights(
 
     files = surface.dsm, surface.reference
     check_not_replaced(files, [output])
-    checked_folder(output)
+    checked_folder(output, _HEIGHTS)
     calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=surface.registers)
     write(output, _HEIGHTS, calibration.model_dump(mode="json"))
     if as_json:

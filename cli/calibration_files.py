@@ -4,19 +4,21 @@ import os
 from pathlib import Path
 from typing import Any
 
-# The first line of their explanations ends so.
-_MARK = ", found by sat-intervals calibrate"
 
+def checked_folder(output: Path, head: str) -> Path:
+    """Return the folder of a file, where tiles are kept meanwhile; raise if it cannot be written.
 
-def checked_folder(output: Path) -> Path:
-    """Return the folder of a file, where tiles are kept meanwhile; raise if it cannot be written."""
+    A file is replaced only if the first line of its explanation is that of ``head``, so that it is of the same kind.
+    """
     from sat_intervals.errors import SatIntervalsError
 
     folder = output.absolute().parent
     if output.is_dir() or not os.access(folder, os.W_OK):
         raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")
-    if output.exists() and _MARK.encode() not in output.read_bytes().partition(b"\n")[0]:
-        raise SatIntervalsError(f"{output} exists and was not made by sat-intervals calibrate: move it away")
+    if output.exists() and output.read_bytes().partition(b"\n")[0] != head.partition("\n")[0].encode():
+        raise SatIntervalsError(
+            f"{output} exists and was not made by sat-intervals calibrate, or holds something else: move it away"
+        )
     return folder
 
 
@@ -26,7 +28,6 @@ def write(output: Path, head: str, content: dict[str, Any]) -> None:
 
     from sat_intervals.raster import whole_file
 
-    assert _MARK in head.partition("\n")[0]
-    checked_folder(output)  # again, after hours
+    checked_folder(output, head)  # again, after hours
     with whole_file(output) as new:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")

@@ -183,6 +183,9 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
     away = write_raster(tmp_path / "away.tif", [height], Affine(1, 0, 5, 0, -1, 5))
     (tmp_path / "mine.yaml").write_text("mine: 1\n")
     given = ["--dsm", model, "--reference", reference]
+    (tmp_path / "levels.yaml").write_text(
+        "# Calibration: levels of the cost curve that reach a coverage, found by sat-i"
+    )
     for words, message in (
         ([], "give PAIRS, or --dsm and --reference"),
         (["--dsm", model], "--dsm and --reference go together"),
@@ -197,6 +200,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
         ([*given, "--coverage", 2], "coverage is 2, allowed: 0.5 to 0.99"),
         ([*given, "--coverage", 0.99, "--output", reference], "would be written: choose another output"),
         ([*given, "--output", tmp_path / "mine.yaml"], "exists and was not made by sat-intervals calibrate"),
+        ([*given, "--output", tmp_path / "levels.yaml"], "levels.yaml exists and was not made by"),
         (["--dsm", reference, "--reference", model], "is not a surface model of sat-intervals dsm"),
         (["--dsm", calibrated, "--reference", flat], "was made with --calibration: make it without"),
         (["--dsm", cut, "--reference", flat], "was made with --max-width: make it without"),
@@ -264,5 +268,5 @@ def test_calibrate_dsm_command__keeps_a_file_that_appears_meanwhile(tmp_path, mo
     monkeypatch.setattr(calibration, "calibrate_surface", slow)
     done = invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
     assert done.exit_code == 2
-    assert f"{output} exists and was not made by sat-intervals calibrate: move it away" in done.stderr
+    assert f"{output} exists and was not made by sat-intervals calibrate, or holds something else" in done.stderr
     assert output.read_text() == "mine"
