@@ -29,7 +29,6 @@ _STRICT = {
     "VRT_NUM_THREADS": "1",
     "GTIFF_DIRECT_IO": "NO",
     "GTIFF_IGNORE_READ_ERRORS": "NO",
-    "GTIFF_VIRTUAL_MEM_IO": "NO",
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",  # reads what is missing from memory that was never written
 }
 # A source of a VRT that cannot be opened fails without a message in each other dataset until the first is closed.
