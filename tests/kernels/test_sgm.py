@@ -24,7 +24,8 @@ X = IMPOSSIBLE_COST
 
 def volume(scene, **changes):
     """The kernel's aggregated costs of a scene."""
-    return cost_volume(between(*codes_of(scene)), Settings(**{**reference.settings_of(scene), **changes}))
+    scene = SimpleNamespace(**{**vars(scene), **changes})
+    return cost_volume(between(*codes_of(scene)), Settings(**reference.settings_of(scene)))
 
 
 def bare_codes(levels):
@@ -322,6 +323,8 @@ def test_cost_volume__of_stored_costs_equals_that_of_codes(scene):
 def test_match_costs__candidates_that_no_cell_searches_change_nothing(seed, before, after, holes):
     """Cells of random ranges in a hull and in a wider one: other vectors contain the candidates of each pixel."""
     random, (rows, columns, count) = np.random.default_rng(seed), (9, 21, 80)
+    largest = 8 * (24 + 32)  # eight paths, each at most a code's 24 bits and P2
+    weights = np.arange(largest + 1, 0, -1).astype(np.uint16)
     ends = np.sort(random.integers(0, count, (2, 3, 4)), axis=0)
     whole = Window(0, 0, rows, columns)
 
@@ -331,7 +334,7 @@ def test_match_costs__candidates_that_no_cell_searches_change_nothing(seed, befo
 
     def matched(right, padding):
         total = right.state.shape[1] + 1 - columns
-        settings = Settings(-padding, total, 77, 8, 32, True, 60, np.arange(60, 0, -1).astype(np.uint16), True)
+        settings = Settings(-padding, total, 77, 8, 32, True, 60, weights, True)
         cells = Cells(ends[0] + padding, ends[1] + padding, 4, 6, 2, 1)
         return match_costs(between(left, right), settings, whole, cells=cells)
 
