@@ -11,6 +11,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import LARGEST
 from sat_intervals.kernels.registration import REACH, Blocks, Registration, register
 from sat_intervals.raster import (
+    GROUND,
     Georeferencing,
     check_reference,
     covered_window,
@@ -64,11 +65,29 @@ class Comparison:
 
     def heights(self, window: Window, finer: int = 1, *, smooth: bool = False) -> np.ndarray:
         """Read the moved reference in a window of cells, which may reach beyond the surface, ``finer`` per side."""
-        east, north, up = self.shift
-        part = self.place.shifted(window).moved(-east, -north).refined(finer)
         shape = finer * window.height, finer * window.width
-        smooth = smooth or (east, north) != (0.0, 0.0)
-        return np.asarray(read_heights(self.reference, part, shape, Window(0, 0, *shape), smooth=smooth) + up)
+        smooth = smooth or self.shift[:2] != (0.0, 0.0)
+        return self.heights_at(self.place.shifted(window), shape, finer, smooth=smooth)
+
+    def heights_at(
+        self, place: Georeferencing, shape: tuple[int, int], finer: int = 1, *, smooth: bool = False
+    ) -> np.ndarray:
+        """Read the moved reference in ``shape`` cells at a place, ``finer`` of them along each side of its cells.
+
+        Raises
+        ------
+        SatIntervalsError
+            A height is impossible on Earth: a no-data value that the file does not declare, or another unit.
+        """
+        east, north, up = self.shift
+        cells = place.moved(-east, -north).refined(finer)
+        heights = read_heights(self.reference, cells, shape, Window(0, 0, *shape), smooth=smooth)
+        if (wrong := heights[(heights < GROUND[0]) | (heights > GROUND[1])]).size:
+            raise SatIntervalsError(
+                f"{self.reference} has heights such as {wrong[0]:.0f} m, which no ground has: declare them as no data, "
+                "with gdal_edit.py -a_nodata, or convert the file to metres"
+            )
+        return np.asarray(heights + up)
 
 
 def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:

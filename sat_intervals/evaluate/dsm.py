@@ -209,8 +209,6 @@ def error_map(given: Comparison, longest: int) -> tuple[np.ndarray, tuple[float,
     place = given.place.transform
     assert place is not None
     across, down = columns / small[1], rows / small[0]
-    east, north, up = given.shift
-    coarse = given.place.moved(-east, -north).coarser(across, down)
-    truth = read_heights(given.reference, coarse, small, Window(0, 0, *small)) + up
+    truth = given.heights_at(given.place.coarser(across, down), small)
     extent = place.c, place.c + columns * place.a, place.f + rows * place.e, place.f
     return heights - truth, extent

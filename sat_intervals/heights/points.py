@@ -1,7 +1,6 @@
 """Open the points of runs, which `triangulate` wrote, and read them by windows."""
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,10 +26,7 @@ def triangulated(outs: Sequence[Path]) -> list[Run]:
     SatIntervalsError
         A folder is no run, is given twice, or has no points, those of an earlier run, or damaged ones.
     """
-    for out, count in Counter(out.resolve() for out in outs).items():
-        if count > 1:
-            raise SatIntervalsError(f"{out} is given {count} times: give each run once")
-    runs = []
+    runs: list[Run] = []
     for out in outs:
         run = open_run(out)
         path = out / "points.tif"
@@ -39,6 +35,8 @@ def triangulated(outs: Sequence[Path]) -> list[Run]:
         if read_tags(path).get("RUN") != run.report["finished"] or read_shape(path) != (len(POINTS), *run.shape):
             raise SatIntervalsError(f"{path} belongs to an earlier run in {out}: triangulate again")
         check_points(out)
+        if known := [one.out for one in runs if one.report["finished"] == run.report["finished"]]:
+            raise SatIntervalsError(f"{known[0]} and {out} are the same run: give each run once")
         runs.append(run)
     return runs
 

@@ -6,7 +6,7 @@ from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, 
 from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
-from sat_intervals.raster.heightfield import HeightRaster
+from sat_intervals.raster.heightfield import GROUND, HeightRaster
 from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files, watched_rasters
 from sat_intervals.raster.layers import (
     MARK,
@@ -42,6 +42,7 @@ from sat_intervals.raster.writer import OutputWriter, remove_scratch, replaceabl
 
 __all__ = [
     "BLOCK",
+    "GROUND",
     "MARK",
     "POINT_FILES",
     "RUN_FILES",

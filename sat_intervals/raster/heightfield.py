@@ -14,7 +14,7 @@ from sat_intervals.raster.windows import read_window
 from sat_intervals.tiling import Window
 
 # Heights of the ground on Earth in metres; others are no-data values that the file does not declare.
-_GROUND = -600.0, 9500.0
+GROUND = -600.0, 9500.0
 # Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
 _BLOCK, _KEPT = 512, 128
 
@@ -78,4 +78,4 @@ class HeightRaster:
         pixels, state = read_window(self._image, block)
         heights = (pixels * self._scale + self._offset).astype(np.float32)
         metres = heights * self.frame.unit
-        return np.where((state == 0) & (metres >= _GROUND[0]) & (metres <= _GROUND[1]), heights, np.float32(np.nan))
+        return np.where((state == 0) & (metres >= GROUND[0]) & (metres <= GROUND[1]), heights, np.float32(np.nan))

@@ -26,6 +26,8 @@ _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, M
 _UNCHECKED = {"ENVI", "GTI", "MRF", "netCDF", "PCIDSK", "PCRaster"}
 # Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
 _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
+# Elements of a virtual raster that name a file, and the metadata that do so: positions of a warped one.
+_SOURCE_TAGS, _GEOLOCATION_KEYS = {"SourceFilename", "SourceDataset", "DEMPath"}, {"X_DATASET", "Y_DATASET"}
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
 
@@ -60,8 +62,8 @@ class Image:
         The user's mask: a file of the same size, not 0 where the image must not be used; None without one.
     georeferencing
         Georeferencing of the file.
-    stamp
-        Stamp of the file when it was opened, see `identity`; None if the file is not local.
+    stamps
+        Stamps of the file and its `other_files` before it was opened, see `identity`; None for one that is not local.
     """
 
     path: str
@@ -74,7 +76,7 @@ class Image:
     alpha: int | None
     mask: str | None
     georeferencing: Georeferencing
-    stamp: str | None
+    stamps: tuple[str | None, ...]
 
 
 def open_image(
@@ -104,7 +106,7 @@ def open_image(
         The file has no usable band, or the mask has another size.
     """
     name = _absolute(path)
-    stamp = stamp_of(name)
+    stamps = tuple(stamp_of(file) for file in (name, *other_files(name)))
     with opened(name) as dataset:
         _check_watched(name, dataset)
         check_seal(name, dataset.files)
@@ -123,7 +125,7 @@ def open_image(
             alpha=alphas[0] if alphas else None,
             mask=None if mask is None else _absolute(mask),
             georeferencing=Georeferencing.of(dataset),
-            stamp=stamp,
+            stamps=stamps,
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
             raise InputError(
@@ -171,8 +173,7 @@ def check_pair(left: Image, right: Image, count: int) -> None:
 @contextmanager
 def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
     """Open a raster for reading and turn GDAL's errors into `InputError`; ``window`` is for the message."""
-    if window is None:
-        _check_beside(path)
+    _check_beside(path)
     check_regular(path)
     try:
         with gdal.reading(path) as dataset:
@@ -260,7 +261,8 @@ def _sources(path: str) -> list[str]:
             raise InputError(
                 f"{path} has a raw band, of which GDAL does not notice missing data: convert it with gdal_translate"
             )
-        if element.tag in ("SourceFilename", "SourceDataset", "DEMPath") and (name := element.text):
+        is_named = element.tag in _SOURCE_TAGS or element.get("key") in _GEOLOCATION_KEYS
+        if is_named and (name := element.text):
             is_relative = element.get("relativeToVRT") == "1" and not _IN_ANOTHER.match(name)
             found.append(os.path.join(os.path.dirname(path), name) if is_relative else name)
     return found
@@ -283,6 +285,7 @@ def other_files(name: str) -> list[str]:
             continue
         asked.add(path)
         _check_beside(path)
+        check_regular(path)
         try:
             with gdal.reading(path) as dataset:
                 _check_watched(path, dataset)

@@ -14,13 +14,16 @@ from sat_intervals.match.measurement import Measured, ladder
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.run.job import checked_region
 from sat_intervals.run.measure import Subject, check_enough
-from sat_intervals.tiling import strips
+from sat_intervals.tiling import Window, strips
 
 
 def check_subjects(subjects: Sequence[Subject]) -> None:
     """Raise if subjects cannot be calibrated together: settings without confidence, other settings, too few truths."""
     first = subjects[0]
+    scenes: dict[tuple[str, Window | None], str] = {}
     for subject in subjects:
+        if (same := scenes.setdefault((subject.left.path, subject.window), subject.name)) != subject.name:
+            raise SatIntervalsError(f"{same} and {subject.name} are the same scene: give each scene once")
         if subject.config.disparity.is_auto:
             raise SatIntervalsError(f"{subject.name}: the search range is auto, but calibrate needs it as numbers")
         missing = [name for name in ("ambiguity", "regularization") if getattr(subject.config, name) is None]

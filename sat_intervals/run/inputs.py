@@ -47,11 +47,13 @@ def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dic
     Raises
     ------
     ChangedInputError
-        The file was replaced after it was opened, so its band and no-data value may be wrong.
+        A file of the image was made or replaced after it was opened, so its band and no-data value may be wrong.
     """
     files, crs = _with_others(image.path, identified), image.georeferencing.crs
-    if files.get("stamp") != image.stamp:
-        raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: rerun the command")
+    if tuple(file.get("stamp") for file in (files, *files["files"])) != image.stamps:
+        raise ChangedInputError(
+            f"{image.path} or a file beside it was replaced or changed since it was opened: rerun the command"
+        )
     return {
         **files,
         "height": image.height,

@@ -30,9 +30,20 @@ _AT_ONCE = 16
 
 @dataclass(frozen=True)
 class LocalFolder:
-    """See `Folder`. Files are renamed when complete; runs exclude each other with ``flock``."""
+    """See `Folder`. Files are renamed when complete; runs exclude each other with ``flock``.
+
+    Nothing is written or deleted behind a link in the folder: its files are those of somebody else.
+
+    Attributes
+    ----------
+    path
+        The folder.
+    depth
+        Number of the last parts of ``path`` that are folders of the store, too.
+    """
 
     path: Path
+    depth: int = 0
 
     def __str__(self) -> str:
         """Return the path."""
@@ -103,7 +114,7 @@ class LocalFolder:
     @contextmanager
     def _written(self, name: str, content: bytes) -> Iterator[tuple[Path, Path]]:
         """Write a temporary file, deleted after the block; yield it and the final path."""
-        file = self.path / name
+        file = self._own(name)
         temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
         try:
             temporary.write_bytes(content)
@@ -115,13 +126,22 @@ class LocalFolder:
 
     def delete(self, name: str) -> None:
         """See `Folder`."""
-        (self.path / name).unlink(missing_ok=True)
+        self._own(name).unlink(missing_ok=True)
+
+    def _own(self, name: str) -> Path:
+        """Return the path of what is written or deleted; raise if a folder of the store on the way is a link."""
+        place = self.path / name
+        for folder in place.parents[: max(0, self.depth + len(Path(name).parts) - 1)]:
+            if folder.is_symlink():
+                raise OSError(errno.ELOOP, f"{folder} has become a symbolic link", str(place))
+        return place
 
     def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
         """See `Folder`."""
         for name in names:
             self.delete(name)
-        places = [LocalFolder(Path(place)) for folder in folders for place, _, _ in os.walk(self.path / folder)]
+        tops = [self._own(folder) for folder in folders]
+        places = [LocalFolder(Path(place)) for top in tops for place, _, _ in os.walk(top) if not top.is_symlink()]
         with ThreadPoolExecutor(_AT_ONCE) as threads:  # one after another takes milliseconds each on some disks
             for _, level in groupby(sorted(places, key=_depth, reverse=True), _depth):
                 list(threads.map(LocalFolder.delete_if_empty, level))
@@ -133,11 +153,11 @@ class LocalFolder:
 
     def inside(self, folder: str) -> "LocalFolder":
         """See `Folder`."""
-        return LocalFolder(self.path / folder)
+        return LocalFolder(self.path / folder, self.depth + len(Path(folder).parts))
 
     def make(self, folder: str) -> None:
         """See `Folder`."""
-        (self.path / folder).mkdir(parents=True, exist_ok=True)
+        self._own(folder).mkdir(parents=True, exist_ok=True)
 
     def place(self, name: str) -> Path:
         """See `Folder`."""

@@ -284,6 +284,7 @@ def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
     away = write_raster(tmp_path / "away.tif", [[[1.5, 9]]], Affine(1, 0, 5, 0, -1, 5))
     feet = write_raster(tmp_path / "feet.tif", [[[3000.0, 3003]]])
     nowhere = write_raster(tmp_path / "nowhere.tif", [[[1.5, 9]]], crs=None)
+    holed = write_raster(tmp_path / "holed.tif", [[[1.5, -9999]]])
     for words, message in (
         ([], "Missing argument 'OUT...'"),
         (["--dsm", model], "--dsm and --reference go together"),
@@ -295,6 +296,7 @@ def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):
             ["--dsm", feet, "--reference", model],
             "feet.tif is not a surface model of sat-intervals dsm: is it the --reference?",
         ),
+        (["--dsm", model, "--reference", holed], "holed.tif has heights such as -9999 m, which no ground has: declare"),
         (["--dsm", model, "--reference", feet], "differ by 500 m or more in the median: check that both are metres"),
         (
             ["--dsm", model, "--reference", feet, "--tolerance", "5"],

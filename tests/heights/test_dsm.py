@@ -3,11 +3,12 @@
 import json
 import shutil
 import threading
+from itertools import count
 
 import numpy as np
 import pytest
 import rasterio
-from finished import FINISHED, write_file, write_run
+from finished import write_file, write_run
 from helpers import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -33,15 +34,19 @@ from sat_intervals.tiling import Window
 TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
 BAND = {band.name: index for index, band in enumerate(SURFACE)}
 LEFT, TOP = 370_000.0, 4_830_000.0
+MICROSECONDS = count()
 
 
-def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run=FINISHED, validity=0):
+def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run=None, validity=0):
     """A run whose pixels are points at map places (metres from LEFT, TOP; y upwards), NaN height for none."""
     x, y, height = (np.atleast_2d(np.asarray(values, np.float64)) for values in (x, y, height))
     folder.mkdir(exist_ok=True)
     bands = np.full((4, *height.shape), 1.0, np.float32)
     bands[3] = confidence
     out = write_run(folder, bands, np.broadcast_to(np.uint16(validity), height.shape))
+    report = json.loads((out / "run.json").read_text())
+    report["finished"] = f"2026-11-21T12:00:00.{next(MICROSECONDS):06d}+00:00"  # it tells runs apart
+    (out / "run.json").write_text(json.dumps(report))
     longitude, latitude = transformed(TO_DEGREES, LEFT + x, TOP + y)
     nothing = np.isnan(height)
     layers = dict.fromkeys((band.name for band in POINTS), np.zeros(height.shape)) | {
@@ -52,7 +57,7 @@ def write_points(folder, x, y, height, lower=1.0, upper=2.0, confidence=0.5, run
         "height_upper": height + upper,
     }
     points = np.stack([np.where(nothing, np.nan, layers[band.name]) for band in POINTS])
-    write_file(out / "points.tif", POINT_FILES[0], points, tags={"RUN": run})
+    write_file(out / "points.tif", POINT_FILES[0], points, tags={"RUN": run or report["finished"]})
     return out
 
 
@@ -579,7 +584,8 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([far[0]], ["--max-width", "-2"], "max_width is -2 m: give one above 0, or leave it out"),
         ([far[0]], ["--min-confidence", "3"], "min_confidence is 3: give one from 0 to 1"),
         ([far[0]], ["--radius", "1e9"], "radius is 1e+09 m: give one above 0"),
-        ([far[0], far[0]], [], "is given 2 times: give each run once"),
+        ([far[0], far[0]], [], "are the same run: give each run once"),
+        ([far[0], shutil.copytree(far[0], tmp_path / "copy")], [], "are the same run: give each run once"),
         (
             [far[0]],
             ["--output", str(far[0] / "points.tif")],

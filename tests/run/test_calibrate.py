@@ -266,6 +266,13 @@ def test_check_subjects__needs_another_group_to_judge_with(scene, tmp_path):
     assert "all 2 pairs are of group" in line
 
 
+def test_check_subjects__refuses_a_scene_that_counts_twice(scene, tmp_path):
+    for out in (tmp_path / "one", tmp_path / "other"):
+        match_pair(scene / "left.tif", scene / "right.tif", out, settings_with(scene, coverage=0.9))
+    line = one_line(invoke("calibrate", tmp_path / "one", tmp_path / "other", "--output", tmp_path / "new.yaml"))
+    assert f"{tmp_path}/one and {tmp_path}/other are the same scene: give each scene once" in line
+
+
 MCCNN = [pytest.param(preset, marks=pytest.mark.peer("onnxruntime")) for preset in PRESETS if "mccnn" in preset]
 
 

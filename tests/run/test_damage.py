@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import shutil
+from contextlib import suppress
 
 import pytest
 import yaml
@@ -372,6 +373,26 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     match(scene, out, *options, "--overwrite")
     assert_kept(mine)
     assert {file for file in tiles.rglob("*") if file.is_file()} == {file for file in mine if tiles in file.parents}
+
+
+@pytest.mark.parametrize("name", ["records", "arrays.zarr", "arrays.zarr/int16/c/0"])
+def test_match_block__keeps_files_behind_a_folder_that_becomes_a_link(scene, tmp_path, name):
+    job = prepare(scene / "left.tif", scene / "right.tif", tmp_path / "out", scene / "settings.yaml")
+    job.begin()
+    first, second, *_ = job.store.grid
+    match_block(job, first)
+    folder, user = tmp_path / "out" / "tiles" / name, tmp_path / "user"
+    folder.rename(user)
+    folder.symlink_to(user)
+    written = [str(file.relative_to(user)) for file in user.rglob("*") if file.is_file()]
+    mine = with_files(user, written)
+    with pytest.raises(OSError, match=f"{folder} has become a symbolic link"):
+        match_block(job, second)
+    with suppress(OSError):
+        job.store._arrays.drop(first)
+    job.store.remove()
+    assert_kept(mine)
+    assert {file for file in user.rglob("*") if file.is_file()} == set(mine)
 
 
 @pytest.mark.parametrize("name", ["records/0_0.json", *SHARDS[:1], "normalization.json", "manifest.json"])

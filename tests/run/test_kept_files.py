@@ -237,6 +237,9 @@ def test_other_files__are_those_of_warping_too(pair):
     dem = f"<Unused><DEMPath>{folder / 'left.tif'}</DEMPath></Unused></VRTDataset>"
     (folder / "warped.vrt").write_text(text.replace("</VRTDataset>", dem))
     assert other_files(str(folder / "warped.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
+    positions = f'<Metadata domain="GEOLOCATION"><MDI key="X_DATASET">{folder / "left.tif"}</MDI></Metadata>'
+    (folder / "warped.vrt").write_text(text.replace("</VRTDataset>", f"{positions}</VRTDataset>"))
+    assert other_files(str(folder / "warped.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
     raw = text.replace('band="1"', 'band="1" subClass="VRTRawRasterBand"')
     raw = re.sub("<SimpleSource>(.*)</SimpleSource>", r"\1", raw, flags=re.DOTALL)
     (folder / "raw.vrt").write_text(raw)
@@ -326,7 +329,20 @@ def test_prepare__refuses_an_image_that_was_replaced_since_it_was_opened(scene, 
     folder, settings = pair
     left, right = open_image(folder / "left.tif"), open_image(folder / "right.tif")
     write_layer(folder / "left.tif", scene.left, int(scene.left[70, 80]), PLACE)  # another no-data value
-    with pytest.raises(ChangedInputError, match=r"left.tif was replaced or changed since it was opened: rerun the"):
+    with pytest.raises(ChangedInputError, match=r"left.tif or a file beside it was replaced or changed since it was"):
+        prepare(left, right, folder / "out", settings)
+
+
+@pytest.mark.parametrize("ending", [".aux.xml", ".msk"])
+def test_prepare__refuses_an_image_that_got_another_file_since_it_was_opened(pair, ending):
+    folder, settings = pair
+    left, right = open_image(folder / "left.tif"), open_image(folder / "right.tif")
+    if ending == ".msk":
+        shutil.copy(folder / "mask.tif", folder / "left.tif.msk")
+    else:
+        nodata = '<PAMDataset><PAMRasterBand band="1"><NoDataValue>7</NoDataValue></PAMRasterBand></PAMDataset>'
+        (folder / "left.tif.aux.xml").write_text(nodata)
+    with pytest.raises(ChangedInputError, match=r"left.tif or a file beside it was replaced or changed since it was"):
         prepare(left, right, folder / "out", settings)
 
 
@@ -1142,11 +1158,10 @@ def test_dsm__says_that_the_working_directory_was_deleted_meanwhile(tmp_path, mo
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
 
-    def deleted(*arguments, **options):
+    def deleted(outs):
         (tmp_path / "gone").rmdir()
-        return triangulated(*arguments, **options)
+        return [out.absolute() for out in outs]
 
-    triangulated = dsm.triangulated
     monkeypatch.setattr(dsm, "triangulated", deleted)
     result = invoke("dsm", "out", "--resolution", "1")
     assert result.exit_code == 1

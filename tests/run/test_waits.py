@@ -21,13 +21,14 @@ from sat_intervals.config import Cluster, ConfigError, Mccnn
 from sat_intervals.config.pairs import find_pairs, read_batch
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
-from sat_intervals.raster import other_files, read_place
+from sat_intervals.raster import read_place, read_window
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_run
 from sat_intervals.run import cluster, submit
 from sat_intervals.run.cluster import connected
 from sat_intervals.run.submit import Submission
 from sat_intervals.run.workers import Task
+from sat_intervals.tiling import Window
 
 
 # ---- Files that are none ---------------------------------------------------------------------------------------
@@ -80,7 +81,15 @@ def test_open_image__does_not_wait_for_a_pipe_beside_a_raster(tmp_path, name, en
     )
     os.mkfifo(tmp_path / f"image{ending}")
     with pytest.raises(SatIntervalsError, match=f"image{ending} is a named pipe: give a regular file"):
-        other_files(open_image(tmp_path / name).path)
+        open_image(tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", [".msk", ".aux.xml"])
+def test_read_window__does_not_wait_for_a_pipe_that_appears_beside_an_image(tmp_path, ending):
+    image = open_image(write(tmp_path / "image.tif"))
+    os.mkfifo(tmp_path / f"image.tif{ending}")
+    with pytest.raises(SatIntervalsError, match=f"image.tif{ending} is a named pipe: give a regular file"):
+        read_window(image, Window(0, 0, 9, 9))
 
 
 def test_log_file__does_not_wait_for_who_reads_a_pipe(tmp_path):
