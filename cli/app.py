@@ -96,7 +96,7 @@ class _Commands(click.Group):
             raise
         except click.UsageError as error:
             where = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
-            return _end(USER_ERROR, f"{error.format_message()}{where}")
+            return _end(USER_ERROR, f"{' '.join(error.format_message().split())}{where}")
         except Ended as ended:
             resumed = context.invoked_subcommand in RESUMED
             again = "; rerun the same command: it resumes" if resumed else ""

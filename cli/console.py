@@ -34,6 +34,16 @@ STAGES = {
 }
 
 
+# Files that other commands write to the folder of a run.
+_PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
+_MADE_FROM_RUNS = ("points.tif", "dsm.tif", "report.html", "project.qgz", "stac.json", *(f"{n}.png" for n in _PICTURES))
+
+
+def _is_older(file: Path, other: Path) -> bool:
+    """Return whether a file exists and was written before another one."""
+    return file.exists() and file.stat().st_mtime_ns < other.stat().st_mtime_ns
+
+
 class _Terminal(Terminal):
     """A terminal that raises BrokenPipeError; rich would end the process with status 1."""
 
@@ -125,6 +135,8 @@ class Console:
         self._terminal.print(table)
         for name in ("intervals.tif", "validity.tif", "run.json"):
             self._terminal.print(str(out / name), soft_wrap=True)
+        if old := [name for name in _MADE_FROM_RUNS if _is_older(out / name, out / "run.json")]:
+            self.say(f"of an earlier run: {', '.join(old)}: make them again")
         if then:
             self.say(f"next: sat-intervals {then} {quote(str(out))}")
 

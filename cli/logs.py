@@ -64,6 +64,9 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
     """
     ours = logging.getLogger("sat_intervals")
     with ExitStack() as stack:
+        # Libraries give the root logger handlers of their own, which would repeat our lines.
+        stack.callback(setattr, ours, "propagate", ours.propagate)
+        ours.propagate = False
         everything = [_Handler(_LINES, stack.enter_context(_opened(log_file)))] if log_file else []
         if debug:
             everything.append(_Handler(_LINES))
@@ -75,6 +78,7 @@ def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
         dasks = logging.getLogger("distributed")
         for handler in everything:
             stack.enter_context(_added(handler, logging.root))
+            stack.enter_context(_added(handler, ours))
             if not dasks.propagate:
                 stack.enter_context(_added(handler, dasks))
         if everything:

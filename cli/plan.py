@@ -37,7 +37,8 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
     if as_json:
         say_json(asdict(made))
         return
-    smaller = " (smaller than set, to fit)" if made.tile_size < config.tiles.size else ""
+    is_smaller = made.tile_size < config.tiles.size
+    smaller = f" (smaller than set, to fit: give --tile-size {made.tile_size})" if is_smaller else ""
     one, together = _verdicts(made, limit, config.cluster.kind)
     is_exact = config.tiles.overlap == "exact"
     seams = "exact seams" if is_exact else f"overlap {config.tiles.overlap} px"

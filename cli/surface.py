@@ -91,7 +91,8 @@ def _check(out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path],
     from sat_intervals.heights.dsm import checked_cells, surface_tags
     from sat_intervals.heights.sensors import Sensors
 
-    _, cell, _, radius = checked_cells(out / "dsm.tif", cells["resolution"], cells["crs"], cells["radius"])
+    given = (cells[name] for name in ("resolution", "crs", "radius", "geoid"))
+    _, cell, _, radius = checked_cells(out / "dsm.tif", *given)
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
     Sensors.load(*map(Path, sensor_files))
 

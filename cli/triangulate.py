@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 # Metres between lines of sight above which models are suspect.
 _SUSPECT = 0.1
+# Nodes of a grid beyond the image above which it may be that of another image: CARS adds up to three.
+_MOST_BEYOND = 4
 
 
 @click.command(short_help="Compute points and height bounds of a run with sensor models.")
@@ -51,7 +53,8 @@ def say_points(console: "Console", report: dict[str, Any]) -> None:
         (lowest, highest), residual = report["height"], report["residual"][1]
         console.say(
             f"{report['points']} points between {lowest:.1f} and {highest:.1f} m above the ellipsoid, "
-            f"lines of sight at most {residual:.2g} m apart (this tests models and grids, not the matches)"
+            f"lines of sight at most {residual:.2g} m apart (so models and grids fit together; "
+            "neither the matches nor whether they belong to these images is tested)"
         )
     else:
         console.say("no valid pixels, so no points")
@@ -64,6 +67,11 @@ def point_warnings(report: dict[str, Any]) -> list[str]:
     lines = []
     if report.get("lost"):
         lines.append(f"{report['lost']} valid pixels have no point: grids or models have no values there")
+    if report.get("beyond", 0) > _MOST_BEYOND * report.get("grid_step", 0):
+        lines.append(
+            f"warning: the left grid reaches {report['beyond']:.0f} px beyond the left image, more than {_MOST_BEYOND} "
+            "of its nodes: check that models and grids belong to these images, which must not be cropped"
+        )
     if report.get("median_residual", 0) > _SUSPECT:
         lines.append(
             f"warning: lines of sight miss each other by {report['median_residual']:.2g} m in the median, where "

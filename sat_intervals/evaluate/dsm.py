@@ -24,6 +24,8 @@ from sat_intervals.tiling import Window
 # Limits of classes: slope of the reference in degrees, width of the interval in metres.
 SLOPES = (0.0, 5.0, 15.0, 30.0, 45.0, 90.0)
 WIDTHS = (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, np.inf)
+# Share of the expected coverage below which a surface is of another place or upside down, not only too sure.
+_POOR = 0.5
 # Largest number of values of a raster of classes.
 _MOST_CLASSES = 64
 # Samples of a profile, and of those read at a time.
@@ -92,10 +94,17 @@ def evaluate_surface(
     report = whole.report()
     in_place = before.report() if moved is not given else report
     check_common(given, in_place["count"], in_place["median"])
+    coverage = report["coverage"]
+    warnings = [NOT_MOVED] if registers and found is None else []
+    if nominal and coverage is not None and coverage < _POOR * nominal:
+        warnings.append(
+            f"the intervals contain {100 * coverage:.0f} % of the reference heights, where {100 * nominal:.0f} % are "
+            "expected: check sensor models, grids and reference, and that left and right are not swapped"
+        )
     return {
         "nominal": nominal,
         "registration": found and found.report(),
-        "warnings": [NOT_MOVED] if registers and found is None else [],
+        "warnings": warnings,
         "before": in_place,
         "all": report,
         "slope": _by(slopes, SLOPES),

@@ -20,6 +20,7 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     OutputWriter,
     Projection,
+    geoid_grid,
     is_surface,
     north_up,
     read_place,
@@ -90,7 +91,7 @@ def make_surface(
     inputs = [*(Path(out) / "points.tif" for out in outs), geoid, resolution if isinstance(resolution, Path) else None]
     check_unchanged = watched_rasters(inputs)
     there = replaceable(path.parent, [surface_file(path.name)])
-    grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius)
+    grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius, geoid)
     runs = _runs(outs, path, inputs)
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
@@ -134,7 +135,7 @@ def _runs(outs: Sequence[str | Path], path: Path, inputs: Sequence[Path | None])
 
 
 def checked_cells(
-    path: Path, resolution: float | Path, crs: str | None, radius: float | None
+    path: Path, resolution: float | Path, crs: str | None, radius: float | None, geoid: Path | None = None
 ) -> tuple[Cells | None, float, str | None, float]:
     """Check the arguments of `make_surface` that need no run; return the grid of a raster, resolution, CRS and radius.
 
@@ -149,6 +150,10 @@ def checked_cells(
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)
         resolution = grid.resolution
+    if crs is not None:
+        Projection(crs, geoid)
+    elif geoid is not None:
+        geoid_grid(geoid)
     radius = resolution if radius is None else radius
     _check_lengths(resolution, radius)
     return grid, resolution, crs, radius

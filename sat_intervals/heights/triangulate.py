@@ -55,7 +55,8 @@ def triangulate(
     Returns
     -------
     ``points``, the number of points; ``lost``, the number of valid pixels without a point, because grids or models have
-    no values there; if there are points, minimum and maximum of ``height`` (metres above the ellipsoid) and
+    no values there; ``beyond``, the number of pixels by which the left grid reaches beyond the left image, and the
+    ``grid_step`` in pixels; if there are points, minimum and maximum of ``height`` (metres above the ellipsoid) and
     ``residual`` (metres); ``median_residual`` (metres) at some positions across the region, far below 0.1 m if models
     and grids belong to these images, for any disparities.
 
@@ -87,7 +88,15 @@ def triangulate(
         progress("files", 0, 1)
         writer.publish((POINTS_REPORT, json.dumps({"files": writer.build()}, indent=1) + "\n"))
         progress("files", 1, 1)
-    return tally.report() | {"median_residual": lattice.residual}
+    return tally.report() | _beyond(sensors.left_grid, run) | {"median_residual": lattice.residual}
+
+
+def _beyond(grid: Any, run: Run) -> dict[str, float]:
+    """Return the largest number of pixels by which a grid reaches beyond the left image, and its largest step."""
+    left, (columns, rows) = run.report["inputs"]["left"], grid.points
+    ends = zip((rows, columns), (left["height"], left["width"]), strict=True)
+    beyond = max(max(float(-nodes[0]), float(nodes[-1]) - (size - 1)) for nodes, size in ends)
+    return {"beyond": beyond, "grid_step": float(max(np.diff(rows).max(), np.diff(columns).max()))}
 
 
 def _check_own(out: Path) -> None:

@@ -26,7 +26,7 @@ from sat_intervals.raster.layers import (
     write_rows,
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
-from sat_intervals.raster.projection import Projection, grid_mapping, utm_of
+from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
 from sat_intervals.raster.publishing import OutputError, stamps
 from sat_intervals.raster.space import check_space, file_bytes, part_bytes
 from sat_intervals.raster.surfaces import (
@@ -71,6 +71,7 @@ __all__ = [
     "factors",
     "file_bytes",
     "footprint",
+    "geoid_grid",
     "grid_mapping",
     "is_marked",
     "is_surface",

@@ -33,7 +33,7 @@ from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, rep
 # Meanings of some of the counts, for readers of run.json.
 _COUNTS_MEANING = {
     "ambiguous": "valid pixels whose interval is the whole search range",
-    "range_ends": "valid pixels with the flag range_end: at the minimum or at the maximum of the search range",
+    "range_ends": "valid pixels with the flag range_end and without range_incomplete, by the end that they are near",
     "low_confidence": "valid pixels with the flag regularized; flags.regularized also counts invalid ones",
     "causes": "invalid pixels, each under its first flag that makes it invalid; with valid they add up to pixels",
     "flags": "pixels with the flag, valid or not; a pixel may have several flags",

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.products import FLAGS, INVALID, RANGE_END, REGULARIZED, Bands, cause
+from sat_intervals.products import FLAGS, INVALID, RANGE_END, RANGE_INCOMPLETE, REGULARIZED, Bands, cause
 
 # Widths are counted in steps of a hundredth of a pixel.
 _WIDTH_STEP = 0.01
@@ -26,7 +26,9 @@ class Tally:
     def add(self, bands: Bands) -> None:
         """Count some rows."""
         self._sums += np.bincount(bands.validity.ravel(), minlength=self._sums.size)
-        ends = bands.disparity[bands.valid & (bands.validity & RANGE_END != 0)]
+        # beside missing data of the right image, winners stand at an end because the true candidate is impossible
+        at_end = bands.validity & (RANGE_END | RANGE_INCOMPLETE) == RANGE_END
+        ends = bands.disparity[bands.valid & at_end]
         self._ends += np.count_nonzero(ends < self._middle), np.count_nonzero(ends >= self._middle)
         width = (bands.upper - bands.lower)[bands.valid]
         width = np.rint(width[np.isfinite(width)] / np.float32(_WIDTH_STEP)).astype(np.int32)
@@ -52,7 +54,7 @@ class Tally:
     def report(self) -> dict[str, Any]:
         """Counts of pixels; ``ambiguous``: valid, with the whole search range as interval.
 
-        ``range_ends``: valid pixels with the flag range_end, by the end.
+        ``range_ends``: valid pixels with the flag range_end and without range_incomplete, by the end.
 
         ``flags`` counts a pixel under each of its flags. ``causes`` counts each invalid pixel once, see
         `products.cause`: with ``valid`` they sum to ``pixels``.

@@ -188,7 +188,7 @@ def parse_memory(text: str) -> int:
     Raises
     ------
     ConfigError
-        It is not a size, or not above zero.
+        It is not a size, or less than a megabyte: a unit is missing.
     """
     from dask.utils import parse_bytes
 
@@ -196,7 +196,7 @@ def parse_memory(text: str) -> int:
         size = parse_bytes(text) if any(map(str.isdigit, text)) else 0  # dask reads "GB" as 1 GB
     except (ValueError, OverflowError):
         size = 0
-    if size <= 0:
+    if size < 1_000_000:
         raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
     return size
 

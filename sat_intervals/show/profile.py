@@ -115,7 +115,7 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     inside = curve.disparities[cut]
     is_whole = results.config.subpixel_levels == 0
     wider = is_whole and (curve.lower < inside.min() or curve.upper > inside.max())
-    ends = f"{curve.lower:.6g} to {curve.upper:.6g} px"
+    ends = f"{curve.lower:.4g} to {curve.upper:.4g} px"
     text = f"interval, {ends}:\ncut pushed out by refinement" if wider else f"interval of the cut, {ends}"
     chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)
     arrow = {"arrowstyle": "<->", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
@@ -130,7 +130,8 @@ def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] 
     chart.grid(axis="y", color="#e8e8e8", zorder=0)
     chart.spines[["top", "right"]].set_visible(False)
     if chart.get_legend_handles_labels()[0]:
-        chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_KEYS, frameon=False, borderaxespad=0.2)
+        keys = _KEYS if len(chart.get_legend_handles_labels()[0]) < _KEYS else _KEYS // 2  # else too wide for the page
+        chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=keys, frameon=False, borderaxespad=0.2)
 
 
 def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, dpi: int) -> None:

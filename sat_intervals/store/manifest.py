@@ -15,6 +15,8 @@ MANIFEST = "manifest.json"
 _SEAL = "crc32"
 # Keys of a file that do not matter if its SHA-256 agrees.
 _IGNORED = ("modified", "stamp")
+# Characters of a value that a message shows.
+_LONGEST = 80
 
 
 class StoreError(SatIntervalsError):
@@ -111,4 +113,10 @@ def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
         for place, pair in enumerate(zip(there, wanted, strict=True)):
             yield from differences(*pair, f"{path}.{place}")
     elif there != wanted:
-        yield f"{path} was {json.dumps(there)}, now {json.dumps(wanted)}"
+        yield f"{path} was {_short(there)}, now {_short(wanted)}"
+
+
+def _short(value: Any) -> str:
+    """Return a value as JSON, cut where a line would get too long for a message, as of a whole calibration."""
+    text = json.dumps(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

@@ -403,6 +403,19 @@ def test_log_file__keeps_what_debug_shows_and_what_it_held(folder, tmp_path):
     assert len(log.read_text()) > len(kept)
 
 
+def test_match__says_a_warning_once_where_a_library_has_set_up_logging(folder, tmp_path, capfd):
+    handler = logging.StreamHandler()
+    logging.root.addHandler(handler)
+    try:
+        result = invoke(*matching(folder, tmp_path / "out", "--disparity", 0, 9, "--log-file", tmp_path / "log"))
+    finally:
+        logging.root.removeHandler(handler)
+    assert result.exit_code == 0
+    assert result.stderr.count("try --disparity") == 1
+    assert "try --disparity" not in capfd.readouterr().err
+    assert (tmp_path / "log").read_text().count("try --disparity") == 1
+
+
 @pytest.mark.parametrize("options", [[], ["--debug"], ["--debug", "--log-file", "run.log"]])
 def test_commands__leave_logging_as_it_was(folder, tmp_path, monkeypatch, options):
     """Whether they succeed or fail."""

@@ -1,6 +1,11 @@
 """What a command prints at its end."""
 
+import os
+
+from finished import random_bands, write_run
+
 from sat_intervals.cli.console import Console
+from sat_intervals.results import open_run
 
 COUNTS = {"pixels": 200, "valid": 150, "median_interval_width": 2.5}
 
@@ -22,3 +27,12 @@ def test_batch_summary__shows_surfaces_of_the_pairs_that_have_one(capsys):
     ]
     Console(quiet=False).batch_summary({"c": report["c"]})
     assert "filled" not in capsys.readouterr().out
+
+
+def test_summary__names_the_files_of_an_earlier_run(tmp_path, capsys):
+    out = write_run(tmp_path, *random_bands(20, 30)[:2])
+    for name, seconds in (("points.tif", -5), ("dsm.tif", 5), ("notes.txt", -5)):
+        (out / name).touch()
+        os.utime(out / name, ns=2 * ((out / "run.json").stat().st_mtime_ns + seconds * 10**9,))
+    Console(quiet=False).summary(open_run(out).report, out)
+    assert capsys.readouterr().out.endswith("of an earlier run: points.tif: make them again\n")

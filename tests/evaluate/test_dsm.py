@@ -51,9 +51,19 @@ def test_evaluate_surface__worked_example(tmp_path):
     with rasterio.open(tmp_path / "dsm.tif", "r+") as dataset:
         dataset.update_tags(COVERAGE="0.9")
     scored = evaluate_surface(tmp_path / "dsm.tif", tmp_path / "reference.tif", registers=False)
-    assert scored["nominal"] == 0.9
+    assert (scored["nominal"], scored["warnings"]) == (0.9, [])
     assert scored["all"]["interval_score"] == pytest.approx((9.5 + 20 * 3.5) / 4)
     assert scored["all"]["needed_half_width"] == everything["le90"]
+
+
+def test_evaluate_surface__warns_of_a_surface_that_is_upside_down(tmp_path):
+    height = np.arange(20.0)[np.newaxis]
+    surface = write_surface(tmp_path / "dsm.tif", height, height - 1, height + 1)
+    with rasterio.open(surface, "r+") as dataset:
+        dataset.update_tags(COVERAGE="0.9")
+    (line,) = evaluate_surface(surface, write_raster(tmp_path / "a.tif", [19 - height]), registers=False)["warnings"]
+    assert line.startswith("the intervals contain 10 % of the reference heights, where 90 % are expected: check")
+    assert not evaluate_surface(surface, write_raster(tmp_path / "b.tif", [height]), registers=False)["warnings"]
 
 
 def relief(row, column):

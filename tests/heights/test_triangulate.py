@@ -432,6 +432,9 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     command = ["surface", *images, str(out), *sensors, *search, "--resolution", "1"]
     wrong = invoke(*command[:-1], "-1")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
+    for option, value, message in (("--crs", "4326", "is not a map in metres"), ("--geoid", "no.gtx", "no such file")):
+        wrong = invoke(*command, option, value)
+        assert (wrong.exit_code, message in wrong.stderr, out.exists()) == (2, True, False)
     (tmp_path / "heights.yaml").write_text(
         "{name: city, coverage: 0.9, registered: true, surface: {CELL: 9 m}, "
         "classes: [{below: null, margin: 1.0, cells: 99}]}"
@@ -512,6 +515,15 @@ def test_surface_command__warns_of_models_that_nearly_fit(tmp_path):
     assert "m above the ellipsoid, lines of sight at most" in result.stdout
     assert "warning: lines of sight miss each other by 0." in result.stderr
     assert "--strict is given" in invoke(*command, "--strict").stderr
+
+
+def test_triangulate_command__warns_of_grids_that_reach_far_beyond_the_image(tmp_path):
+    out = write_run(tmp_path, np.full((4, 60, 80), 5, np.float32), np.zeros((60, 80), np.uint16))
+    result = invoke("triangulate", out, *sensor_words(cameras(tmp_path, 60, 80)))
+    assert (result.exit_code, result.stderr) == (0, "")
+    result = invoke("triangulate", out, *sensor_words(cameras(tmp_path, 60, 140)))  # nodes -40, -20, ... 180
+    assert result.exit_code == 0
+    assert "warning: the left grid reaches 101 px beyond the left image, more than 4 of its nodes" in result.stderr
 
 
 def test_batch_command__a_bad_model_fails_its_pair_only(tmp_path):

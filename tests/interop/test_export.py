@@ -140,6 +140,7 @@ def test_export__refuses_what_is_no_run_and_what_it_does_not_know(run, tmp_path)
     for words, message in (
         ([str(tmp_path), "to", "--to", "cars"], "give the folder of a finished run"),
         ([str(run[0]), str(tmp_path), "--to", "micmac"], "'micmac' is not one of"),
+        ([str(run[0]), str(tmp_path)], "Missing option '--to'. Choose from: cars, otb"),
     ):
         result = invoke("export", *words)
         assert result.exit_code == 2

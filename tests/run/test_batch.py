@@ -443,7 +443,9 @@ def test_parse_memory__reads_figures_with_units(text, count):
     assert parse_memory(text) == count
 
 
-@pytest.mark.parametrize("text", ["much", "4 bananas", "", "GB", "1.2.3GB", "1e400", "nan", "-4GB", "0", "0GB", "0.5"])
+@pytest.mark.parametrize(
+    "text", ["much", "4 bananas", "", "GB", "1.2.3GB", "1e400", "nan", "-4GB", "0", "0GB", "0.5", "4"]
+)
 def test_parse_memory__refuses_what_is_none(text):
     with pytest.raises(ConfigError, match=f"^memory {text!r}: give a figure with a unit, such as 4GB or 512MiB$"):
         parse_memory(text)
@@ -472,7 +474,7 @@ def test_plan__prints_what_a_run_will_take(images):
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith("preparing kernels")
     assert "expected time, 3 tiles at once" in result.stdout
-    assert "smaller than set, to fit" in result.stdout
+    assert "smaller than set, to fit: give --tile-size " in result.stdout
     assert re.search(r"memory of a worker: +\d+ MB, fits in 400 MB\n", result.stdout)
     assert re.search(r"with 3 tiles at once: +\d+ MB, does not fit in 400 MB: give --workers [12]\n", result.stdout)
     refused = invoke("plan", *pair, "--memory", "100MB")

@@ -26,7 +26,7 @@ from sat_intervals.run.job import prepare
 from sat_intervals.run.output import is_complete
 from sat_intervals.run.tile import match_block
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.manifest import digest
+from sat_intervals.store.manifest import differences, digest
 from sat_intervals.tiling import Window
 
 
@@ -331,6 +331,10 @@ def test_digest__tells_what_differences_tell(tmp_path):
     other = {"settings": {"p": 1}, "inputs": {"left": {"sha256": "a", "modified": "today"}, "files": [{"bytes": 4}]}}
     assert digest(later) == digest(manifest)
     assert digest(other) != digest(manifest)
+    (line,) = differences({"calibration": None}, {"calibration": {"classes": [*range(1000)]}})
+    assert line.startswith("calibration was null, now {")
+    assert line.endswith("...")
+    assert len(line) < 150
 
 
 @pytest.mark.parametrize("links", [True, False])

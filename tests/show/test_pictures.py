@@ -24,7 +24,18 @@ from sat_intervals import match_pair
 from sat_intervals.cli.console import Console
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import FLAGS, INVALID, LEFT_WINDOW, MISMATCH, NOT_REFINED, OCCLUSION, REGULARIZED, Bands
+from sat_intervals.products import (
+    FLAGS,
+    INVALID,
+    LEFT_WINDOW,
+    MISMATCH,
+    NOT_REFINED,
+    OCCLUSION,
+    RANGE_END,
+    RANGE_INCOMPLETE,
+    REGULARIZED,
+    Bands,
+)
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run.statistics import Tally
@@ -180,6 +191,13 @@ def test_class_counts__agree_with_the_map():
     counts = tally.report()
     assert class_counts(counts) == np.bincount(classify(validity).ravel(), minlength=len(PIXEL_CLASSES)).tolist()
     assert counts["valid"] + sum(counts["causes"].values()) == validity.size < sum(counts["flags"].values())
+
+
+def test_tally__winners_beside_missing_data_are_not_at_an_end_of_the_range():
+    tally = Tally(31)
+    flags = np.array([[RANGE_END, RANGE_END | RANGE_INCOMPLETE, RANGE_INCOMPLETE, 0]], np.uint16)
+    tally.add(Bands(*np.zeros((4, 1, 4), np.float32), flags))
+    assert tally.report()["range_ends"] == {"minimum": 1, "maximum": 0}
 
 
 def test_draw_overview__shows_the_shares_of_the_terminal(tmp_path, words, unrendered, capsys):
