@@ -1,6 +1,6 @@
 """``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,13 +58,16 @@ def surface(
         from sat_intervals.run.before import report_before
 
         _check_kept(out, cells, sensor_files, settings.file)
+        check_unchanged = _watched(sensor_files, cells)
         _check(out, cells, sensor_files, resolved(config).interval)
         left, right = pair.open()
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
+        check_unchanged()
         points = triangulate(out, *sensor_files, progress=console.progress)
         made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
+        check_unchanged()
     if as_json:
         say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
@@ -84,6 +87,14 @@ def _check_kept(
     results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
     like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
     check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
+
+
+def _watched(sensor_files: Sequence[str | Path], cells: dict[str, Any]) -> Callable[[], None]:
+    """Return a function that raises if models, grids or rasters were changed since they were checked."""
+    from sat_intervals.raster import watched_rasters
+
+    like = cells["resolution"] if isinstance(cells["resolution"], Path) else None
+    return watched_rasters([*sensor_files, cells["geoid"], like])
 
 
 def _check(out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
@@ -107,6 +118,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
 
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
     errors: dict[str, SatIntervalsError] = {}
+    checks: dict[str, Callable[[], None]] = {}
     if any(pair.sensors for pair in pairs):
         import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
     for pair in pairs:
@@ -115,6 +127,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         folder, of_pair = out / pair.name, {"resolution": pair.resolution, **cells}
         _check_kept(folder, of_pair, pair.sensors)
         try:
+            checks[pair.name] = _watched(pair.sensors, of_pair)
             _check(folder, of_pair, pair.sensors, None)
         except SatIntervalsError as error:
             errors[pair.name] = error
@@ -129,8 +142,10 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
             return {}
         if pair.name in errors:
             raise errors[pair.name]
+        checks[pair.name]()
         points = triangulate(folder, *pair.sensors, console.progress)
         made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
+        checks[pair.name]()
         return {"points": points, "surface": made}
 
     return surface_of

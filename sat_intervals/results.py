@@ -130,13 +130,13 @@ class Run:
     @contextmanager
     def unchanged(self, *others: str) -> Iterator[None]:
         """Raise RunError at the end of the block if the run, or one of ``others`` in its folder, was replaced."""
-        check_others = watched(self.out / name for name in others)
+        check_files = watched(self.out / name for name in (*others, "run.json", *_BANDS))
         try:
             yield
         finally:
             if _which(self.out) != self.which:
                 raise RunError(f"the run in {self.out} was replaced while it was read: rerun the command")
-        check_others()
+        check_files()
 
     def windows(self) -> Iterator[Window]:
         """Yield full-width windows of the results from the top."""

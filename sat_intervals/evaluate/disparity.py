@@ -15,7 +15,7 @@ from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.postprocess import cut_rows, with_halo
 from sat_intervals.products import Bands
-from sat_intervals.raster import Layer, watched_rasters
+from sat_intervals.raster import Layer, watched_images
 from sat_intervals.results import Run, open_run
 
 _PIXELS = 1 << 20  # evaluated at a time, 150 bytes each; pixels read ahead take 25 bytes
@@ -75,7 +75,7 @@ def evaluate_run(
     def strips() -> Iterator[Bands]:
         return _read_strips(run, truth_layer, mask_layer)
 
-    check_unchanged = watched_rasters([truth_layer.image.path, mask])
+    check_unchanged = watched_images(layer.image for layer in (truth_layer, mask_layer) if layer is not None)
     figures = evaluate(strips, criteria, remove_bias=remove_bias, with_rejected=config.products.keep_rejected)
     check_unchanged()
     return {"cost": config.cost.method, **figures}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import Frame, Vertical
+from sat_intervals.raster import GROUND, Frame, Vertical
 
 # Points read at a time.
 _PART = 500_000
@@ -49,10 +49,12 @@ class PointFile:
         self.frame = Frame(str(path), crs or own, vertical)
 
     def parts(self) -> Iterator[np.ndarray]:
-        """Yield ``(n, 3)`` float64 x, y and height in the frame; points without one of them are left out."""
+        """Yield ``(n, 3)`` float64 x, y and height in the frame, of points that have all and are on the ground."""
         try:
             for part in self._parts(self._path):
-                yield part[np.isfinite(part).all(axis=1)]
+                metres = part[:, 2] * self.frame.unit
+                is_ground = (metres >= GROUND[0]) & (metres <= GROUND[1])  # others are no-data values
+                yield part[np.isfinite(part).all(axis=1) & is_ground]
         except SatIntervalsError:
             raise
         except Exception as error:  # the libraries raise many types

@@ -7,7 +7,15 @@ from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.heightfield import GROUND, HeightRaster
-from sat_intervals.raster.images import Image, InputError, check_pair, open_image, other_files, watched_rasters
+from sat_intervals.raster.images import (
+    Image,
+    InputError,
+    check_pair,
+    open_image,
+    other_files,
+    watched_images,
+    watched_rasters,
+)
 from sat_intervals.raster.layers import (
     MARK,
     check_alone,
@@ -99,6 +107,7 @@ __all__ = [
     "surface_file",
     "truth_file",
     "utm_of",
+    "watched_images",
     "watched_rasters",
     "whole_file",
     "write_layer",

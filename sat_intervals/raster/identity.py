@@ -13,7 +13,7 @@ from functools import lru_cache
 from http.client import HTTPException
 from pathlib import Path
 from threading import Event
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from urllib.request import Request, urlopen
 
 from sat_intervals.errors import RunError, SatIntervalsError, check_regular
@@ -102,20 +102,54 @@ def _stamp(file: str | Path) -> str:
     return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}"
 
 
-def _moment(path: str) -> list[str]:
-    """Return the stamp of a file, if it has one, and what changes if a link or folder on its path is exchanged."""
+class _Place(NamedTuple):
+    """State of a file, link or folder on the way to an input: inode, times in nanoseconds, the parent's change time."""
+
+    inode: int
+    modified: int
+    changed: int
+    parent_changed: int
+    is_folder: bool
+
+
+class _Moment(NamedTuple):
+    """Stamp of a file, None if it has none, and the places on its path and those of its links."""
+
+    stamp: str | None
+    places: list[_Place]
+
+    def is_touched(self, later: "_Moment") -> bool:
+        """Return whether the file, or a link or folder on its path, was changed or exchanged since.
+
+        A folder that gets a new file has both times of that moment, one that is renamed only the change time.
+        """
+        return (self.stamp, len(self.places)) != (later.stamp, len(later.places)) or any(
+            before.inode != now.inode
+            or (before.changed != now.changed and not (now.is_folder and now.modified == now.changed))
+            for before, now in zip(self.places, later.places, strict=True)
+        )
+
+    def may_be_touched(self, later: "_Moment") -> bool:
+        """Return whether a folder on the path may have been renamed and then got a file: its parent changed, too."""
+        return any(
+            before.changed != now.changed and before.parent_changed != now.parent_changed
+            for before, now in zip(self.places, later.places, strict=True)
+        )
+
+
+def _moment(path: str) -> _Moment:
     file = _local_file(path)
-    return [] if file is None else [_stamp(file), *_way_to(file.absolute())]
+    return _Moment(None, []) if file is None else _Moment(_stamp(file), [*_way_to(file.absolute())])
 
 
-def _way_to(path: Path) -> Iterator[str]:
-    for place in (path, *path.parents):
-        status = place.lstat()
-        is_link = stat.S_ISLNK(status.st_mode)
-        # a folder that gets a new file has both times of that moment, one that is renamed only the latter
-        if is_link or (place != path and status.st_mtime_ns != status.st_ctime_ns):
-            yield f"{status.st_ino:x}-{status.st_ctime_ns:x}"
-        if is_link:
+def _way_to(path: Path) -> Iterator[_Place]:
+    places = path, *path.parents
+    statuses = [place.lstat() for place in places]
+    for place, status, parent in zip(places, statuses, (*statuses[1:], statuses[-1]), strict=True):
+        is_folder = stat.S_ISDIR(status.st_mode)
+        if is_folder or stat.S_ISLNK(status.st_mode):
+            yield _Place(status.st_ino, status.st_mtime_ns, status.st_ctime_ns, parent.st_ctime_ns, is_folder)
+        if stat.S_ISLNK(status.st_mode):
             yield from _way_to(place.parent / place.readlink())
 
 
@@ -206,9 +240,12 @@ def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _R
             content = read()
         finally:  # a changed input explains a read error
             check_unchanged(files)
-        touched = [name for name, moment in before.items() if _moment(name) != moment]
-        if not touched:
+        now = {name: _moment(name) for name in files}
+        touched = [name for name in files if before[name].is_touched(now[name])]
+        if not touched and not any(before[name].may_be_touched(now[name]) for name in files):
             return content
+    if not touched:  # both folders get new files all the time
+        return content
     raise RunError(f"{touched[0]} is touched again and again while it is read: end that and rerun the same command")
 
 
@@ -255,7 +292,7 @@ def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
 
     def check() -> None:
         for file, moment in before.items():
-            if _moment(file) != moment:
+            if moment.is_touched(_moment(file)):
                 raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
 
     return check

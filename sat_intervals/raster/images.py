@@ -16,14 +16,14 @@ from rasterio.io import DatasetReader
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.identity import stamp_of, watched
+from sat_intervals.raster.identity import ChangedInputError, stamp_of, watched
 from sat_intervals.raster.seal import check_seal
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# Formats of which GDAL takes missing data for zeros, or does not list the files.
-_UNCHECKED = {"ENVI", "GTI", "MRF", "netCDF", "PCIDSK", "PCRaster"}
+# Formats of which GDAL takes missing data for zeros, does not list the files, or reads on after their end forever.
+_UNCHECKED = {"AAIGrid", "ENVI", "GRASSASCIIGrid", "GTI", "ISG", "MRF", "netCDF", "PCIDSK", "PCRaster"}
 # Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
 _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
 # Elements of a virtual raster that name a file, and the metadata that do so: positions of a warped one.
@@ -106,7 +106,7 @@ def open_image(
         The file has no usable band, or the mask has another size.
     """
     name = _absolute(path)
-    stamps = tuple(stamp_of(file) for file in (name, *other_files(name)))
+    stamps = _stamps(name)
     with opened(name) as dataset:
         _check_watched(name, dataset)
         check_seal(name, dataset.files)
@@ -306,6 +306,36 @@ def _may_have_others(name: str) -> bool:
 
 
 def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:
-    """Return what `watched` returns, for rasters and their `other_files`."""
+    """Return what `watched` returns, for rasters and their `other_files`, none of which may appear either."""
     names = [str(file) for file in files if file is not None]
-    return watched(file for name in names for file in (name, *other_files(name)))
+    before = {name: other_files(name) for name in names}
+    check_files = watched(file for name in names for file in (name, *before[name]))
+
+    def check() -> None:
+        check_files()
+        for name in names:
+            if other_files(name) != before[name]:
+                raise ChangedInputError(f"a file beside {name} appeared while it was read: rerun the command")
+
+    return check
+
+
+def watched_images(images: Iterable[Image]) -> Callable[[], None]:
+    """Return what `watched_rasters` returns, for images as they were opened, and their masks.
+
+    Raises
+    ------
+    ChangedInputError
+        A file of an image was replaced or changed since it was opened.
+    """
+    images = list(images)
+    check = watched_rasters(file for image in images for file in (image.path, image.mask))
+    for image in images:
+        if _stamps(image.path) != image.stamps:
+            raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: rerun the command")
+    return check
+
+
+def _stamps(name: str) -> tuple[str | None, ...]:
+    """Return the stamps of a raster and its `other_files`."""
+    return tuple(stamp_of(file) for file in (name, *other_files(name)))

@@ -20,7 +20,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import OutputError, stamps
+from sat_intervals.raster.publishing import OutputError, rename_new, stamps
 from sat_intervals.raster.seal import check_beside
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
@@ -45,19 +45,25 @@ def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give the block a temporary file to write; rename it to ``path`` at the end, or delete it on failure.
 
-    A symbolic link at ``path`` is replaced, not followed. What a killed process left is deleted, see
-    `LocalFolder.scratch`.
+    A file that appears at ``path`` meanwhile is kept. A symbolic link there is replaced, not followed. What a killed
+    process left is deleted, see `LocalFolder.scratch`.
 
     Raises
     ------
     OutputError
-        Names ``path`` and the system's reason.
+        Names ``path`` and the system's reason, or says that another process wrote it meanwhile.
     """
     path = Path(path)
+    before = stamps(path.parent, [path.name])
     try:
         with LocalFolder(path.parent).scratch(path.name) as folder:
             yield folder / path.name
-            os.replace(folder / path.name, path)
+            if stamps(path.parent, [path.name]) != before:
+                raise OutputError(f"{path} was written by another process meanwhile: choose another name")
+            if before:
+                os.replace(folder / path.name, path)
+            else:
+                rename_new(folder / path.name, path)
     except (*gdal.GDAL_ERRORS, OSError) as error:
         reason = getattr(error, "strerror", None) or gdal.reason(error)
         raise OutputError(f"{path} cannot be written: {reason}: make room or check its rights") from error

@@ -62,7 +62,7 @@ def publish(
                 _put_aside(finished / name, folder / name, replaceable.get(name))
         for name in names:
             with failing(folder / name):
-                _rename(finished / name, folder / name)
+                rename_new(finished / name, folder / name)
     except BaseException:
         for name in names:
             new, place = finished / name, folder / name
@@ -77,7 +77,7 @@ def put_back(finished: Path, folder: Path, names: Iterable[str]) -> None:
     """Restore files that were put aside, unless there are others of their names."""
     for name in names:
         with suppress(OSError):
-            _rename(finished / REPLACED / name, folder / name)
+            rename_new(finished / REPLACED / name, folder / name)
 
 
 def _put_aside(new: Path, place: Path, stamp: str | None) -> None:
@@ -108,7 +108,7 @@ def _is_same(file: Path, new: Path) -> bool:
     return filecmp.cmp(file, new, shallow=False)
 
 
-def _rename(source: Path, target: Path) -> None:
+def rename_new(source: Path, target: Path) -> None:
     """Rename a file, but never over another."""
     try:
         os.link(source, target, follow_symlinks=False)

@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -28,9 +28,9 @@ from sat_intervals.raster.space import WAY_OUT, check_space, file_bytes
 from sat_intervals.raster.streaming import Stream
 from sat_intervals.store.folder import LocalFolder
 
-# Locked folder of unfinished files, named after the first of them. Files of these names from a killed process are
-# replaced, others stay.
-_SCRATCH = ".unpublished-{}"
+# Locked folder of unfinished files, named after the first of them, and the mark that a process made these files. Those
+# of a killed process are replaced, others stay.
+_SCRATCH, _MADE = ".unpublished-{}", ".sat-intervals.files"
 # Names there: a final one, those of its strips and their levels, and those of GDAL beside both.
 _UNFINISHED = r"(?:(?:strips|rows)-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
 # Tags in the file itself, not in another beside it.
@@ -107,14 +107,13 @@ class OutputWriter:
                 raise OutputError(f"{place} cannot be written: it is not a regular file: choose another name or folder")
         with self._failing(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
-        for place in (self._hidden, self._scratch, self._replaced):
-            if place.is_symlink():
-                raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
+        self._check_hidden()
         self._locked.enter_context(LocalFolder(self._hidden).locked())
         try:
             with self._failing(self._folder):
                 put_back(self._scratch, self._folder, self._names)
                 self._remove_scratch()
+                (self._hidden / _MADE).touch()
                 self._replaced.mkdir(parents=True, exist_ok=True)
                 self._there = stamps(self._folder, self._names)
             self._check_space(1)
@@ -127,6 +126,25 @@ class OutputWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._clean()
+
+    def _check_hidden(self) -> None:
+        """Raise if folders of temporary files are links, or have files of their names that no killed process left."""
+        self._check_links()
+        is_ours = (self._hidden / _MADE).exists()
+        if not is_ours and (foreign := next(self._unfinished(), None)):
+            raise OutputError(f"{foreign} was not written by sat-intervals: move {self._hidden} away")
+
+    def _check_links(self) -> None:
+        for place in (self._hidden, self._scratch, self._replaced):
+            if place.is_symlink():
+                raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
+
+    def _unfinished(self) -> Iterator[Path]:
+        """Yield files with names of temporary ones, the replaced ones first."""
+        ours = re.compile(_UNFINISHED.format("|".join(map(re.escape, self._names))))
+        for folder in (self._replaced, self._scratch):
+            with suppress(OSError):
+                yield from (file for file in folder.iterdir() if ours.fullmatch(file.name) and not file.is_dir())
 
     def write(self, row: int, *rasters: np.ndarray) -> None:
         """Write the strip that begins at ``row``; one array per file, ``(bands, rows, width)`` or ``(rows, width)``."""
@@ -160,6 +178,7 @@ class OutputWriter:
     def assemble(self, name: str, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
         """Make a file of rows of blocks, see `cog.assemble`, under a temporary name."""
         (file,) = (file for file in self._files if file.name == name)
+        self._check_links()
         with self._failing(self._folder / name):
             made = template(file, self._georeferencing, self._tags, self._scratch / name)
             # a name of its own: a worker that was lost must not write into the file of a later run
@@ -188,7 +207,13 @@ class OutputWriter:
         self._pictures.clear()
         return dict(self._made)
 
-    def publish(self, report: tuple[str, str] | None = None, *, replaceable: Mapping[str, str] | None = None) -> None:
+    def publish(
+        self,
+        report: tuple[str, str] | None = None,
+        *,
+        replaceable: Mapping[str, str] | None = None,
+        announce: Callable[[list[str]], None] = lambda stamps: None,
+    ) -> None:
         """Rename the files to their final names, all of them or none; `publishing.publish` has the rules.
 
         Parameters
@@ -199,8 +224,11 @@ class OutputWriter:
         replaceable
             `stamps` of the files that may be replaced, by default of those that were there when the context was
             entered.
+        announce
+            Called before, with the `stamps` that the files will have, the report last.
         """
         self.build()
+        self._check_links()
         names = [file.name for file in self._files]
         if report:
             name, text = report
@@ -208,6 +236,7 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 (self._scratch / name).write_text(text, encoding="utf-8")
                 _flush(self._scratch / name)
+        announce(list(stamps(self._scratch, names).values()))
         publish(self._scratch, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
         self._is_published = True
 
@@ -248,13 +277,21 @@ class OutputWriter:
 
     def _remove_scratch(self) -> None:
         """Delete temporary files of this or a killed process, and the replaced ones after publishing; no others."""
-        ours = re.compile(_UNFINISHED.format("|".join(map(re.escape, self._names))))
+        with suppress(OutputError):
+            self._check_links()
+            self._delete()
+
+    def _delete(self) -> None:
+        for file in [*self._unfinished()]:
+            if file.parent == self._scratch or self._is_published:
+                with suppress(OSError):
+                    file.unlink()
         for folder in (self._replaced, self._scratch):
             with suppress(OSError):
-                for file in folder.iterdir() if folder == self._scratch or self._is_published else ():
-                    if ours.fullmatch(file.name) and not file.is_dir():
-                        file.unlink()
                 folder.rmdir()
+        if not any(self._unfinished()):
+            with suppress(OSError):
+                (self._hidden / _MADE).unlink()
 
 
 def remove_scratch(folder: Path, files: Sequence[File]) -> None:
@@ -279,7 +316,8 @@ def replaceable(folder: Path, files: Sequence[File]) -> dict[str, str]:
 def _killed(folder: Path, files: Sequence[File]) -> Iterator[OutputWriter]:
     """Yield the writer of a killed process; afterwards delete its temporary files."""
     writer = OutputWriter(folder, files, 0, 0, Georeferencing(), {})
-    if writer._hidden.is_dir() and not writer._hidden.is_symlink():
+    writer._check_hidden()
+    if writer._hidden.is_dir():
         with LocalFolder(writer._hidden).locked():
             yield writer
             writer._remove_scratch()

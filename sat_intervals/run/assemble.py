@@ -16,12 +16,11 @@ from sat_intervals.errors import RemovedTilesError, RunError
 from sat_intervals.match.postprocess import ConfidenceScale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import OutputError, OutputWriter, run_files, stamps
+from sat_intervals.raster import OutputError, OutputWriter, run_files
 from sat_intervals.raster.identity import compared
 from sat_intervals.run.copying import assemble_files
 from sat_intervals.run.inputs import appeared_mask
 from sat_intervals.run.job import Job
-from sat_intervals.run.output import OUTPUTS
 from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.scale import checked_scale
 from sat_intervals.run.seams import seam_report
@@ -118,11 +117,13 @@ def _check_content(job: Job, name: str | None) -> None:
 
 def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> None:
     home = job.store.home
-    if not keep_tiles:
-        mark_finished(home, job.name)
-    writer.publish(("run.json", json.dumps(report, indent=1) + "\n"), replaceable=replaceable_files(home))
-    if not keep_tiles:
-        mark_finished(home, job.name, list(stamps(job.out, OUTPUTS).values()))
+
+    def announce(stamps: list[str]) -> None:
+        if not keep_tiles:
+            mark_finished(home, job.name, stamps)
+
+    text = json.dumps(report, indent=1) + "\n"
+    writer.publish(("run.json", text), replaceable=replaceable_files(home), announce=announce)
     mark_replaced(home)
     if keep_tiles:  # otherwise the parts are removed with them
         try:

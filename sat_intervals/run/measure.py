@@ -27,7 +27,7 @@ from sat_intervals.match.postprocess import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, Layer, open_image, watched_rasters
+from sat_intervals.raster import Image, Layer, open_image, watched_images
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
 from sat_intervals.run.scale import checked_scale
@@ -119,7 +119,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
         Tiles failed.
     """
     found: list[Measured] = []
-    check_unchanged = watched_rasters(subject.truth.image.path for subject in subjects)
+    check_unchanged = watched_images(subject.truth.image for subject in subjects)
     levels = ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with (

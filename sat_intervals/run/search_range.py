@@ -23,7 +23,7 @@ from sat_intervals.match.search_range import (
 )
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, read_window
+from sat_intervals.raster import Image, read_window, watched_images
 from sat_intervals.raster.identity import ChangedInputError, read_unchanged
 from sat_intervals.run.quality import COLLAR, is_plain
 from sat_intervals.run.workers import Connection, Task, Workers, reason
@@ -117,8 +117,11 @@ def search_range(client: Workers, left: Image, right: Image, files: _Files, prog
 
 def find_here(left: Image, right: Image, progress: Progress) -> Found:
     """Find the search range of a pair with the cores of this machine; see `search_range`."""
+    check_unchanged = watched_images([left, right])
     with Connection(Cluster(), Path()) as connection:
-        return search_range(connection.client(), left, right, {}, progress)
+        found = search_range(connection.client(), left, right, {}, progress)
+    check_unchanged()
+    return found
 
 
 def _reduced(client: Workers, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:

@@ -340,10 +340,10 @@ def remove_tiles(home: Path, place: Folder) -> None:
     folder_at(home).delete_all([name for name in folder_at(home).sizes() if final_name(name) in names])
 
 
-def mark_finished(home: Path, run: str, stamps: Sequence[str] = ()) -> None:
+def mark_finished(home: Path, run: str, stamps: Sequence[str]) -> None:
     """Mark a run as finished, so that its tiles are removed even if it is killed before.
 
-    Call it before its files are published, and again afterwards with their stamps.
+    Call it before its files are published, with the stamps that they will have.
     """
     folder_at(home).write(_FINISHED, "\n".join([run, *stamps]))
 

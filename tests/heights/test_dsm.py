@@ -196,6 +196,12 @@ def test_make_surface__keeps_a_file_that_appears_after_the_check(tmp_path, monke
     assert (tmp_path / "dsm.tif").read_text() == "mine"
 
 
+def test_make_surface__of_a_run_that_was_moved(tmp_path):
+    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
+    out.rename(tmp_path / "moved")
+    make_surface([tmp_path / "moved"], tmp_path / "moved" / "dsm.tif", resolution=1.0)
+
+
 def test_make_surface__goes_on_where_it_was_killed_while_it_published(tmp_path):
     out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
     surface_of([out], tmp_path)
@@ -203,6 +209,7 @@ def test_make_surface__goes_on_where_it_was_killed_while_it_published(tmp_path):
     aside = tmp_path / ".unpublished-dsm.tif" / "files" / "replaced"
     aside.mkdir(parents=True)
     (tmp_path / "dsm.tif").rename(aside / "dsm.tif")
+    (aside.parents[1] / ".sat-intervals.files").touch()  # as a killed process leaves it
     surface_of([out], tmp_path)
     assert (tmp_path / "dsm.tif").read_bytes() == whole
     assert not aside.exists()

@@ -263,6 +263,16 @@ def test_make_truth__points_of_all_files_give_their_disparities(tmp_path):
         assert np.nanmax(np.abs(truth - truths[".csv"])) < 0.01
 
 
+def test_make_truth__leaves_out_points_that_are_not_on_the_ground(tmp_path):
+    out, files, _ = run_of(tmp_path, seen_of(hills, VIEWS[0]))
+    points = places(hills, 200)
+    truth, _ = truth_of(out, files, write_csv(tmp_path / "p.csv", points), is_points=True, registers=False)
+    for height in (-9999.0, -32767.0, 99999.0, 3.4e38):
+        points = np.vstack([points, [*(points[0, :2] + 1e-6), height]])
+    again, _ = truth_of(out, files, write_csv(tmp_path / "q.csv", points), is_points=True, registers=False)
+    np.testing.assert_array_equal(again, truth)
+
+
 def test_make_truth__points_on_pixel_centres_are_exact_and_hidden_ones_are_left_out(tmp_path):
     town = Town()
     height, is_level = town.seen(VIEWS[0])

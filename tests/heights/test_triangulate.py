@@ -503,6 +503,25 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert (out / "b" / "dsm.tif").exists()
 
 
+def test_surface_command__ends_where_a_grid_is_replaced_while_it_matches(tmp_path, monkeypatch):
+    scene = make_scene(60, 80, seed=4)
+    write_pair(tmp_path, scene)
+    files = cameras(tmp_path, 60, 80)
+    other = grid(tmp_path / "other.tif", 60, 80, offset=3.5)
+
+    def match(*arguments, **options):
+        report = match_pair(*arguments, **options)
+        other.replace(files[2])
+        return report
+
+    monkeypatch.setattr("sat_intervals.run.pair.match_pair", match)
+    search = "--disparity", scene.minimum, scene.maximum
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    result = invoke("surface", *images, tmp_path / "out", *sensor_words(files), *search, "--resolution", 1)
+    assert (result.exit_code, (tmp_path / "out" / "points.tif").exists()) == (1, False)
+    assert "left_grid.tif was replaced or changed while it was read: rerun the command" in result.stderr
+
+
 def test_surface_command__warns_of_models_that_nearly_fit(tmp_path):
     scene = make_scene(60, 80, seed=4)
     write_pair(tmp_path, scene)

@@ -693,6 +693,7 @@ def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products):
     (tmp_path / ".unpublished-intervals.tif" / "files" / "replaced").mkdir(parents=True)
     for name in ("strips-intervals.tif", "validity.tif", "run.json", "replaced/intervals.tif"):
         (tmp_path / ".unpublished-intervals.tif" / "files" / name).write_text("half")
+    (tmp_path / ".unpublished-intervals.tif" / ".sat-intervals.files").touch()
     produce(tmp_path, products)
     assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
 
@@ -839,6 +840,22 @@ def test_whole_file__names_the_file_that_cannot_be_written(tmp_path):
     for path in (tmp_path / "missing" / "a.txt", tmp_path):
         with pytest.raises(OutputError, match=rf"{path} cannot be written: .*: make room or"), whole_file(path) as new:
             new.write_text("a")
+
+
+@pytest.mark.parametrize("was_there", [False, True])
+def test_whole_file__keeps_a_file_that_appears_meanwhile(tmp_path, was_there):
+    path = tmp_path / "new.yaml"
+    if was_there:
+        path.write_text("before")
+
+    def write():
+        with whole_file(path) as new:
+            new.write_text("new")
+            path.write_text("of the user")
+
+    with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile"):
+        write()
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
 
 
 def test_whole_file__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):

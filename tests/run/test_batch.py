@@ -21,7 +21,7 @@ from sat_intervals.config.pairs import PairOfBatch, read_batch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.memory import fitted, tile_bytes
-from sat_intervals.raster import write_layer
+from sat_intervals.raster import stamps, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import batch
 from sat_intervals.run.batch import match_batch
@@ -83,6 +83,7 @@ def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(i
     scratch = tmp_path / "pair1" / ".unpublished-intervals.tif" / "files" / "replaced"
     scratch.mkdir(parents=True)
     (scratch / "run.json").write_text("{}")
+    (scratch.parents[1] / ".sat-intervals.files").touch()  # as a killed process leaves it
     match_batch(pairs, tmp_path, {"tiles": {"size": 64, "overlap": 20}})
     assert sorted(file.name for file in (tmp_path / "pair1").iterdir()) == OUTPUTS
 
@@ -327,7 +328,8 @@ def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, t
 def test_match_batch__removes_tiles_that_a_death_left_beside_a_result_and_none_that_were_kept(images, tmp_path):
     pairs = read_batch(rows(images))
     first = match_batch(pairs, tmp_path, keep_tiles=True)
-    mark_finished(tmp_path / "pair2" / "tiles", "the run of pair2")  # as a run does before it removes its tiles
+    noted = list(stamps(tmp_path / "pair2", ("intervals.tif", "validity.tif", "run.json")).values())
+    mark_finished(tmp_path / "pair2" / "tiles", "the run of pair2", noted)  # as a run does before it removes its tiles
     again = match_batch(pairs, tmp_path)
     assert [path.parent.name for path in tmp_path.glob("*/tiles")] == ["pair1"]
     assert (tmp_path / "pair1" / "tiles" / "manifest.json").exists()

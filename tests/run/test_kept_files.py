@@ -39,12 +39,15 @@ from sat_intervals.raster import (
     publishing,
     put_back,
     read_layers,
+    remove_scratch,
+    replaceable,
+    restore,
     watched_rasters,
     write_layer,
 )
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.results import Run, open_results
-from sat_intervals.run import source, strips
+from sat_intervals.run import search_range, source, strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
@@ -143,14 +146,14 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     assert hashes(folder / "out") == hashes(folder / "once")
 
 
-@pytest.mark.parametrize("way", ["link", "rename", "folder"])
+@pytest.mark.parametrize("way", ["link", "rename", "folder", "folder that gets a file"])
 def test_match_pair__reads_again_where_an_input_was_another_one_for_a_moment(pair, monkeypatch, way):
     folder, settings = pair
     (folder / "link.tif").symlink_to("right.tif")
     for name in ("right", "other"):
         (folder / f"{name}s").mkdir()
         shutil.copy(folder / f"{name}.tif", folder / f"{name}s" / "image.tif")
-    images = folder / "left.tif", folder / ("rights/image.tif" if way == "folder" else "link.tif")
+    images = folder / "left.tif", folder / ("rights/image.tif" if "folder" in way else "link.tif")
     match_pair(*images, folder / "once", settings)
     read_views, moments = source.read_views, iter(range(2))
 
@@ -169,6 +172,8 @@ def test_match_pair__reads_again_where_an_input_was_another_one_for_a_moment(pai
         put("other.tif") if way == "link" else exchange()
         views = read_views(*arguments)
         put("right.tif") if way == "link" else exchange()
+        if "file" in way:
+            (folder / "rights" / f"new{len(os.listdir(folder / 'rights'))}").touch()
         return views
 
     monkeypatch.setattr(source, "read_views", blink)
@@ -255,7 +260,7 @@ def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
         open_image(folder / "left.zarr")
 
 
-@pytest.mark.parametrize("driver", ["ENVI", "PCIDSK", "MRF"])
+@pytest.mark.parametrize("driver", ["AAIGrid", "ENVI", "PCIDSK", "MRF"])
 def test_open_image__refuses_formats_of_which_gdal_does_not_notice_missing_data(tmp_path, driver):
     path = tmp_path / "image"
     kind = {"width": 30, "height": 20, "count": 1, "dtype": "uint8", "crs": "EPSG:32631", "transform": PLACE.transform}
@@ -310,6 +315,30 @@ def test_watched_rasters__sees_a_changed_source_and_a_new_file(pair, name):
         file.write(b"more")
     with pytest.raises(ChangedInputError, match=rf"{name} was replaced or changed while it was read"):
         check()
+
+
+def test_watched_rasters__sees_a_file_that_appears_beside_one(pair):
+    folder, _ = pair
+    check = watched_rasters([folder / "left.tif"])
+    check()
+    (folder / "left.tif.aux.xml").write_text("<PAMDataset/>")
+    with pytest.raises(ChangedInputError, match=r"a file beside .*left\.tif appeared while it was read"):
+        check()
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_find_here__ends_where_an_image_is_replaced(pair, monkeypatch, when):
+    folder, _ = pair
+    images = open_image(folder / "left.tif"), open_image(folder / "right.tif")
+
+    def search(*arguments):
+        shutil.copy(folder / "other.tif", folder / "right.tif")
+
+    if when == "before":
+        search()
+    monkeypatch.setattr(search_range, "search_range", search)
+    with pytest.raises(ChangedInputError, match=r"right\.tif was replaced or changed"):
+        search_range.find_here(*images, lambda *progress: None)
 
 
 def test_match_pair__goes_on_where_an_input_is_touched_and_not_changed(pair):
@@ -588,12 +617,44 @@ def test_output_writer__adopts_no_folder_through_a_link(tmp_path, inner):
         link.rmdir() if link.exists() else None
     (tmp_path / "out" / ".unpublished-intervals.tif" / inner).symlink_to(precious / inner)
     before = contents(precious)
-    with (
-        pytest.raises(OutputError, match="is a symbolic link"),
-        OutputWriter(tmp_path / "out", RUN_FILES, 4, 5, Georeferencing(), {}),
-    ):
-        pass
-    assert contents(precious) == before
+    for look in (replaceable, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
+        with pytest.raises(OutputError, match="is a symbolic link"):
+            look(tmp_path / "out", RUN_FILES)
+        assert contents(precious) == before
+
+
+def writer(out):
+    return OutputWriter(out, RUN_FILES, 4, 5, Georeferencing(), {})
+
+
+def test_output_writer__deletes_no_files_that_no_process_made(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files" / "replaced"
+    place.mkdir(parents=True)
+    for file in (place / "intervals.tif", place.parent / "run.json"):
+        file.write_text("mine")
+        before = contents(tmp_path)
+        for look in (replaceable, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
+            with pytest.raises(OutputError, match=f"{file.name} was not written by sat-intervals: move .* away"):
+                look(tmp_path, RUN_FILES)
+            assert contents(tmp_path) == before
+        file.unlink()
+
+
+def test_output_writer__does_not_follow_a_link_that_appears_meanwhile(tmp_path):
+    (tmp_path / "user").mkdir()
+    (tmp_path / "user" / "intervals.tif").write_text("mine")
+    hidden = tmp_path / "out" / ".unpublished-intervals.tif"
+
+    def write():
+        with writer(tmp_path / "out") as output:
+            output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+            (hidden / "files").rename(hidden / "aside")
+            (hidden / "files").symlink_to(tmp_path / "user")
+            output.publish()
+
+    with pytest.raises(OutputError, match="files is a symbolic link"):
+        write()
+    assert contents(tmp_path / "user") == {str(tmp_path / "user" / "intervals.tif"): b"mine"}
 
 
 def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
@@ -601,6 +662,7 @@ def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
     (place / "replaced").mkdir(parents=True)
     for file in (place / "mine.txt", place / "replaced" / "mine.txt", place / "strips-intervals.tif"):
         file.write_text("mine")
+    (place.parent / ".sat-intervals.files").touch()  # as a killed process leaves it
     with OutputWriter(tmp_path, RUN_FILES, 4, 5, Georeferencing(), {}) as writer:
         writer.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
         writer.publish()
@@ -1103,6 +1165,7 @@ def test_output_writer__deletes_no_file_with_a_name_like_that_of_its_own(tmp_pat
     ours = [place / "strips-intervals.tif", place / "intervals.tif.ovr.tmp", place / "validity.tif.aux.xml"]
     for file in (*mine, *ours):
         file.write_text("content")
+    (place.parent / ".sat-intervals.files").touch()
     with OutputWriter(tmp_path, RUN_FILES, 4, 5, Georeferencing(), {}):
         pass
     assert contents(tmp_path) == {str(file): b"content" for file in mine}
