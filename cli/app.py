@@ -52,7 +52,7 @@ STEPS: dict[str, tuple[click.Command, ...]] = {
     "Compare with a truth": (reference, evaluate, calibrate, ablate),
     "Use elsewhere": (export, stac),
 }
-# Commands of every day, which the command without arguments shows.
+# The most common commands, which the command without arguments shows.
 _DAILY = (demo, match, status, report, project, surface, triangulate, dsm, evaluate, export)
 
 

@@ -9,7 +9,7 @@ from sat_intervals.cli.options import json_option, path, say_json
 from sat_intervals.cli.triangulate import point_warnings
 
 
-@click.command(short_help="Match many pairs; a rerun does what is missing.")
+@click.command(short_help="Match many pairs; a rerun matches the missing ones.")
 @click.argument("pairs", callback=path)
 @click.argument("out", callback=path)
 @json_option
@@ -19,7 +19,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     """Match the PAIRS of a CSV, YAML or JSON file, each into its own folder in OUT.
 
     Columns: name, left, right, minimum, maximum, left_mask, right_mask, nodata, band, window, and any setting such as
-    sgm.p2. Rows with left_model, right_model, left_grid, right_grid and resolution go on to a surface model, as
+    sgm.p2. Rows with left_model, right_model, left_grid, right_grid and resolution also produce a surface model, as
     `surface` does. A failed pair does not stop the others. OUT/batch.json has the state of each pair; the exit status
     is 1 if any failed.
     """
@@ -55,6 +55,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
 
         lines = "\n".join(f"  {name}: {error}" for name, error in failed.items())
         raise RunError(
-            f"{len(failed)} of {len(report)} pairs failed; rerun the same command: it does what is missing:\n{lines}"
+            f"{len(failed)} of {len(report)} pairs failed; rerun the same command: it matches only the missing pairs:\n"
+            f"{lines}"
         )
     run.check_strict([*(line for end in report.values() for line in end.get("warnings", ())), *of_points])

@@ -1,6 +1,7 @@
 """``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from sat_intervals.run.measure import Subject
 
 _FILE = click.Path(path_type=Path)
+_OPTIONS_OF_OTHERS = "--coverage applies only with --dsm, and --calibration is an option of match: leave them out."
 _CALIBRATION = """\
 # Calibration: levels of the cost curve that reach a coverage, found by sat-intervals calibrate.
 # Use it with: sat-intervals match LEFT RIGHT OUT --coverage 0.9 --calibration FILE, with the settings of `key`.
@@ -53,7 +55,11 @@ _SETTINGS = """\
 )
 @reference_options("Calibrate this surface model against --reference, instead of pairs.")
 @json_option
-@settings_options
+@partial(
+    settings_options,
+    coverage="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
+    hides_calibration=True,
+)
 @quiet_option
 @log_options
 def calibrate(
@@ -70,8 +76,8 @@ def calibrate(
 ) -> None:
     """Find the levels of the cost curve whose intervals reach coverages of .5 to .99 on PAIRS, and write them to FILE.
 
-    Use them with: match --coverage 0.9 --calibration FILE. They fit images like those of PAIRS, and only the settings
-    that they were made with.
+    Use FILE with: match --coverage 0.9 --calibration FILE. It is valid for images like those of PAIRS, and only with
+    the same settings.
 
     One of PAIRS is a folder with left.tif, right.tif, truth.tif and meta.json (`disparity`: [minimum, maximum],
     `group`), a CSV file with the columns left, right, truth, minimum, maximum and optionally name, group, tolerance and
@@ -79,10 +85,10 @@ def calibrate(
     unknown pixels are NaN or no data.
 
     The table shows what to expect: figures of each pair with the levels found on the others, means over pairs. A single
-    pair is judged in 16 blocks.
+    pair is split into 16 blocks, and each block is evaluated with the levels found on the other 15.
 
-    With --dsm: find the metres that the intervals of a surface model need to contain its coverage, or --coverage, of
-    the heights of --reference. Use them with: dsm --calibration FILE.
+    With --dsm: find margins in metres, so that the intervals of a surface model contain the required share of the
+    heights of --reference (its own coverage, or --coverage). Use FILE with: dsm --calibration FILE.
     """
     if surface is not None:
         check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
@@ -92,7 +98,7 @@ def calibrate(
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
     if "interval" in settings.sections:
-        raise click.UsageError("--coverage and --calibration are options of match: leave them out.")
+        raise click.UsageError(_OPTIONS_OF_OTHERS)
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
     from sat_intervals.raster.identity import check_not_replaced
@@ -136,8 +142,8 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judgi
     is_run = [(path / "run.json").exists() for path in paths]
     if unknown := [path for path, run in zip(paths, is_run, strict=True) if not run and not is_pair(path)]:
         raise SatIntervalsError(
-            f"{unknown[0]} is no pair and no finished run: give a folder with left.tif, right.tif, truth.tif and "
-            "meta.json, a CSV file, or the folder of a run"
+            f"{unknown[0]} is neither a pair nor a finished run: give a folder with left.tif, right.tif, truth.tif "
+            "and meta.json, a CSV file, or the folder of a run"
         )
     find_pairs(source for source, run in zip(paths, is_run, strict=True) if not run)  # raises if a pair is given twice
     found: list[tuple[Path, Pair | None]] = []
@@ -211,11 +217,12 @@ def _tune(
 ) -> None:
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
+    from sat_intervals.config.weights import INSTALL_MCCNN
     from sat_intervals.errors import RunError, SatIntervalsError
     from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
-        console.say("MC-CNN is left out: pip install sat-intervals[mccnn]")
+        console.say(f"MC-CNN is left out: to include it, {INSTALL_MCCNN}")
     found = []
     for label, changes in candidates(subjects[0].config, with_network=has_network()):
         console.say(f"calibrating {label}")

@@ -36,7 +36,8 @@ _CELL_OPTIONS = (
         "--keep-open/--drop-open",
         "keeps_open",
         default=None,
-        help="Whether points count whose interval is open at an end of the search range; default: not with a coverage.",
+        help="Keep or leave out points whose interval is open at an end of the search range; default: leave out with a "
+        "coverage, else keep.",
     ),
     click.option(
         "--outliers",
@@ -81,7 +82,7 @@ def calibration_option(*names: str) -> Callable[[Command], Command]:
         "height_calibration",
         callback=path,
         metavar="FILE",
-        help="Calibration of heights by calibrate --dsm, which moves the bounds.",
+        help="Calibration written by calibrate --dsm: margins in metres that move the bounds.",
     )
 
 

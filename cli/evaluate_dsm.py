@@ -129,7 +129,7 @@ def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
     from sat_intervals.show.marks import check_made_here
 
     if not folder.is_dir():
-        raise click.UsageError(f"--pictures {folder} is no folder: give an existing one.")
+        raise click.UsageError(f"--pictures {folder} is not a folder: give an existing one.")
     check_not_replaced(inputs, [folder / name for name in (*_TEXTS, *_PICTURES)])
     check_made_here(folder / name for name in _PICTURES)
     _check_texts(folder)

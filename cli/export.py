@@ -25,8 +25,8 @@ def export(out: Path, target: Path, form: str) -> None:
     s2p    experimental: rectified_disp.tif,
            rectified_mask.png (1 = valid), rectified_disp_confidence.tif
 
-    Experimental formats follow the documentation of the tool, which has not read them yet. All files have the size of
-    the left image. Earlier exports of these names are replaced, other files are not.
+    Experimental formats follow the documentation of the tool. They have not been tested with the tool itself. All files
+    have the size of the left image. Earlier exports of these names are replaced, other files are not.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.interop.export import export
 

@@ -141,7 +141,7 @@ class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
 
 
 local_option = click.option(
-    "--local-range", is_flag=True, help="Search a range of its own in each cell of the image, found from the images."
+    "--local-range", is_flag=True, help="Search a separate range in each cell of the image, found from the images."
 )
 _SEARCH_OPTIONS = (
     click.option(
@@ -156,24 +156,21 @@ _SEARCH_OPTIONS = (
         "--range-grid", callback=named, metavar="FILE", help="Raster of two bands, minimum and maximum of each pixel."
     ),
 )
-_SETTINGS_OPTIONS = (
+_COVERAGE = "Share of true disparities to be inside, .5 to .99, instead of alpha."
+_FIRST_SETTINGS = (
     click.option(
         "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
     ),
     preset_option,
     cost_option,
-    click.option(
-        "--coverage",
-        type=float,
-        metavar="C",
-        help="Share of true disparities to be inside, .5 to .99, instead of alpha.",
-    ),
-    click.option(
-        "--calibration", callback=named, metavar="FILE", help="Calibration for --coverage; default the built-in one."
-    ),
+)
+_LAST_SETTINGS = (
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
     click.option(
-        "--overlap", type=_Overlap(), help="exact (default): no result depends on the tiles; or pixels around a core."
+        "--overlap",
+        type=_Overlap(),
+        help="exact (default): results do not depend on the tiles; or a number of pixels read around each tile, with "
+        "results that depend on them slightly.",
     ),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     click.option(
@@ -197,8 +194,11 @@ _PLACES = {
 }
 
 
-def settings_options(command: Command) -> Command:
-    """Add options for settings; the command gets ``settings``, a `SettingsArguments`."""
+def settings_options(command: Command, coverage: str = _COVERAGE, hides_calibration: bool = False) -> Command:
+    """Add options for settings; the command gets ``settings``, a `SettingsArguments`.
+
+    ``coverage`` is the help of its option. A command that refuses --calibration hides it.
+    """
 
     @wraps(command)
     def with_settings(*, config_file: Path | None, preset: str | None, cluster: str | None, **others: Any) -> Any:
@@ -214,7 +214,19 @@ def settings_options(command: Command) -> Command:
             sections["cluster"] = sections.get("cluster", {}) | chosen
         return command(settings=SettingsArguments(config_file, sections, names), **others)
 
-    return with_options(with_settings, *_SETTINGS_OPTIONS)
+    return with_options(
+        with_settings,
+        *_FIRST_SETTINGS,
+        click.option("--coverage", type=float, metavar="C", help=coverage),
+        click.option(
+            "--calibration",
+            callback=named,
+            metavar="FILE",
+            hidden=hides_calibration,
+            help="Calibration for --coverage; default the built-in one.",
+        ),
+        *_LAST_SETTINGS,
+    )
 
 
 def search_options(command: Command) -> Command:
@@ -249,9 +261,17 @@ def run_options(command: Command) -> Command:
 
     return with_options(
         with_run,
-        click.option("--strict", is_flag=True, help="End with status 1 if the run warns, as of a narrow search range."),
+        click.option(
+            "--strict",
+            is_flag=True,
+            help="End with status 1 if the run prints a warning, for example that the search range is too narrow.",
+        ),
         click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
-        click.option("--overwrite", is_flag=True, help="Replace the run in OUT and delete its tiles."),
+        click.option(
+            "--overwrite",
+            is_flag=True,
+            help="Start again: delete the tiles in OUT, and replace a finished run there.",
+        ),
         quiet_option,
         log_options,
     )

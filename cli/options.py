@@ -37,8 +37,8 @@ quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print errors on
 preset_option = click.option(
     "--preset",
     type=click.Choice(PRESETS),
-    help="Settings for what is left out: satellite for satellite images, satellite-mccnn for different dates or little "
-    "texture, paper (default) for the paper's figures.",
+    help="Settings for all keys that are not given: satellite for satellite images, satellite-mccnn for different "
+    "dates or little texture, paper (default) for the paper's figures.",
 )
 cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost, with its default penalties.")
 store_option = click.option(

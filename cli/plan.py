@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 @json_option
 @log_options
 def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, as_json: bool) -> None:
-    """Estimate tiles, memory, disk and time of matching LEFT and RIGHT, from a small window matched at the centre.
+    """Estimate tiles, memory, disk and time of matching LEFT and RIGHT.
 
-    Options and settings are those of match.
+    The time comes from a sample matched at the centre, or elsewhere if there is no data. Options and settings are those
+    of match.
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.run.plan import plan as make_plan
@@ -49,7 +50,7 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
         "memory of a worker": f"{made.worker_bytes / 1e6:.0f} MB{one}",
         f"  with {made.together} tiles at once": f"{made.together_bytes / 1e6:.0f} MB{together}",
         "disk in the folder of the run": f"{made.disk_bytes / 1e9:.1f} GB at most",
-        f"expected time, {at_once} at once": f"{_duration(made.seconds)}, with cores such as this machine's",
+        f"expected time, {at_once} at once": f"{_duration(made.seconds)}, on cores like this machine's",
     }
     if made.together == 1:
         del lines["  with 1 tiles at once"]

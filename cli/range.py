@@ -51,12 +51,12 @@ def _rows(found: Any) -> list[tuple[str, str]]:
     rows.append(("local ranges, of the whole", f"{100 * found.local.share:.0f} %"))
     for level in found.levels:
         searched = f"{level.minimum} to {level.maximum} px searched, {100 * level.matched:.1f} % matched"
-        rows.append((f"  images reduced {level.step} times", searched))
+        rows.append((f"  images reduced by {level.step}", searched))
     rows += _histogram(found.histogram)
     quality: dict[str, Any] = found.quality
     if quality["noise"] is not None:
         rows.append(("distance of matches", f"{quality['noise']:.2f} of that of random pixels"))
-        rows.append(("rows of both images differ by", f"{abs(quality['row_offset']):.1f} px"))
+        rows.append(("rows of the two images differ by", f"{abs(quality['row_offset']):.1f} px"))
     for side, collar in quality["collars"].items():
         share = f"{100 * collar['share']:.0f} % of the pixels, along the borders"
         rows.append((f"{side} image, value {collar['value']:g}", share))

@@ -91,4 +91,5 @@ def _say_fit(console: "Console", report: dict[str, Any]) -> None:
     if misfit:
         console.say(f"row misfit of models and grids: {misfit[0]:.2g} px in the median, {misfit[1]:.2g} px at most")
         if misfit[0] > _SUSPECT_ROWS:
-            click.echo(f"warning: rows of both images differ by {misfit[0]:.2g} px: check models and grids", err=True)
+            line = f"the rows of the two images differ by {misfit[0]:.2g} px: check models and grids"
+            click.echo(f"warning: {line}", err=True)

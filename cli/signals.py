@@ -27,7 +27,10 @@ _received: list[Ended] = []
 
 
 def check() -> None:
-    """Raise `Ended` if a signal came: Python drops exceptions that handlers raise inside destructors."""
+    """Raise `Ended` if a signal was received.
+
+    Python discards exceptions that a signal handler raises inside a destructor.
+    """
     if _received:
         raise _received[0]
 

@@ -172,7 +172,7 @@ def _notes(report: dict[str, Any]) -> list[str]:
 
 
 def registration_lines(found: dict[str, Any] | None) -> list[str]:
-    """Return lines for people about a registration: the shift, and figures before and after it."""
+    """Return lines for the user about a registration: the shift, and figures before and after it."""
     if found is None:
         return []
     east, north, up = (
@@ -181,7 +181,7 @@ def registration_lines(found: dict[str, Any] | None) -> list[str]:
     )
     lines = [f"reference moved: easting {east}, northing {north}, height {up}"]
     if not found["is_horizontal"]:
-        lines = [f"reference moved: height {up}; easting and northing cannot be told here, as on flat ground"]
+        lines = [f"reference moved: height {up}; easting and northing cannot be determined here, as on flat ground"]
     for when in ("before", "after"):
         figures = found[when]
         lines.append(

@@ -66,8 +66,8 @@ FLAGS = (
     Flag(9, "mismatch", "rejected by cross-checking: mismatch", True),
     Flag(11, "regularized", "low confidence; interval regularised, unless the calibration has no quantile", False),
     Flag(13, "range_end", "best candidate at an end of the search range, or next to it", False),
-    Flag(14, "open_below", "interval open below: the disparity may lie before the search range", False),
-    Flag(15, "open_above", "interval open above: the disparity may lie behind the search range", False),
+    Flag(14, "open_below", "interval open below: the disparity may be below the search range", False),
+    Flag(15, "open_above", "interval open above: the disparity may be above the search range", False),
 )
 
 
@@ -99,7 +99,7 @@ BANDS = (
     Band("disparity", "px", "disparity of the left image, x_right = x_left + disparity"),
     Band("lower", "px", "lower bound of the disparity interval"),
     Band("upper", "px", "upper bound of the disparity interval"),
-    Band("confidence", "", "confidence from ambiguity, 0 to 1, high = easy to tell"),
+    Band("confidence", "", "confidence from ambiguity, 0 to 1, high = unambiguous"),
 )
 
 
@@ -146,7 +146,7 @@ POINTS = (
     Band("height", "m", "of the same point above the ellipsoid of WGS 84"),
     Band("height_lower", "m", "the lower of the heights that the two bounds of the disparity give"),
     Band("height_upper", "m", "the upper of them"),
-    Band("residual", "m", "distance of the point from either line of sight: tells models that do not fit, not matches"),
+    Band("residual", "m", "distance of the point from either line of sight: shows if the models fit, not the match"),
     Band("longitude_lower", "degree", "of the point at height_lower, which lies on the same left line of sight"),
     Band("latitude_lower", "degree", "of the point at height_lower"),
     Band("longitude_upper", "degree", "of the point at height_upper"),

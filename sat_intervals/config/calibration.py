@@ -31,7 +31,7 @@ SETTINGS = {"preset", "disparity", "cost", "sgm", "interval"}
 
 
 class StrictModel(BaseModel):
-    """Content of a file, without conversions and further keys."""
+    """Content of a file; other types and unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -79,14 +79,14 @@ class Calibration(CalibrationFile):
     Attributes
     ----------
     name
-        For people.
+        Shown to the user, not used.
     key
         All settings that the levels belong to, see `key_of`.
     levels
         One row for each coverage, in this order. Levels do not fall as the coverage rises, except ``low`` where the
         quantile changes.
     provenance
-        Scenes, date, version, figures to expect: for people.
+        Scenes, date, version, figures to expect; shown to the user, not used.
     """
 
     name: str
@@ -216,16 +216,18 @@ def _built_in(name: str) -> Calibration:
     return load_calibration(name)
 
 
-def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """Return the differences of two keys in words."""
+def differences(there: Mapping[str, Any], here: Mapping[str, Any], whose: str = "the settings") -> list[str]:
+    """Return the differences of the key of a calibration and the key ``here``, which is that of ``whose``, in words."""
     one, other = _flat(there), _flat(here)
     found = []
     for name in {**other, **one}:
         if one.get(name) != other.get(name):
             words = ["null" if key.get(name) is None else key[name] for key in (one, other)]
-            found.append(f"{name} is {words[0]} there and {words[1]} here")
+            found.append(f"{name} is {words[0]} in the calibration and {words[1]} in {whose}")
     # a null or an empty section that the other lacks counts only if nothing else differs
-    return found or [f"{name} is only {'there' if name in one else 'here'}" for name in one.keys() ^ other.keys()]
+    return found or [
+        f"{name} is only in {'the calibration' if name in one else whose}" for name in one.keys() ^ other.keys()
+    ]
 
 
 def _flat(key: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -251,7 +253,7 @@ def resolved(config: "Config") -> "Config":
 
 
 def unreached(config: "Config") -> str:
-    """Return a line that names a coverage which the calibration does not reach; empty if it does, or with alpha."""
+    """Return a warning if the calibration does not reach the coverage asked for; else, and with alpha, ``""``."""
     levels = config.cuts
     if levels is None or levels.reached:
         return ""

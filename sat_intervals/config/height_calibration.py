@@ -44,7 +44,7 @@ class HeightCalibration(CalibrationFile):
     Attributes
     ----------
     name
-        For people.
+        Shown to the user, not used.
     coverage
         Share of true heights inside the widened intervals.
     registered
@@ -55,7 +55,7 @@ class HeightCalibration(CalibrationFile):
     classes
         From narrow to wide.
     provenance
-        Files, registration, figures to expect: for people.
+        Files, registration, figures to expect; shown to the user, not used.
     """
 
     name: str
@@ -94,7 +94,7 @@ class HeightCalibration(CalibrationFile):
         ConfigError
             Names the first difference.
         """
-        if different := differences(self.surface, key):
+        if different := differences(self.surface, key, "the surface"):
             raise ConfigError(f"calibration {self.name} belongs to other surfaces, {different[0]}: {_MAKE_ONE}")
 
 

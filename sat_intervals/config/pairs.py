@@ -36,7 +36,7 @@ _NODES = 200_000
 class Pair:
     """Two epipolar images, their true disparity and the search range, both ends included.
 
-    ``tolerance`` and ``remove_bias`` tell how `calibrate` compares with the truth; None: as its options say.
+    ``tolerance`` and ``remove_bias`` determine how `calibrate` compares with the truth; None: its options do.
     """
 
     name: str

@@ -67,7 +67,7 @@ class NegativeSgm(_Penalties):
 
 
 class InverseSgm(_Penalties):
-    """Penalty of a larger step that decreases with the inverse gradient of the left image (Banz et al. 2012)."""
+    """Penalty of a larger step that falls with the gradient of the left image by an inverse law (Banz et al. 2012)."""
 
     penalty: Literal["inverse"] = Field("inverse", description="p2 is gamma + alpha / (gradient + beta)")
     p1: int = Field(8, ge=1, description="penalty of a disparity step of one pixel")

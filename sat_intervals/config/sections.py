@@ -75,7 +75,7 @@ class Disparity(Section):
         description="confidence 0 and open intervals at the ends of the range, as where it is found or with a coverage",
     )
 
-    local: bool = Field(False, description="search a range of its own in each cell of the image, found from the images")
+    local: bool = Field(False, description="search a separate range in each cell of the image, found from the images")
     grid: str | None = Field(
         None, description="raster of two bands, minimum and maximum, for local ranges; null: found from the images"
     )
@@ -245,7 +245,7 @@ class CrossCheck(Section):
     method: Literal["fast", "accurate"] = Field(
         "fast", description="right disparities from the left costs, or matched on their own at twice the work"
     )
-    tolerance: int = Field(1, ge=0, description="largest difference of both disparities, in pixels")
+    tolerance: int = Field(1, ge=0, description="largest difference of the two disparities, in pixels")
 
 
 class Median(Section):
@@ -272,7 +272,7 @@ class Tiles(Section):
     )
     overlap: Annotated[int, Field(ge=1, le=4096)] | Literal["exact"] = Field(
         "exact",
-        description="exact: tiles hand SGM's path states on, or pixels read around the core and dropped",
+        description="exact: tiles hand SGM's path states on; or pixels read around each tile and dropped",
     )
 
     @property

@@ -36,7 +36,7 @@ SGM_PATHS = 8
 class Config(Section):
     """All settings of a run; None in place of a section switches its step off."""
 
-    preset: Literal[PRESETS] = Field(PRESETS[0], description="settings for keys that are left out")  # type: ignore[valid-type]
+    preset: Literal[PRESETS] = Field(PRESETS[0], description="settings for all keys that are not given")  # type: ignore[valid-type]
     disparity: Disparity = Disparity()
     cost: Census | Mccnn = Field(Census(), discriminator="method")
     sgm: AnySgm | None = Sgm()

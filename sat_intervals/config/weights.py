@@ -7,7 +7,7 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 
 # The distribution of the official weights, and the file in it that Pandora uses.
 _DISTRIBUTION, _OFFICIAL = "MCCNN", "mc_cnn_fast_int8_excl_01.onnx"
-INSTALL_MCCNN = "pip install sat-intervals[mccnn]"
+INSTALL_MCCNN = "pip install 'sat-intervals[mccnn]'"
 # Largest file of weights in bytes; the official one has 0.4 MB.
 _LARGEST = 256 * 10**6
 

@@ -1,7 +1,8 @@
 """Calibrate the intervals of a surface model in metres, against reference heights.
 
-Intervals of pixels know neither what the cells of a surface mix nor how models and grids err. The margins are those of
-split-conformal prediction, by class of width. Expected figures are those of blocks of ground that were held out.
+Pixel intervals do not contain every error of a height: cells mix several points, walls are vertical, and models and
+grids have errors. The margins are those of split-conformal prediction, by class of width. Expected figures are those of
+blocks of ground that were held out.
 """
 
 from collections.abc import Mapping
@@ -55,7 +56,7 @@ class Sample(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Widths between classes, margins of classes, and their numbers of cells."""
+    """Limits of the width classes, with the margin and the number of cells of each class."""
 
     limits: np.ndarray
     margins: np.ndarray
@@ -72,7 +73,7 @@ def calibrate_surface(
     surface, reference, registers
         As in `evaluate_surface`. The surface has intervals and was made without a calibration or largest width.
     name
-        For people.
+        Shown to the user, not used.
     coverage
         The share; by default the coverage of the surface's runs.
 
@@ -80,7 +81,7 @@ def calibrate_surface(
     -------
     Its provenance has the files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks
     of ground with the margins of the other blocks (None with too few cells): coverage, median and mean width in metres;
-    ``lowest``, the smallest coverage of a block (None with too few cells in each); ``warnings``, lines for people.
+    ``lowest``, the smallest coverage of a block (None with too few cells in each); ``warnings``, lines for the user.
 
     Raises
     ------
@@ -188,12 +189,12 @@ def _datum_warnings(given: Comparison, sample: Sample, up: float, *, is_register
     if median is None or abs(median) <= _DATUM:
         return []
     line = (
-        f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as those above "
-        "a geoid and the ellipsoid do"
+        f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as heights "
+        "above a geoid and heights above the ellipsoid do"
     )
     if is_registered:
         return [f"{line}; the margins do not include it"]
-    raise SatIntervalsError(f"{line}: make the surface with --geoid, convert the reference, or let it be moved")
+    raise SatIntervalsError(f"{line}: make the surface with --geoid, convert the reference, or leave out --no-register")
 
 
 def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins | None:
@@ -213,7 +214,7 @@ def fitted(sample: Sample, cells_of_height: float, coverage: float) -> Margins |
 
 
 def held_out(sample: Sample, cells_of_height: float, coverage: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return bounds with the margins of the other blocks of ground; None if those of a block have too few cells."""
+    """Return bounds with the margins of the other blocks of ground; None if the others have too few cells."""
     lower, upper = np.full((2, sample.height.size), np.nan)
     for block in np.unique(sample.block):
         own = sample.block == block

@@ -61,7 +61,7 @@ def evaluate_surface(
     For ``all`` heights, by ``slope`` of the reference (degrees), by ``width`` of the interval (metres) and by
     ``classes``: the figures of `Accuracy.report`. ``before``: those of all heights with the reference in its place.
     ``from`` and ``to`` are the limits of a class, ``class`` its number. ``registration``, see `Registration.report`;
-    None without, or with too few heights, of which ``warnings`` tell. ``nominal``: coverage or alpha of the surface;
+    None without, or with too few heights (see ``warnings``). ``nominal``: coverage or alpha of the surface;
     None if unknown.
 
     Raises

@@ -43,8 +43,8 @@ def fused(runs: Sequence[RunCells]) -> np.ndarray:
     """Return the bands of SURFACE from the cells of each run: ``(6, rows, columns)`` float32.
 
     Heights and middles of intervals are means weighted by ``1 / width^2``; the width is that of the mean weight. It is
-    not divided by the root of the number of runs: errors of pairs of one place are alike. Where the intervals do not
-    meet, their hull is taken. Heights of runs without intervals count where no run has one.
+    not divided by the root of the number of runs: errors of pairs of the same place are correlated. Where the intervals
+    do not meet, their hull is taken. Heights of runs without intervals count where no run has one.
     """
     weights, heights, lowers, uppers = (
         np.stack([getattr(run, name) for run in runs]) for name in ("weight", "height", "lower", "upper")

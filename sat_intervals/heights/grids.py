@@ -28,7 +28,7 @@ def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
         GeoTIFF: columns in band 1, rows in band 2, no positions where there is no data. Files tagged by OTB have
         displacements from epipolar coordinates to sensor positions, all others sensor positions.
     left
-        Georeferencing of the whole left epipolar image. OTB takes it as the place of its pixels in epipolar
+        Georeferencing of the whole left epipolar image. OTB takes it as the position of its pixels in epipolar
         coordinates, for the right image, too.
 
     Raises

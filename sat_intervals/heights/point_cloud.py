@@ -32,7 +32,7 @@ from sat_intervals.tiling import Grid, Window
 
 # Bounds that need all points of a cell at once.
 LISTED = {"median": MEDIAN, "nearest": NEAREST, "agreeing": AGREEING}
-# Pixels around a point whose median tells outliers.
+# Pixels around a point whose median outliers are compared with.
 _NEAR = 2
 
 

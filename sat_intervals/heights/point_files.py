@@ -182,7 +182,7 @@ def _vectors(path: Path) -> Iterator[np.ndarray]:
         skipped += len(geometry)
         points = shapely.from_wkb(geometry)
         if set(np.unique(shapely.get_type_id(points))) - {-1, 0}:
-            raise SatIntervalsError(f"{path} has geometries that are no points: give points")
+            raise SatIntervalsError(f"{path} has geometries that are not points: give points")
         places = np.column_stack([shapely.get_x(points), shapely.get_y(points), shapely.get_z(points)])
         if column and not np.isfinite(places[:, 2]).any():
             places[:, 2] = values[0]

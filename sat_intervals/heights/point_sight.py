@@ -10,9 +10,10 @@ from sat_intervals.tiling import Window
 # Rows of a strip.
 _ROWS = 256
 _RECORD = np.dtype([("row", "<i4"), ("column", "<i4"), ("disparity", "<f4")])
-# Points expected around a pixel if what hides a point is to be seen, and largest distance in pixels of those asked.
+# Number of points needed around a pixel to decide whether a point is hidden, and the largest distance in pixels that is
+# searched for them.
 _AROUND, _FURTHEST = 8, 8
-# A slope that is no wall, and pixels of disparity that no slope explains.
+# The steepest slope that is not a wall, and pixels of disparity that no slope explains.
 _STEEPEST, _CLEAR = np.tan(np.radians(60.0)), 1.0
 
 
@@ -53,7 +54,7 @@ class PointSight:
 
     @property
     def reach(self) -> int:
-        """Return how far around a pixel points may hide it, in pixels; 0 if they are too few to tell."""
+        """Return how far around a pixel points may hide it, in pixels; 0 if they are too few to decide."""
         density = self.points / (self._region.height * self._region.width)
         reach = 0 if not density else max(1, int(np.ceil((np.sqrt(_AROUND / density) - 1) / 2)))
         return reach if reach <= _FURTHEST else 0

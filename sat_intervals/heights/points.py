@@ -24,7 +24,7 @@ def triangulated(outs: Sequence[Path]) -> list[Run]:
     Raises
     ------
     SatIntervalsError
-        A folder is no run, is given twice, or has no points, those of an earlier run, or damaged ones.
+        A folder is not a run, is given twice, or has no points, those of an earlier run, or damaged ones.
     """
     runs: list[Run] = []
     for out in outs:

@@ -46,7 +46,7 @@ class Scene:
 
 
 class _FarError(Exception):
-    """The lattice must reach further: to this minimum and maximum of the disparity."""
+    """Raised when the lattice must cover more disparities; holds the new minimum and maximum."""
 
 
 class RasterSight:

@@ -303,7 +303,8 @@ class _Tally:
         if correlation is not None and correlation < _SWAPPED:
             raise SatIntervalsError(
                 f"the heights of {path} rise where the disparities of {self._run.out} fall (correlation "
-                f"{correlation:.2f}): models and grids of left and right are swapped, or the images were"
+                f"{correlation:.2f}): models and grids of left and right are swapped, or the left "
+                "and right images are"
             )
 
     def report(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Triangulate the disparities and bounds of a run: points and heights in its geometry.
 
-Points are interpolated from a lattice at about one second per megapixel, so a single process without resuming is
-enough. Rows are read, computed and written strip by strip, so memory does not depend on the size.
+Points are interpolated from a lattice at about three seconds of processor time per megapixel, so a single process
+without resuming is enough. Rows are read, computed and written strip by strip, so memory does not depend on the size.
 """
 
 import json

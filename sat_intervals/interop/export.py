@@ -2,7 +2,7 @@
 
 All of them define disparity as ``x_right - x_left`` of the epipolar pair, as here, and none uses a CRS. The files have
 the size of the left image; pixels outside the matched region are invalid. Those for OTB keep the transform of the left
-image, which is the place of its pixels in OTB's grids.
+image, which gives the position of its pixels in OTB's grids.
 """
 
 from collections.abc import Callable

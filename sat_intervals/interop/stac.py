@@ -84,7 +84,7 @@ def _time(text: str) -> str:
 
 
 def _check_own(file: Path) -> None:
-    """Raise if the file exists and is no item of this tool. Links are replaced, never followed: they pass."""
+    """Raise if the file exists and is not an item of this tool. Links pass: they are replaced, never followed."""
     if not os.path.lexists(file) or file.is_symlink():
         return
     with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):

@@ -33,9 +33,10 @@ class Costs(NamedTuple):
     Attributes
     ----------
     left, right
-        Words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)``, padded behind the last column
-        by whole vectors; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None. Kernels
-        are compiled for either form.
+        Words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)``, padded after the last column
+        by whole vectors; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None. ``size``
+        is the count padded to a multiple of 32 lanes, `padded_to_lanes`; lanes beyond the count may hold anything.
+        Kernels are compiled for either form.
     left_state
         ``(rows, columns)`` uint8, 0 = usable window.
     right_state
@@ -174,7 +175,7 @@ class Candidates(NamedTuple):
     barrier
         ``(columns + size,)`` uint16: ``barrier[c + k]`` is the cost of an impossible candidate, or 0.
     beyond
-        ``(cells, size)`` uint16: 0 in the search range of a cell, above every cost before and behind it.
+        ``(cells, size)`` uint16: 0 in the search range of a cell, above every cost before and after it.
     walls
         ``(columns,)`` int64: where the row of ``beyond`` that applies to each pixel begins in ``beyond.ravel()``.
     """

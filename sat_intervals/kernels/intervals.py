@@ -232,7 +232,7 @@ def _same_neighbours(s, t, above, below):
 
 @cached
 def regularize(lower, upper, low, minimum, depth, quantile, rows, per_pixel):
-    """Widen the intervals of low-confidence areas to quantiles of the area's bounds (paper section 3.5).
+    """Replace the bounds of low-confidence pixels by quantiles of the bounds of their area (paper section 3.5).
 
     A segment's area is made of the segments reached in at most ``depth`` steps between segments of adjacent rows
     that share a column.

@@ -188,7 +188,7 @@ def read_curve(curve, span, lowest, settings):
 
 @inlined
 def _distrusts(k, span, settings):
-    """Whether a winner stands at an end of its cell's range that is no end of the whole range, or next to it.
+    """Whether a winner is at or next to an end of its cell's range where the whole range goes on.
 
     The true disparity may then be among the candidates of the whole range that were not searched: they are ambiguous.
     """

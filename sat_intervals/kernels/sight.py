@@ -1,4 +1,4 @@
-"""Meet lines of sight with a surface of heights: of several heights on a line, the one that the sensor sees.
+"""Intersect lines of sight with a surface of heights. Of several intersections, the one that the sensor sees is taken.
 
 Letters: r row, c column of the image; i, j lattice node along rows and columns, k along disparities; y, x position in
 cells of the surface, z height; t place between two nodes k and k + 1.

@@ -64,7 +64,7 @@ def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
 def rehulled(edge: Edge, minimum: int, config: Config) -> Edge:
     """States of a neighbour, whose first disparity is ``minimum``, over the search range of ``config``.
 
-    What one of both does not search is beyond the cells of the pixels that they share: a wall.
+    A disparity that only one of the two searches is outside the cells of the pixels that they share: it is impossible.
     """
     size, shift = padded_to_lanes(config.disparity.count), config.disparity.minimum - minimum
     found = []

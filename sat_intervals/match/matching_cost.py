@@ -201,7 +201,7 @@ def _correlations(
 
 
 def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStatistics, network: Network) -> np.ndarray:
-    """Features of rows of a view, ``(features, rows, columns)``; zero before and behind the usable columns."""
+    """Features of rows of a view, ``(features, rows, columns)``; zero before and after the usable columns."""
     height, width = rows.stop - rows.start, state.shape[1]
     usable = np.flatnonzero((state[rows] == 0).any(axis=0))
     if not usable.size:

@@ -17,7 +17,8 @@ from sat_intervals.config import Config
 QUANTILES = (None, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 HIGH, SCHEMES = 0, 1 + len(QUANTILES)
 
-# Rungs: level 0, and from a fraction of the span to the level that holds every candidate, a third of an octave apart.
+# Rungs: level 0, and from a fraction of the span to the level that holds every candidate, each 1.26 times the
+# one before.
 _LOWEST, _RUNGS = 1 / 256, 25
 # Widths are counted in steps of 1/64 px up to 8 px, and of 1 % above.
 _STEPS, _FINE, _RATIO = 64, 8, 1.01

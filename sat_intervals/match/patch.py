@@ -283,9 +283,10 @@ def _mark_ends(raw: Raw, flat: np.ndarray, search: Disparity) -> None:
 
 
 def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparity) -> None:
-    """Reject winners at an end of their cell's range, or next to it, that is no end of the whole range: no minima.
+    """Reject winners at or next to an end of their cell's range, unless the whole range ends there.
 
-    The cross-check would reject most of them in a search of the whole range. ``least`` and ``most`` are those ends.
+    They may not be minima of the cost. The cross-check would reject most of them in a search of the whole range.
+    ``least`` and ``most`` are those ends.
     """
     ends = (raw.winner <= least + 1) & (least > search.minimum)
     ends |= (raw.winner >= most - 1) & (most < search.maximum)

@@ -166,7 +166,7 @@ def finish_rows(rows: Filtered, first: int, last: int, config: Config) -> Bands:
 def widened(
     lower: np.ndarray, upper: np.ndarray, disparity: np.ndarray, config: Config
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds that contain the disparity, off which medians or quantiles may move them, rounded outwards."""
+    """Widen bounds to contain the disparity, rounded outwards: medians or quantiles may have moved them past it."""
     lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
     if config.bound_steps:
         for round_, bound in ((np.floor, lower), (np.ceil, upper)):  # in place: half the time
@@ -177,7 +177,10 @@ def widened(
 
 
 def _open_ends(rows: RawRows, validity: np.ndarray, confidence: np.ndarray, config: Config) -> None:
-    """Distrust winners at the ends of the search range: the true disparity may lie beyond."""
+    """Set the confidence of winners at the ends of the search range to 0, and open their intervals.
+
+    The true disparity may be outside the range.
+    """
     ends = validity & RANGE_END != 0
     confidence[ends] = 0
     if config.interval:

@@ -15,7 +15,7 @@ from sat_intervals.products import NO_DATA
 from sat_intervals.tiling import View, Views, Window, facing
 
 # Side of a window in pixels of the image, and windows along each side of the image; side in pixels of the part of a
-# level that tells the row offset.
+# level that determines the row offset.
 _SIDE, _WINDOWS, _PART = 64, 2, 128
 # Rows up and down that are tried, and the box over which costs are summed.
 ROWS, _BOX = 2, 9
@@ -38,7 +38,7 @@ class Sample(NamedTuple):
     minimum, maximum
         Disparities to search there.
     rows
-        Rows by which the right window lies lower, the nearest whole number to what the coarse matches tell.
+        Rows by which the right window lies lower, rounded from the row offset of the coarse matches.
     """
 
     left: Window
@@ -59,7 +59,7 @@ class Sample(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What a window tells: number of matches, their mean distance, that of random candidates, and the row offset."""
+    """Figures of a window: number of matches, their mean distance, that of random candidates, and the row offset."""
 
     number: int
     matched: float
@@ -68,7 +68,7 @@ class Look(NamedTuple):
 
 
 def samples(matches: Matches, rows: float) -> list[Sample]:
-    """Windows spread over the image, where enough is matched; ``rows`` is the row offset that coarse matches tell."""
+    """Windows spread over the image, where enough is matched; ``rows`` is the row offset of the coarse matches."""
     step = matches.step
     height, width = max(1, _SIDE // step.rows), max(1, _SIDE // step.columns)
     shares = _shares(matches.kept, height, width)
@@ -117,7 +117,7 @@ def look(sample: Sample, left: tuple[np.ndarray, np.ndarray], right: tuple[np.nd
 
 
 def _look(codes: tuple[Codes, Codes], index: np.ndarray, known: np.ndarray, rows: int) -> Look | None:
-    """What matches tell; ``rows`` is how much lower the right codes were read."""
+    """Figures of the matches of a window; ``rows`` is how much lower the right codes were read."""
     offsets = row_offsets(*codes, index, known)
     if known.sum() < _FEWEST or not offsets.size:
         return None
@@ -129,7 +129,7 @@ def _look(codes: tuple[Codes, Codes], index: np.ndarray, known: np.ndarray, rows
 
 
 def row_offsets(left: Codes, right: Codes, index: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Rows by which the right image lies lower, one figure for each match that tells it.
+    """Rows by which the right image lies lower, one figure for each match that determines it.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def _boxed(costs: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def coarse_rows(left: np.ndarray, right: np.ndarray, matches: Matches) -> float:
-    """Rows of the image by which the right image lies lower, from a part of a level; 0 if its matches do not tell."""
+    """Rows of the image by which the right image is lower, from a part of a level; 0 if its matches do not show it."""
     height, width = (min(_PART, side) for side in left.shape)
     shares = _shares(matches.kept, height, width)
     place = np.unravel_index(np.argmax(shares), shares.shape)
@@ -210,7 +210,7 @@ def _padded(image: np.ndarray, window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_in_tile(views: Views, core: Window, minimum: int, maximum: int) -> list[Look]:
-    """What the middle of a tile tells of the pair.
+    """Estimate noise and row offset of the pair from the middle of a tile.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def _cut(view: View, window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def summary(looks: Iterable[Look | None]) -> dict[str, Any]:
-    """Noise and row offset of a pair from its samples; None where no window tells them.
+    """Noise and row offset of a pair from its samples; None if no window determines them.
 
     ``noise`` is the mean distance of matches over that of random candidates; ``row_offset`` has the median size of the
     windows' offsets in rows, positive where the right image lies lower.

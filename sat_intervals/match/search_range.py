@@ -47,7 +47,7 @@ _CELL, _UNDERSTOOD, _LOCAL_MARGIN = 32, 0.2, (2, 1)
 
 
 class NoRangeError(SatIntervalsError):
-    """The images have too few consistent matches to tell the search range."""
+    """The images have too few consistent matches to determine the search range."""
 
 
 class Step(NamedTuple):
@@ -252,7 +252,7 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, shape: tuple[int
         top = levels[0]
         raise NoRangeError(
             f"only {100 * top.matched:.0f} % of the pixels have a consistent match between disparities {top.minimum} "
-            f"and {top.maximum} in images reduced {top.step} times, {100 * _FEWEST:.0f} % are needed"
+            f"and {top.maximum} in images reduced by a factor of {top.step}, {100 * _FEWEST:.0f} % are needed"
         )
     size = matches.step.columns
     low, high = (size * end for end in _range_of(matches, _MARGIN))
@@ -266,8 +266,8 @@ def find_range(left: np.ndarray, right: np.ndarray, step: Step, shape: tuple[int
 def _local(matches: Matches, minimum: int, maximum: int, shape: tuple[int, int]) -> LocalRanges:
     """Local ranges from the matches of a level: those of a cell and its neighbours, with a margin.
 
-    Cells without enough matches get the whole range: the level does not understand them. Cells without a usable pixel
-    take the range of their neighbours.
+    Cells without enough matches get the whole range: there is too little evidence for a narrower one. Cells without a
+    usable pixel take the range of their neighbours.
     """
     rows, columns = (-(-side // (_CELL * size)) for side, size in zip(shape, matches.step, strict=True))
 

@@ -20,7 +20,7 @@ BLOCK = 512
 COLUMNS = 4 * BLOCK
 """Columns compressed at a time: padded and interleaved copies stay small."""
 AROUND = 8
-"""Bytes around each block in a file: its size before it, and a copy of its last four bytes behind it."""
+"""Bytes around each block in a file: its size before it, and a copy of its last four bytes after it."""
 
 # Every GeoTIFF reader supports DEFLATE. On the bands of a Pleiades pair level 1 writes 5.4 Mpx per second and core, 49
 # bits per pixel; level 6: 3.2 and 46; no compression: 9.1 and 186. Predictors are slower and larger (4.3 and 63), since
@@ -56,7 +56,7 @@ def compressed(bands: np.ndarray, file: File) -> CompressedRow:
         They differ.
     """
     sizes: list[int] = []
-    content = BytesIO()  # its value is no copy
+    content = BytesIO()  # its value is not a copy
     for first in range(0, bands.shape[2], COLUMNS):
         for block in _compressed(bands[:, :, first : first + COLUMNS], file):
             sizes.append(len(block))

@@ -1,8 +1,8 @@
 """Assemble Cloud-Optimized GeoTIFFs from blocks that were compressed apart, in any order and by any worker.
 
-GDAL makes all of it but the places: it compresses blocks in memory, and writes every tag into a small template of the
-same kind. The layout is that of GDAL's COG driver: directories, then the smallest overview first, each block between
-its size and a copy of its last four bytes.
+GDAL compresses the blocks in memory and writes all tags into a small template file of the same kind. This module only
+computes the offsets of the blocks. The layout is that of GDAL's COG driver: directories, then the smallest overview
+first, each block between its size and a copy of its last four bytes.
 """
 
 import errno

@@ -23,7 +23,7 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
-# With these a damaged image is an error. A failure without a message is none to rasterio, which then returns zeros.
+# With these a damaged image is an error. rasterio ignores a failure without a message, and returns zeros.
 _STRICT = {
     "GDAL_NUM_THREADS": "1",  # a failure in another thread has no message in this one
     "VRT_NUM_THREADS": "1",
@@ -36,7 +36,7 @@ _OF_SOURCES = threading.RLock()
 
 
 class _Reader(DatasetReader):  # type: ignore[misc]
-    """A dataset of which no source fails without an error, as those of a VRT in a VRT do from the second time on."""
+    """A dataset that raises if a source cannot be read. GDAL reports a missing source of a nested VRT only once."""
 
     def read(self, indexes: int | None = None, *, out_shape: Any = None, **options: Any) -> np.ndarray:
         values = super().read(indexes, out_shape=out_shape, **options)

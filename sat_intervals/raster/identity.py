@@ -73,7 +73,7 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
 
 
 def stamp_of(path: str) -> str | None:
-    """The stamp that `identity` tells of a file; None where it tells none."""
+    """Return the stamp of a file as `identity` gives it; None where it gives none."""
     file = _local_file(path)
     return _stamp(file) if file else None
 
@@ -225,7 +225,9 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _Read]) -> _Read:
-    """Return what is read from inputs of a run; read again if one was touched: it may have been another for a moment.
+    """Read from the inputs of a run and return the result.
+
+    It reads again if an input was touched meanwhile: another file may have taken its place for a moment.
 
     Raises
     ------
@@ -246,15 +248,17 @@ def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _R
             return content
     if not touched:  # both folders get new files all the time
         return content
-    raise RunError(f"{touched[0]} is touched again and again while it is read: end that and rerun the same command")
+    raise RunError(
+        f"{touched[0]} keeps changing while it is read: stop the program that writes it and rerun the same command"
+    )
 
 
 @contextmanager
 def compared(files: Mapping[str, Mapping[str, Any]]) -> Iterator[Callable[[], str | None]]:
     """Compare the content of inputs of a run with their `identity` during the block, in a thread.
 
-    It reads all local files: a memory map may change a file without its times. The function given waits for the end and
-    returns the name of the first file that differs, None if none does. It raises RunError if a file cannot be read.
+    It reads all local files, since a memory map can change a file but not its times. The yielded function waits for the
+    end and returns the name of the first file that differs, or None. It raises RunError if a file cannot be read.
     """
     is_over = Event()
     with ThreadPoolExecutor(1) as thread:
@@ -301,7 +305,9 @@ def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
 def check_not_replaced(
     inputs: Iterable[str | Path | None], outputs: Iterable[str | Path], folders: Iterable[str | Path] = ()
 ) -> None:
-    """Raise if an input is also an output, under any name or link, or inside a folder of outputs, or an output a pipe.
+    """Raise if an output would replace an input, or is a pipe.
+
+    Links and other names of an input are recognised, and inputs inside folders of outputs.
 
     Parameters
     ----------

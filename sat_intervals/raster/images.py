@@ -233,7 +233,7 @@ def _check_mask(image: Image, mask: str) -> None:
 
 
 def _check_watched(name: str, dataset: DatasetReader) -> None:
-    """Raise if nobody would notice that files of a raster are incomplete, or change."""
+    """Raise if the tool could not notice that files of a raster are incomplete or change."""
     if any(map(os.path.isdir, (name, *dataset.files))) or "/vsisparse/" in name or "/vsicached" in name:
         raise InputError(
             f"{name} is read from files that GDAL does not list, which may change during a run: convert it with "
@@ -241,13 +241,16 @@ def _check_watched(name: str, dataset: DatasetReader) -> None:
         )
     if dataset.driver in _UNCHECKED:
         raise InputError(
-            f"{name} has the format {dataset.driver}, of which GDAL does not notice missing data: convert it with "
+            f"{name} has the format {dataset.driver}, in which GDAL does not report missing data: convert it with "
             "gdal_translate"
         )
 
 
 def _sources(path: str) -> list[str]:
-    """Return all sources of a virtual raster, a file or its text: GDAL lists plain files only, none of masks."""
+    """Return all sources of a virtual raster, given as a file or as text.
+
+    GDAL lists only plain files, and not those of masks.
+    """
     text = Path(path).read_bytes() if os.path.isfile(path) else path.encode()
     if b"<VRTDataset" not in text:
         return []
@@ -259,7 +262,7 @@ def _sources(path: str) -> list[str]:
     for element in elements:
         if element.get("subClass") == "VRTRawRasterBand":
             raise InputError(
-                f"{path} has a raw band, of which GDAL does not notice missing data: convert it with gdal_translate"
+                f"{path} has a raw band, in which GDAL does not report missing data: convert it with gdal_translate"
             )
         is_named = element.tag in _SOURCE_TAGS or element.get("key") in _GEOLOCATION_KEYS
         if is_named and (name := element.text):

@@ -71,7 +71,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
-    """Keep copies of files while the block may replace them; restore them if it does not renew ``report``.
+    """Keep copies of files that the block may replace; restore them at the end unless it has replaced ``report``.
 
     If the process is killed, the next call with the same files restores them.
     """
@@ -227,8 +227,9 @@ def check_marked(path: Path) -> None:
 
 
 def check_made_by(path: Path, command: str, tag: str, value: str | None = None) -> None:
-    """Raise if a raster exists that a command did not make: without `MARK`, or without its tag, of any value if None.
+    """Raise if a raster exists that this command did not make: it lacks `MARK` or the command's tag.
 
+    If ``value`` is None, any value of the tag passes.
     Links are replaced, never followed: they pass.
     """
     check_marked(path)

@@ -66,7 +66,9 @@ def check_seal(path: str | Path, files: Iterable[str]) -> None:
 
 
 def check_beside(path: str | Path, files: Iterable[str]) -> None:
-    """Raise if GDAL reads one of our rasters from more ``files``: masks, overviews, or more than statistics.
+    """Raise if ``files`` next to one of our rasters change what GDAL reads.
+
+    These are masks, overviews, and an ``.aux.xml`` with more than statistics.
 
     Raises
     ------

@@ -32,7 +32,7 @@ from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, rep
 # Meanings of some of the counts, for readers of run.json.
 _COUNTS_MEANING = {
     "ambiguous": "valid pixels whose interval is the whole search range",
-    "range_ends": "valid pixels with the flag range_end and without range_incomplete, by the end that they are near",
+    "range_ends": "valid pixels with the flag range_end and without range_incomplete, counted at the nearer end",
     "low_confidence": "valid pixels with the flag regularized; flags.regularized also counts invalid ones",
     "causes": "invalid pixels, each under its first flag that makes it invalid; with valid they add up to pixels",
     "flags": "pixels with the flag, valid or not; a pixel may have several flags",
@@ -102,13 +102,16 @@ def assemble(
 
 
 def _check_content(job: Job, name: str | None) -> None:
-    """Raise if the content of an input differs, or a mask is new. If no time differs, no tile can be trusted."""
+    """Raise if the content of an input has changed or a mask file has appeared.
+
+    If no time of the input has changed, the tiles are deleted, since they cannot be trusted.
+    """
     if name is not None:
         job.check_inputs()
         job.store.remove()
         raise RemovedTilesError(
-            f"{name} was changed during the run, though its times were not, as with a memory map: the tiles of the run "
-            "are deleted: rerun the command when the file is complete"
+            f"{name} was changed during the run without a change of its modification time, as through a memory map: "
+            "the tiles of the run are deleted: rerun the command when the file is complete"
         )
     if mask := appeared_mask(job.left, job.right, job.files):
         job.store.remove()
@@ -203,7 +206,7 @@ def _report(
     counts = _counts(config, parts)
     quality = quality_of(job, records)
     return {
-        "finished": datetime.now(UTC).isoformat(timespec="microseconds"),  # tells runs apart
+        "finished": datetime.now(UTC).isoformat(timespec="microseconds"),  # distinguishes runs
         "settings": config.model_dump(mode="json"),
         "requested": {"disparity": job.requested},
         "search": job.found and job.found.report(),

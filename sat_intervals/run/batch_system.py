@@ -33,7 +33,7 @@ def batch_system(settings: Cluster, logs: Path) -> Any:
         import dask_jobqueue
     except ImportError as error:
         raise SatIntervalsError(
-            f"cluster {settings.kind} needs dask-jobqueue: pip install sat-intervals[cluster]"
+            f"cluster {settings.kind} needs dask-jobqueue: pip install 'sat-intervals[cluster]'"
         ) from error
     base: Any = getattr(dask_jobqueue, f"{settings.kind.upper()}Cluster")
     own_logs = dask.config.get(f"jobqueue.{settings.kind}.log-directory", None)
@@ -123,9 +123,10 @@ def job_script(settings: Cluster, out: Path) -> str:
 
 
 def current_workers(client: Client) -> dict[str, int]:
-    """Return addresses and cores of a client's workers; call it every few seconds, since it ends a futile wait.
+    """Return the addresses and cores of a client's workers.
 
-    There is no time limit for the first worker of a batch system, but a warning every minute.
+    Call it every few seconds while waiting: it raises if waiting is useless. There is no time limit for the first
+    worker of a batch system, but a warning every minute.
 
     Raises
     ------

@@ -38,8 +38,8 @@ def check_subjects(subjects: Sequence[Subject]) -> None:
     groups = {subject.group for subject in subjects}
     if len(subjects) > 1 and len(groups) == 1:
         raise SatIntervalsError(
-            f"all {len(subjects)} pairs are of group {first.group}, so that no other is left to judge it with: leave "
-            "--by-group out, or give pairs of another group"
+            f"all {len(subjects)} pairs are of group {first.group}, so no other group is left to test the levels on: "
+            "leave out --by-group, or give pairs of another group"
         )
     known = 0
     for subject in subjects:

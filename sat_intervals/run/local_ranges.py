@@ -94,7 +94,10 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
     images = [open_image(path, band=band) for band in (1, 2)]
     here, there = images[0].georeferencing, left.georeferencing
     if here.crs and there.crs and (here.crs, here.transform) != (there.crs, there.transform):
-        raise SatIntervalsError(f"{path} and {left.path} lie at different places: give ranges of the left image")
+        raise SatIntervalsError(
+            f"{path} and {left.path} have different georeferencing: give a raster of ranges on the grid of the left "
+            "image"
+        )
     rows = [_row_of_cells(images, Window(row, 0, min(_CELL, height - row), width)) for row in range(0, height, _CELL)]
     minimum, maximum = (np.stack(bound) for bound in zip(*rows, strict=True))
     return LocalRanges(minimum, maximum, _CELL, _CELL)

@@ -47,7 +47,7 @@ class Subject:
     Attributes
     ----------
     name
-        For people.
+        Shown to the user, not used.
     group
         Subjects of one group are left out together.
     left, right

@@ -34,7 +34,10 @@ def check_output(out: Path, overwrite: bool) -> None:
 
 
 def check_replaceable(out: Path) -> None:
-    """Raise if a folder has files with names of a run's, but none that a run made; call it to overwrite."""
+    """Raise if a folder has files with the names of a run's files, but none that a run made.
+
+    Call it before overwriting.
+    """
     there = [out / name for name in OUTPUTS if (out / name).exists()]
     if there and not any(_is_of_run(file) for file in there):
         raise SatIntervalsError(

@@ -147,7 +147,7 @@ def _path_pixels(core: Window, region: Window, whole: Window, config: Config) ->
 
 
 def _work(grid: Grid, whole: Window, config: Config) -> int:
-    """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows behind its core."""
+    """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows after its core."""
     if config.tiles.overlap == "exact":
         return _path_pixels(grid.region, grid.region, whole, config)
     overlap = config.tiles.margin
@@ -173,7 +173,7 @@ def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
 def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
     """Estimate the seconds of a run from a sample, and its extra work: tiles scaled by work, the rest by pixels.
 
-    As many samples at once as this machine has workers slow each other as these will.
+    It runs as many samples at once as this machine runs workers, so that they slow each other down as the workers will.
     """
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
     shape = SAMPLE, SAMPLE

@@ -19,7 +19,7 @@ _SHORT_RANGE = 8
 _AMBIGUOUS_SHARE = 0.1
 # Share of valid pixels at the ends of the search range above which a run warns, and at one end to search further there.
 _AT_ENDS, _AT_END = 0.005, 0.001
-# Share of the pixels of an image that make a collar worth telling, and rows that are looked at.
+# Share of the pixels of an image that make a collar worth a warning, and rows that are looked at.
 COLLAR, _ROWS = 0.01, 8
 # Rows that make a pair badly resampled, and the distance of matches that makes it noisy.
 _ROW_OFFSET, _NOISE = 1.0, 0.55
@@ -54,7 +54,7 @@ def _collar(image: Image, region: Window) -> dict[str, float] | None:
 
 
 def warnings_of(job: Job, counts: dict[str, Any], quality: dict[str, Any]) -> list[str]:
-    """Return a line for each doubt about a run."""
+    """Return the warnings about a run, one line each."""
     search, path = job.config.disparity, job.left.path
     lines = []
     if ends := _ends(counts, search):
@@ -74,10 +74,10 @@ def warnings_of(job: Job, counts: dict[str, Any], quality: dict[str, Any]) -> li
 
 
 def doubts(quality: dict[str, Any], paths: dict[str, str], *, is_census: bool = True) -> list[str]:
-    """Return a line for each doubt about a pair; ``is_census``: it is matched with the penalties for clean images."""
+    """Return the warnings about a pair; ``is_census``: it is matched with the penalties for clean images."""
     lines = [
         f"{paths[side]}: {100 * collar['share']:.0f} % of the pixels are exactly {collar['value']:g}, along its "
-        f"borders, and no no-data value is declared: --{side}-nodata {collar['value']:g}?"
+        f"borders, and no no-data value is declared: if they are no data, give --{side}-nodata {collar['value']:g}"
         for side, collar in quality["collars"].items()
     ]
     if abs(quality["row_offset"] or 0) > _ROW_OFFSET:
@@ -87,20 +87,20 @@ def doubts(quality: dict[str, Any], paths: dict[str, str], *, is_census: bool = 
         )
     if (quality["noise"] or 0) > _NOISE and is_census:
         lines.append(
-            f"{paths['left']} and {paths['right']}: matches differ {quality['noise']:.2f} times as much as random "
-            "pixels, the pair is noisy: --preset satellite has penalties for such images, calibrate --tune finds some"
+            f"{paths['left']} and {paths['right']}: matching pixels differ {quality['noise']:.2f} times as much as "
+            "random pixels, the pair is noisy: try --preset satellite, or find penalties with calibrate --tune"
         )
     return lines
 
 
 def _ends(counts: dict[str, Any], search: Disparity) -> str:
-    """Return a line that names a wider range if many disparities lie at the ends of the range, else nothing."""
+    """Return a line that names a wider range if many disparities are at the ends of the range, else nothing."""
     low, high = (counts["range_ends"][end] / max(1, counts["valid"]) for end in ("minimum", "maximum"))
     if low + high <= _AT_ENDS:
         return ""
     more = max(_SHORT_RANGE, search.count // 2)
     wider = search.minimum - more * (low > _AT_END), search.maximum + more * (high > _AT_END)
     return (
-        f"{100 * (low + high):.1f} % of valid disparities lie at {search.minimum} or {search.maximum}, the ends of the "
-        f"search range: try --disparity {wider[0]} {wider[1]}"
+        f"{100 * (low + high):.1f} % of the valid disparities are within 1 px of {search.minimum} or {search.maximum}, "
+        f"the ends of the search range: try --disparity {wider[0]} {wider[1]}"
     )

@@ -71,7 +71,7 @@ class Schedule:
     ) -> None:
         """Order the steps that ``waiting`` blocks need.
 
-        ``is_done`` tells by their names which borders are done; None: blocks are independent of each other.
+        ``is_done`` says whether the borders of a name are done; None: blocks are independent of each other.
         ``together`` is the number of tiles along each side of a block.
         """
         self._open: dict[Step, int] = {}  # number of unfinished steps that each needs
@@ -127,9 +127,10 @@ class Schedule:
                         self._queue(other).append(other)
 
     def failed(self, step: Step) -> bool:
-        """Note that a step cannot be done, nor those that need it; return False if its block under way makes up for it.
+        """Note that a step failed, and with it the steps that need it; return False if its block gives the same result.
 
-        What a block would have given is traced instead.
+        That is so for the last wavefront of a block that is being matched. What a failed block would have given is
+        traced instead.
         """
         self._under_way.discard(step)
         last = Step(step.block, LAST)

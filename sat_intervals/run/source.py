@@ -1,4 +1,4 @@
-"""What a step computes with: the pixels of a block and the costs of its tiles, new or kept by an earlier step."""
+"""Provide the input of a step: pixels of a block and costs of its tiles, computed now or kept by an earlier step."""
 
 from typing import NamedTuple
 

@@ -17,7 +17,7 @@ from sat_intervals.errors import RunError
 from sat_intervals.machine import usable_cores
 from sat_intervals.store.folder import LocalFolder, folder_at
 
-# Seconds between two times that the caller is asked for more tasks, while none ends.
+# Seconds after which the caller is asked for more tasks, if no task has ended.
 CHECK_EVERY = 2.0
 _FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
@@ -53,7 +53,7 @@ class Outcome(NamedTuple):
 
 
 class Workers(Protocol):
-    """Whatever runs tasks."""
+    """Interface of what runs tasks: threads of this process or a dask cluster."""
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
         """Run tasks with two in flight per core; yield their outcomes, and None every few seconds without one.

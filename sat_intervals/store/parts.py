@@ -2,7 +2,7 @@
 
 The worker that makes a part writes its contents and then its record, with sizes and checksums. A part is done if its
 record is intact and its contents have these sizes. The names of parts have a digest of all that decides their bytes,
-such as the median and the versions of the codecs: parts of other settings are no parts of a run.
+such as the median and the versions of the codecs: parts made with other settings do not belong to the run.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

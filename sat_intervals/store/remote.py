@@ -56,7 +56,7 @@ class RemoteFolder:
             found = system.cat_ranges(paths, starts, stops, on_error="return")
         contents: list[bytes | None] = []
         for (name, start, stop), read in zip(parts, found, strict=True):
-            if isinstance(read, Exception):  # missing, or shorter than `start`, which services refuse: now it is told
+            if isinstance(read, Exception):  # missing, or shorter than `start`, which services refuse: now it is known
                 content = self.read_bytes(name)
                 contents.append(None if content is None else content[start:stop])
             else:

@@ -50,7 +50,7 @@ class Steps:
         return None if content is None else _parsed(content, f"{self.run}/{kind}/{name}", wanted)
 
     def intact(self, kind: str) -> Callable[[str], bool]:
-        """Return a function that tells whether a file was written and is not damaged."""
+        """Return a function that returns whether a file was written and is not damaged."""
         there = self.folder.inside(kind).sizes().keys()
 
         @cache

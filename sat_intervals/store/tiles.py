@@ -165,7 +165,7 @@ class Store:
         except OSError as error:
             raise StoreError(
                 f"{folder} cannot be used: {error.strerror or error}: check the path or URL, the credentials, and "
-                "whether the package of its file system is installed (sat-intervals[remote] for s3://)"
+                "whether the package of its file system is installed (pip install 'sat-intervals[remote]' for s3://)"
             ) from error
 
     def _place_before(self, overwrite: bool) -> Folder | None:

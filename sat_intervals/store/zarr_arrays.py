@@ -46,7 +46,7 @@ _COMPRESSOR = BloscCodec(cname="lz4", clevel=1, shuffle="shuffle")
 STORED_BYTES = 12
 
 Checksums = Mapping[str, Sequence[int]]
-"""Size in bytes and CRC-32 of files, by name; of shards, then those of their pieces and of the index behind them."""
+"""Size in bytes and CRC-32 of files, by name; of shards, then those of their pieces and of the index after them."""
 
 
 class DamagedFileError(Exception):

@@ -108,11 +108,14 @@ def test_load_calibration__names_a_missing_file() -> None:
 @pytest.mark.parametrize(
     ("settings", "difference"),
     [
-        ({"cost": {"window": 7}}, "cost.window is 5 there and 7 here"),
-        ({"sgm": {"p2": 64}}, "sgm.p2 is 32 there and 64 here"),
-        ({"median": None}, "median.size is 3 there and null here"),
-        ({"regularization": {"kernel": 7}}, "confidence.kernel is 5 there and 7 here"),
-        ({"cross_check": {"method": "accurate"}}, "cross_check.method is fast there and accurate here"),
+        ({"cost": {"window": 7}}, "cost.window is 5 in the calibration and 7 in the settings"),
+        ({"sgm": {"p2": 64}}, "sgm.p2 is 32 in the calibration and 64 in the settings"),
+        ({"median": None}, "median.size is 3 in the calibration and null in the settings"),
+        ({"regularization": {"kernel": 7}}, "confidence.kernel is 5 in the calibration and 7 in the settings"),
+        (
+            {"cross_check": {"method": "accurate"}},
+            "cross_check.method is fast in the calibration and accurate in the settings",
+        ),
     ],
 )
 def test_calibration_of__refuses_one_of_other_settings(settings, difference) -> None:
@@ -153,7 +156,7 @@ def test_key_of__of_mccnn_has_the_digest_of_its_weights(tmp_path) -> None:
 
 def test_calibration_of__without_one_names_the_command() -> None:
     config = load_config(RANGE, {"cost": {"window": 9}, "interval": {"coverage": 0.9}})
-    nearest = r"\(that of paper is the nearest: cost.window is 5 there and 9 here, span is .*\)"
+    nearest = r"\(that of paper is the nearest: cost.window is 5 in the calibration and 9 in the settings, span is .*\)"
     with pytest.raises(ConfigError, match=rf"no built-in .* settings {nearest}: .* calibrate"):
         resolved(config)
 

@@ -136,7 +136,7 @@ def test_calibrate_surface__another_datum_is_a_warning_where_the_reference_is_mo
     geoid = write_raster(tmp_path / "geoid.tif", [np.full((60, 60), 52.5)])
     (warning,) = calibrate_surface(model, geoid, "x").provenance["warnings"]
     assert "differ by 47.5 m in the median" in warning
-    with pytest.raises(SatIntervalsError, match=r"differ by 47.5 m .* let it be moved"):
+    with pytest.raises(SatIntervalsError, match=r"differ by 47.5 m .* leave out --no-register"):
         calibrate_surface(model, geoid, "x", registers=False)
 
 
@@ -209,7 +209,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
         (["--dsm", model, "--reference", away], "give a reference of the same place"),
         (
             ["--dsm", model, "--reference", geoid, "--no-register"],
-            "differ by 47.5 m in the median, as those above a geoid",
+            "differ by 47.5 m in the median, as heights above a geoid",
         ),
     ):
         output = [] if "--output" in words else ["--output", tmp_path / "heights.yaml"]
@@ -249,7 +249,7 @@ def test_load_height_calibration__what_it_cannot_use_is_one_line(tmp_path):
         assert "\n" not in str(error.value)
     file.write_text(yaml.safe_dump(given | {"surface": given["surface"] | {"INTERVAL": "envelope"}}))
     with pytest.raises(
-        SatIntervalsError, match=r"belongs to other surfaces, INTERVAL is envelope there and median here"
+        SatIntervalsError, match=r"other surfaces, INTERVAL is envelope in the calibration and median in the surface"
     ):
         load_height_calibration(file).check_surface(given["surface"])
     assert invoke("match", "a", "b", tmp_path, "--coverage", 0.9, "--calibration", file).stderr.count(

@@ -408,10 +408,13 @@ def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tm
         assert dataset.tags()["REGISTERED"] == "no"
         assert dataset.tags()["CALIBRATION"] != tags["CALIBRATION"]
     for changes, message in (
-        (["--resolution", "2"], "belongs to other surfaces, CELL is 1 m there and 2 m here: make one with"),
-        (["--bounds", "mean"], "INTERVAL is median there and mean here"),
-        (["--radius", "1"], "RADIUS is 0.6 m there and 1 m here"),
-        (["--outliers", "9"], "OUTLIERS is null there and 9 m here"),
+        (
+            ["--resolution", "2"],
+            "belongs to other surfaces, CELL is 1 m in the calibration and 2 m in the surface: make one with",
+        ),
+        (["--bounds", "mean"], "INTERVAL is median in the calibration and mean in the surface"),
+        (["--radius", "1"], "RADIUS is 0.6 m in the calibration and 1 m in the surface"),
+        (["--outliers", "9"], "OUTLIERS is null in the calibration and 9 m in the surface"),
         (["--calibration", str(tmp_path / "none.yaml")], "No such file or directory: make one with"),
     ):
         result = invoke(*words, *changes)
@@ -428,7 +431,7 @@ def test_dsm_command__a_calibration_belongs_to_the_calibration_of_the_disparitie
     file = tmp_path / "heights.yaml"
     words = ["dsm", str(out), "--resolution", "1", "--radius", "0.6", "--calibration", str(file)]
     file.write_text(CALIBRATION)
-    assert "DISPARITY_CALIBRATION is null there and satellite" in invoke(*words).stderr
+    assert "DISPARITY_CALIBRATION is null in the calibration and satellite" in invoke(*words).stderr
     of_runs = f"satellite {load_calibration('satellite').sha256}"
     file.write_text(CALIBRATION.replace("{CELL", f"{{DISPARITY_CALIBRATION: {of_runs}, CELL"))
     assert invoke(*words).exit_code == 0

@@ -441,7 +441,7 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     )
     wrong = invoke(*command, "--height-calibration", tmp_path / "heights.yaml")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
-    assert "calibration city belongs to other surfaces, CELL is 9 m there and 1 m here" in wrong.stderr
+    assert "city belongs to other surfaces, CELL is 9 m in the calibration and 1 m in the surface" in wrong.stderr
     monkeypatch.setattr("sat_intervals.heights.dsm.PointCloud", None)  # an error of the last step
     assert invoke(*command).exit_code == 1
     monkeypatch.undo()

@@ -142,7 +142,7 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     output = "--output", tmp_path / "new.yaml"
     assert "needs confidence" in one_line(invoke("calibrate", scene, *output, "--config", off(tmp_path)))
     assert "given 2 times for 1 PAIRS" in one_line(invoke("calibrate", scene, *output, *2 * ("--truth", "a.tif")))
-    assert "options of match" in one_line(invoke("calibrate", scene, *output, "--coverage", 0.9))
+    assert "is an option of match" in one_line(invoke("calibrate", scene, *output, "--coverage", 0.9))
     assert "existing folder" in one_line(invoke("calibrate", scene, "--output", tmp_path / "no" / "new.yaml"))
     assert "truth.tif" in one_line(invoke("calibrate", scene, "--output", scene / "truth.tif"))
     assert "is an input" in one_line(invoke("calibrate", scene, "--output", scene / "meta.json"))

@@ -185,7 +185,7 @@ def test_page__tells_what_the_run_tells(page):
     assert "intervals that contain the truth" in page.text("#headline")
     for selector, words in (
         ("#validity", "rejected by cross-checking: occlusion"),
-        ("#search", "Disparities \u221220 to 10 px, given. Of the valid pixels, 0.0 % lie at the minimum"),
+        ("#search", "Disparities \u221220 to 10 px, given. Of the valid pixels, 0.0 % are within 1 px of the minimum"),
         ("#search", "5.0 % of its pixels are 0"),
         ("#search", "left.tif: 5 % of the pixels are exactly 0"),
         ("#tiles", "6 tiles of 27 x 27 pixels"),

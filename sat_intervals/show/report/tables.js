@@ -120,8 +120,8 @@ function showSearch() {
   const place = find("search");
   const origin = found ? `found from matches on ${percent(found.matched)} of the pixels` : "given";
   place.append(element("p", {}, `Disparities ${short(search.minimum)} to ${short(search.maximum)} px, ${origin}` +
-    `${local ? `; each cell searches ${percent(local.share)} of them in the mean, see the map` : ""}. Of the valid pixels, ` +
-    `${percent(ends.minimum / valid)} lie at the minimum and ${percent(ends.maximum / valid)} at the maximum.`));
+    `${local ? `; each cell searches ${percent(local.share)} of them on average, see the map` : ""}. Of the valid pixels, ` +
+    `${percent(ends.minimum / valid)} are within 1 px of the minimum and ${percent(ends.maximum / valid)} of the maximum.`));
   const rows = [
     ["distance of matches, 1 = random pixels", quality.noise === null ? "none" : fixed(quality.noise, 2)],
     ["offset of the rows", quality.row_offset === null ? "none" : `${fixed(quality.row_offset, 1)} px`],
