@@ -162,6 +162,8 @@ def _explained(error: Exception) -> tuple[int, str]:
     line = " ".join(str(error).split())
     if isinstance(error, SystemError):  # raised by Python for a library that fails without an exception
         return FAILED, f"a library failed without a reason, probably for lack of memory: {_NO_MEMORY} ({line})"
+    if isinstance(error, RuntimeError) and line.startswith("can't start new thread"):
+        return FAILED, f"no more threads can be started: {_NO_MEMORY}, or allow it more processes (ulimit -u)"
     if isinstance(error, RuntimeError) and line.startswith("Symlink loop"):
         return USER_ERROR, f"{line}: it is a link to itself, choose another path"
     if isinstance(error, ValueError) and line.startswith("A dask config file"):

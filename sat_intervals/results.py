@@ -354,8 +354,10 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
 
 def _opened(record: dict[str, Any]) -> Image:
     """Reopen an input image; raise if it has changed since the run."""
-    mask = record["mask"]
-    image = open_image(record["path"], band=record["band"], nodata=_nodata(record), mask=mask and mask["path"])
+    name, mask = record["path"], record["mask"]
+    if name.startswith("/") and not name.startswith("/vsi") and not Path(name).exists():
+        raise SatIntervalsError(f"{name}, an image of the run, is missing: move it back, or put a link to it there")
+    image = open_image(name, band=record["band"], nodata=_nodata(record), mask=mask and mask["path"])
     if (image.height, image.width) != (record["height"], record["width"]):
         raise SatIntervalsError(
             f"{image.path} has {image.height} x {image.width} pixels, but had {record['height']} x {record['width']} "

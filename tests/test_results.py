@@ -40,3 +40,16 @@ def test_commands__name_a_report_that_was_edited(tmp_path, place):
         assert done.exit_code == 2
         assert done.stderr.count("\n") == 1
         assert "run.json is not the report of a run" in done.stderr or "local ranges of the run are dam" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["report", "plot"])
+def test_commands__name_an_image_of_the_run_that_is_missing(tmp_path, command):
+    out = write_run(tmp_path, *random_bands(20, 30))
+    (tmp_path / "left.tif").rename(tmp_path / "moved.tif")
+    done = invoke(command, out)
+    assert done.exit_code == 2
+    assert (
+        f"{tmp_path}/left.tif, an image of the run, is missing: move it back, or put a link to it there" in done.stderr
+    )
+    (tmp_path / "left.tif").symlink_to("moved.tif")
+    assert invoke(command, out).exit_code == 0

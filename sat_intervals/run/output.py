@@ -24,6 +24,7 @@ def check_output(out: Path, overwrite: bool) -> None:
         is_unfinished = is_replacing(home) or finished_run(home) is not None
         is_under_way = is_unfinished or ("run.json" not in there and has_begun(home))
         if there and not overwrite and not is_under_way:
+            check_replaceable(out)
             raise holds_run(out, there)
         if home.is_symlink():
             raise SatIntervalsError(f"{home} is a symbolic link: give the folder of the tiles with --store")

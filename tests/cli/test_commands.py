@@ -332,6 +332,7 @@ def test_match__shows_a_traceback_only_when_asked(folder, tmp_path):
         (OSError(28, "No space left on device", "/there/file"), 1, "/there/file: No space left on device"),
         (OSError(28, "No space left on device"), 1, "sat-intervals: No space left on device"),
         (MemoryError("9 GB"), 1, "not enough memory: choose a smaller --tile-size or fewer --workers (9 GB)"),
+        (RuntimeError("can't start new thread"), 1, "no more threads can be started: not enough memory: choose"),
         (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero (this should not happen; --debug shows where)"),
     ],
 )

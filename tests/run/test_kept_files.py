@@ -708,7 +708,7 @@ def test_match__takes_the_tiles_of_a_user_for_no_run_of_its_own(pair):
     (folder / "out" / "tiles" / "12_34.png").write_text("mine")
     (folder / "out" / "validity.tif").write_text("mine")
     before = contents(folder)
-    with pytest.raises(SatIntervalsError, match=r"already holds a run \(validity.tif\)"):
+    with pytest.raises(SatIntervalsError, match=r"validity.tif exists and was not made by sat-intervals"):
         match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     assert contents(folder) == before
 
