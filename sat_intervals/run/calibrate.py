@@ -1,5 +1,6 @@
 """Calibrations from pairs with truth."""
 
+import logging
 import math
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -15,6 +16,8 @@ from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.run.job import checked_region
 from sat_intervals.run.measure import Subject, check_enough
 from sat_intervals.tiling import Window, strips
+
+_LOG = logging.getLogger(__name__)
 
 
 def check_subjects(subjects: Sequence[Subject]) -> None:
@@ -41,21 +44,28 @@ def check_subjects(subjects: Sequence[Subject]) -> None:
             f"all {len(subjects)} pairs are of group {first.group}, so no other group is left to test the levels on: "
             "leave out --by-group, or give pairs of another group"
         )
-    known = 0
-    for subject in subjects:
-        search, region = subject.config.disparity, checked_region(subject.left, subject.window)
-        here = outside = 0
-        for window in strips(region.height, region.width, STRIP_PIXELS):
-            truth = subject.truth.read(window)
-            here += int(np.isfinite(truth).sum())
-            outside += int(((truth < search.minimum) | (truth > search.maximum)).sum())
-        if 2 * outside > here:
-            raise SatIntervalsError(
-                f"{subject.truth.image.path}: {outside} of {here} truths are outside the search range "
-                f"{search.minimum} to {search.maximum}: check their sign, x_right = x_left + disparity, and the range"
-            )
-        known += here
-    check_enough(known, subjects, "known truths")
+    numbers = [_checked_truths(subject) for subject in subjects]
+    check_enough(sum(known for known, _ in numbers), subjects, "known truths")
+    for subject, (known, whole) in zip(subjects, numbers, strict=True):
+        if known == whole and not subject.tolerance:
+            _LOG.warning("the truth of %s has whole pixels only: try --tolerance 0.5", subject.name)
+
+
+def _checked_truths(subject: Subject) -> tuple[int, int]:
+    """Return the numbers of known truths and of whole ones; raise if most are outside the search range."""
+    search, region = subject.config.disparity, checked_region(subject.left, subject.window)
+    known = outside = whole = 0
+    for window in strips(region.height, region.width, STRIP_PIXELS):
+        truth = subject.truth.read(window)
+        known += int(np.isfinite(truth).sum())
+        outside += int(((truth < search.minimum) | (truth > search.maximum)).sum())
+        whole += int((truth % 1 == 0).sum())
+    if 2 * outside > known:
+        raise SatIntervalsError(
+            f"{subject.truth.image.path}: {outside} of {known} truths are outside the search range "
+            f"{search.minimum} to {search.maximum}: check their sign, x_right = x_left + disparity, and the range"
+        )
+    return known, whole
 
 
 def calibration_from(

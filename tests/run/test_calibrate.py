@@ -266,6 +266,16 @@ def test_check_subjects__needs_another_group_to_judge_with(scene, tmp_path):
     assert "all 2 pairs are of group" in line
 
 
+@pytest.mark.parametrize("tolerance", [0, 0.5])
+def test_calibrate__warns_of_a_truth_in_whole_pixels(scene, tmp_path, tolerance):
+    folder = copytree(scene, tmp_path / "pair")
+    with rasterio.open(folder / "truth.tif", "r+") as file:
+        file.write(np.rint(file.read()))
+    done = invoke("calibrate", folder, "--output", tmp_path / "new.yaml", "--tolerance", tolerance, "--quiet")
+    assert done.exit_code == 0
+    assert ("pair has whole pixels only: try --tolerance 0.5" in done.stderr) == (tolerance == 0)
+
+
 def test_check_subjects__refuses_a_scene_that_counts_twice(scene, tmp_path):
     for out in (tmp_path / "one", tmp_path / "other"):
         match_pair(scene / "left.tif", scene / "right.tif", out, settings_with(scene, coverage=0.9))
