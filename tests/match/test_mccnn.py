@@ -83,13 +83,13 @@ def test_weights_file__names_the_missing_extra(monkeypatch):
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr("sat_intervals.config.weights.files", nowhere)
-    with pytest.raises(SatIntervalsError, match=r"needs the package MCCNN: pip install sat-intervals\[mccnn\]"):
+    with pytest.raises(SatIntervalsError, match=r"needs the package MCCNN: pip install 'sat-intervals\[mccnn\]'"):
         weights_file(None)
 
 
 def test_network__names_the_missing_onnxruntime(network_file, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(SatIntervalsError, match=r"needs onnxruntime: pip install sat-intervals\[mccnn\]"):
+    with pytest.raises(SatIntervalsError, match=r"needs onnxruntime: pip install 'sat-intervals\[mccnn\]'"):
         Network(network_file)
 
 
