@@ -63,31 +63,41 @@ class Comparison:
         assert self.place.pixel_size is not None
         return self.place.pixel_size[0]
 
-    def heights(self, window: Window, finer: int = 1, *, smooth: bool = False) -> np.ndarray:
+    def heights(
+        self, window: Window, finer: int = 1, *, smooth: bool = False, needed: np.ndarray | None = None
+    ) -> np.ndarray:
         """Read the moved reference in a window of cells, which may reach beyond the surface, ``finer`` per side."""
         shape = finer * window.height, finer * window.width
         smooth = smooth or self.shift[:2] != (0.0, 0.0)
-        return self.heights_at(self.place.shifted(window), shape, finer, smooth=smooth)
+        return self.heights_at(self.place.shifted(window), shape, finer, smooth=smooth, needed=needed)
 
     def heights_at(
-        self, place: Georeferencing, shape: tuple[int, int], finer: int = 1, *, smooth: bool = False
+        self,
+        place: Georeferencing,
+        shape: tuple[int, int],
+        finer: int = 1,
+        *,
+        smooth: bool = False,
+        needed: np.ndarray | None = None,
     ) -> np.ndarray:
         """Read the moved reference in ``shape`` cells at a place, ``finer`` of them along each side of its cells.
 
         Raises
         ------
         SatIntervalsError
-            A height is impossible on Earth: a no-data value that the file does not declare, or another unit.
+            A ``needed`` height is impossible on Earth: a no-data value that the file does not declare, or another unit.
+            Others are NaN.
         """
         east, north, up = self.shift
         cells = place.moved(-east, -north).refined(finer)
         heights = read_heights(self.reference, cells, shape, Window(0, 0, *shape), smooth=smooth)
-        if (wrong := heights[(heights < GROUND[0]) | (heights > GROUND[1])]).size:
+        wrong = (heights < GROUND[0]) | (heights > GROUND[1])
+        if needed is not None and (found := heights[wrong & needed]).size:
             raise SatIntervalsError(
-                f"{self.reference} has heights such as {wrong[0]:.0f} m, which no ground has: declare them as no data, "
+                f"{self.reference} has heights such as {found[0]:.0f} m, which no ground has: declare them as no data, "
                 "with gdal_edit.py -a_nodata, or convert the file to metres"
             )
-        return np.asarray(heights + up)
+        return np.where(wrong, np.nan, heights + up)
 
 
 def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
@@ -159,7 +169,7 @@ def compared(given: Comparison, window: Window) -> ComparedCells:
         np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
         for band in read_layers(given.surface, window)[:3].astype(np.float64)
     )
-    reference = given.heights(window, finer)
+    reference = given.heights(window, finer, needed=np.isfinite(height))
     known = np.isfinite(reference) & np.isfinite(height)
     return ComparedCells(height[known], lower[known], upper[known], reference[known], known)
 

@@ -13,6 +13,7 @@ from sat_intervals.raster.images import (
     check_pair,
     open_image,
     other_files,
+    stamps_of,
     watched_images,
     watched_rasters,
 )
@@ -104,6 +105,7 @@ __all__ = [
     "restore",
     "run_files",
     "stamps",
+    "stamps_of",
     "surface_file",
     "truth_file",
     "utm_of",

@@ -17,7 +17,7 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import ChangedInputError, stamp_of, watched
-from sat_intervals.raster.seal import check_seal
+from sat_intervals.raster.seal import check_seal, has_statistics_only
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
@@ -63,7 +63,7 @@ class Image:
     georeferencing
         Georeferencing of the file.
     stamps
-        Stamps of the file and its `other_files` before it was opened, see `identity`; None for one that is not local.
+        `stamps_of` its files before it was opened.
     """
 
     path: str
@@ -106,7 +106,7 @@ def open_image(
         The file has no usable band, or the mask has another size.
     """
     name = _absolute(path)
-    stamps = _stamps(name)
+    stamps = stamps_of(name)
     with opened(name) as dataset:
         _check_watched(name, dataset)
         check_seal(name, dataset.files)
@@ -189,14 +189,21 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
         ) from error
 
 
-def _check_beside(path: str) -> None:
-    """Raise if a file beside a raster, such as a mask, is a pipe: GDAL would wait for it."""
+def _check_beside(path: str, listed: dict[str, list[str]] | None = None) -> None:
+    """Raise if a file beside a raster, such as a mask, is a pipe: GDAL would wait for it.
+
+    ``listed`` keeps such files by folder, so that the folder of many rasters is listed once.
+    """
     folder, name = os.path.split(path)
+    listed = {} if listed is None else listed
+    if folder not in listed:
+        listed[folder] = []
+        with suppress(OSError), os.scandir(folder or ".") as files:
+            listed[folder] = [file.name for file in files if not (file.is_file() or file.is_dir())]
     stem = os.path.splitext(name)[0].lower()
-    with suppress(OSError), os.scandir(folder or ".") as files:
-        for file in files:
-            if file.name.lower().startswith((f"{stem}.", f"{stem}_rpc.")):
-                check_regular(file.path)
+    for other in listed[folder]:
+        if other.lower().startswith((f"{stem}.", f"{stem}_rpc.")):
+            check_regular(os.path.join(folder, other))
 
 
 def _absolute(path: str | os.PathLike[str]) -> str:
@@ -279,15 +286,17 @@ def other_files(name: str) -> list[str]:
     InputError
         GDAL does not list all of them.
     """
-    seen: list[str] = []
+    seen: set[str] = set()
     asked: set[str] = set()
+    listed: dict[str, list[str]] = {}
+    own = Path(name).resolve()
     waiting = [name]
     while waiting:
         path = waiting.pop()
         if path in asked:
             continue
         asked.add(path)
-        _check_beside(path)
+        _check_beside(path, listed)
         check_regular(path)
         try:
             with gdal.reading(path) as dataset:
@@ -296,8 +305,8 @@ def other_files(name: str) -> list[str]:
                 waiting += filter(_may_have_others, _sources(path) if dataset.driver == "VRT" else [])
         except gdal.GDAL_ERRORS:  # a sidecar file that is not a raster
             continue
-        new = [file for file in files if file not in seen and Path(file).resolve() != Path(name).resolve()]
-        seen += new
+        new = [file for file in files if file not in seen and Path(file).resolve() != own]
+        seen.update(new)
         waiting += filter(_may_have_others, new)
     return sorted(seen)
 
@@ -309,15 +318,15 @@ def _may_have_others(name: str) -> bool:
 
 
 def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:
-    """Return what `watched` returns, for rasters and their `other_files`, none of which may appear either."""
+    """Return what `watched` returns, for rasters and their `read_files`, none of which may appear either."""
     names = [str(file) for file in files if file is not None]
-    before = {name: other_files(name) for name in names}
-    check_files = watched(file for name in names for file in (name, *before[name]))
+    before = {name: read_files(name) for name in names}
+    check_files = watched(file for name in names for file in before[name])
 
     def check() -> None:
         check_files()
         for name in names:
-            if other_files(name) != before[name]:
+            if read_files(name) != before[name]:
                 raise ChangedInputError(f"a file beside {name} appeared while it was read: rerun the command")
 
     return check
@@ -334,11 +343,17 @@ def watched_images(images: Iterable[Image]) -> Callable[[], None]:
     images = list(images)
     check = watched_rasters(file for image in images for file in (image.path, image.mask))
     for image in images:
-        if _stamps(image.path) != image.stamps:
+        if stamps_of(image.path) != image.stamps:
             raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: rerun the command")
     return check
 
 
-def _stamps(name: str) -> tuple[str | None, ...]:
-    """Return the stamps of a raster and its `other_files`."""
-    return tuple(stamp_of(file) for file in (name, *other_files(name)))
+def read_files(name: str) -> list[str]:
+    """Return a raster and its `other_files`, but no ``.aux.xml`` that a program wrote which only showed it."""
+    others = (file for file in other_files(name) if not (file.endswith(".aux.xml") and has_statistics_only(Path(file))))
+    return [name, *others]
+
+
+def stamps_of(name: str) -> tuple[str | None, ...]:
+    """Return the stamps of the `read_files` of a raster, see `identity`; None for one that is not local."""
+    return tuple(map(stamp_of, read_files(name)))

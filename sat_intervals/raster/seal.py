@@ -76,14 +76,15 @@ def check_beside(path: str | Path, files: Iterable[str]) -> None:
         Names the first such file.
     """
     for file in files:
-        if Path(file) != Path(path) and not (file.endswith(".aux.xml") and _has_statistics_only(Path(file))):
+        if Path(file) != Path(path) and not (file.endswith(".aux.xml") and has_statistics_only(Path(file))):
             raise SatIntervalsError(f"{file} changes what is read from {path}: move it away")
 
 
-def _has_statistics_only(file: Path) -> bool:
+def has_statistics_only(file: Path) -> bool:
+    """Return whether an ``.aux.xml`` has nothing but statistics, as GDAL and QGIS write them for a raster they show."""
     try:
         elements = list(ElementTree.parse(file).iter())
-    except ElementTree.ParseError:
+    except (ElementTree.ParseError, OSError):
         return False
     keys = [element.get("key", "") for element in elements if element.tag == "MDI"]
     return {element.tag for element in elements} <= _STATISTICS and all(key.startswith("STATISTICS_") for key in keys)

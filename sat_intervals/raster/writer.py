@@ -130,7 +130,7 @@ class OutputWriter:
     def _check_hidden(self) -> None:
         """Raise if folders of temporary files are links, or have files of their names that no killed process left."""
         self._check_links()
-        is_ours = (self._hidden / _MADE).exists()
+        is_ours = (self._hidden / _MADE).exists() or LocalFolder(self._hidden).has_lock()
         if not is_ours and (foreign := next(self._unfinished(), None)):
             raise OutputError(f"{foreign} was not written by sat-intervals: move {self._hidden} away")
 

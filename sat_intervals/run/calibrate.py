@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from sat_intervals.match.measurement import Measured, ladder
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.run.job import checked_region
 from sat_intervals.run.measure import Subject, check_enough
-from sat_intervals.tiling import Window, strips
+from sat_intervals.tiling import strips
 
 _LOG = logging.getLogger(__name__)
 
@@ -23,9 +24,10 @@ _LOG = logging.getLogger(__name__)
 def check_subjects(subjects: Sequence[Subject]) -> None:
     """Raise if subjects cannot be calibrated together: settings without confidence, other settings, too few truths."""
     first = subjects[0]
-    scenes: dict[tuple[str, Window | None], str] = {}
+    scenes: dict[Any, str] = {}
     for subject in subjects:
-        if (same := scenes.setdefault((subject.left.path, subject.window), subject.name)) != subject.name:
+        scene = *((image.path, image.band) for image in (subject.left, subject.right)), subject.window
+        if (same := scenes.setdefault(scene, subject.name)) != subject.name:
             raise SatIntervalsError(f"{same} and {subject.name} are the same scene: give each scene once")
         if subject.config.disparity.is_auto:
             raise SatIntervalsError(f"{subject.name}: the search range is auto, but calibrate needs it as numbers")

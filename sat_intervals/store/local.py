@@ -237,6 +237,13 @@ class LocalFolder:
             os.close(lock)
         return False
 
+    def has_lock(self) -> bool:
+        """Return whether a process locks the folder, or was killed while it did."""
+        with suppress(OSError):
+            lock = (self.path / _LOCK).lstat()
+            return stat.S_ISREG(lock.st_mode) and not lock.st_size
+        return False
+
     @contextmanager
     def scratch(self, name: str) -> Iterator[Path]:
         """Yield a hidden folder for temporary files, new in this one; delete it after the block.
@@ -245,8 +252,7 @@ class LocalFolder:
         """
         for left in self.path.glob(f".{escape(name)}-*"):
             with suppress(OSError, SatIntervalsError):  # it is in use, or cannot be deleted
-                lock = (left / _LOCK).lstat()
-                if not left.is_symlink() and stat.S_ISREG(lock.st_mode) and not lock.st_size:
+                if not left.is_symlink() and LocalFolder(left).has_lock():
                     with LocalFolder(left)._emptied():
                         pass
         with LocalFolder(Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)))._emptied() as files:

@@ -66,6 +66,15 @@ def test_evaluate_surface__warns_of_a_surface_that_is_upside_down(tmp_path):
     assert not evaluate_surface(surface, write_raster(tmp_path / "b.tif", [height]), registers=False)["warnings"]
 
 
+def test_evaluate_surface__needs_a_ground_where_the_surface_has_a_height(tmp_path):
+    nan, reference = np.nan, write_raster(tmp_path / "reference.tif", [[[1.0, -9999, 2]]])
+    known = write_surface(tmp_path / "known.tif", [[1.0, nan, 2]], [[0.0, nan, 1]], [[2.0, nan, 3]])
+    assert evaluate_surface(known, reference, registers=False)["all"]["count"] == 2
+    whole = write_surface(tmp_path / "whole.tif", [[1.0, 1, 2]], [[0.0, 0, 1]], [[2.0, 2, 3]])
+    with pytest.raises(SatIntervalsError, match=r"reference\.tif has heights such as -9999 m, which no ground has"):
+        evaluate_surface(whole, reference, registers=False)
+
+
 def relief(row, column):
     return 500 + 8 * np.sin(0.1 * column + 0.03 * row) + 5 * np.cos(0.08 * row - 0.02 * column)
 

@@ -689,11 +689,12 @@ def test_output_writer__keeps_what_was_there_until_publish(tmp_path, products):
     np.testing.assert_array_equal(look(tmp_path / "intervals.tif"), products[0])
 
 
-def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products):
+@pytest.mark.parametrize("mark", [".sat-intervals.files", ".sat-intervals.lock"])
+def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products, mark):
     (tmp_path / ".unpublished-intervals.tif" / "files" / "replaced").mkdir(parents=True)
     for name in ("strips-intervals.tif", "validity.tif", "run.json", "replaced/intervals.tif"):
         (tmp_path / ".unpublished-intervals.tif" / "files" / name).write_text("half")
-    (tmp_path / ".unpublished-intervals.tif" / ".sat-intervals.files").touch()
+    (tmp_path / ".unpublished-intervals.tif" / mark).touch()
     produce(tmp_path, products)
     assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
 

@@ -1,5 +1,6 @@
 """Calibrations of demo scenes: through the engine, against runs with them, and from mistaken inputs."""
 
+import dataclasses
 import json
 import os
 from shutil import copytree
@@ -281,6 +282,9 @@ def test_check_subjects__refuses_a_scene_that_counts_twice(scene, tmp_path):
         match_pair(scene / "left.tif", scene / "right.tif", out, settings_with(scene, coverage=0.9))
     line = one_line(invoke("calibrate", tmp_path / "one", tmp_path / "other", "--output", tmp_path / "new.yaml"))
     assert f"{tmp_path}/one and {tmp_path}/other are the same scene: give each scene once" in line
+    (one,) = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    third = open_image(copytree(scene, tmp_path / "third") / "right.tif")
+    check_subjects([one, dataclasses.replace(one, name="a triplet", group="another", right=third)])
 
 
 MCCNN = [pytest.param(preset, marks=pytest.mark.peer("onnxruntime")) for preset in PRESETS if "mccnn" in preset]

@@ -64,6 +64,13 @@ VRT = """<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType=
 <SourceFilename relativeToVRT="1">mask.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
 
 
+NODATA = '<PAMDataset><PAMRasterBand band="1"><NoDataValue>7</NoDataValue></PAMRasterBand></PAMDataset>'
+STATISTICS = (
+    '<PAMDataset><PAMRasterBand band="1"><Metadata><MDI key="STATISTICS_MEAN">7</MDI></Metadata></PAMRasterBand>'
+    "</PAMDataset>"
+)
+
+
 @pytest.fixture(scope="module")
 def scene():
     return make_scene(80, 100, seed=2)
@@ -317,11 +324,20 @@ def test_watched_rasters__sees_a_changed_source_and_a_new_file(pair, name):
         check()
 
 
+def test_prepare__takes_an_image_that_was_shown_since_it_was_opened(pair):
+    folder, settings = pair
+    left, right = open_image(folder / "left.tif"), open_image(folder / "right.tif")
+    (folder / "left.tif.aux.xml").write_text(STATISTICS)
+    prepare(left, right, folder / "out", settings)
+
+
 def test_watched_rasters__sees_a_file_that_appears_beside_one(pair):
     folder, _ = pair
     check = watched_rasters([folder / "left.tif"])
     check()
-    (folder / "left.tif.aux.xml").write_text("<PAMDataset/>")
+    (folder / "left.tif.aux.xml").write_text(STATISTICS)
+    check()
+    (folder / "left.tif.aux.xml").write_text(NODATA)
     with pytest.raises(ChangedInputError, match=r"a file beside .*left\.tif appeared while it was read"):
         check()
 
@@ -369,8 +385,7 @@ def test_prepare__refuses_an_image_that_got_another_file_since_it_was_opened(pai
     if ending == ".msk":
         shutil.copy(folder / "mask.tif", folder / "left.tif.msk")
     else:
-        nodata = '<PAMDataset><PAMRasterBand band="1"><NoDataValue>7</NoDataValue></PAMRasterBand></PAMDataset>'
-        (folder / "left.tif.aux.xml").write_text(nodata)
+        (folder / "left.tif.aux.xml").write_text(NODATA)
     with pytest.raises(ChangedInputError, match=r"left.tif or a file beside it was replaced or changed since it was"):
         prepare(left, right, folder / "out", settings)
 
