@@ -1144,6 +1144,26 @@ def test_match__keeps_the_run_to_replace_until_the_new_one_exists(runs, tmp_path
     assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
 
 
+def test_match__takes_no_run_that_was_copied_there_for_its_own(runs, tmp_path, monkeypatch):
+    folder, images, settings, _ = runs
+    out, publish = tmp_path / "out", OutputWriter.publish
+
+    def publish_after_a_copy(*arguments, **options):
+        for name in NAMES:
+            shutil.copy(folder / "two" / name, out)
+        publish(*arguments, **options)
+
+    monkeypatch.setattr(OutputWriter, "publish", publish_after_a_copy)
+    with pytest.raises(RunError, match="is not of this run"):
+        match_pair(*images, out, settings)
+    monkeypatch.undo()
+    copied = {name: (out / name).read_bytes() for name in NAMES}
+    with pytest.raises(SatIntervalsError, match=r"intervals\.tif was changed after the run, but the tiles still exist"):
+        match_pair(*images, out, settings)
+    assert {name: (out / name).read_bytes() for name in NAMES} == copied
+    assert list((out / "tiles" / "records").iterdir())
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_match__overwrites_no_file_where_there_is_no_run(runs, tmp_path, name):
     folder, images, *_ = runs
