@@ -57,8 +57,15 @@ _SETTINGS = """\
 @json_option
 @partial(
     settings_options,
-    coverage="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
-    hides_calibration=True,
+    levels=(
+        click.option(
+            "--coverage",
+            type=float,
+            metavar="C",
+            help="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
+        ),
+        click.option("--calibration", metavar="FILE", hidden=True, help="An option of match: refused, with a hint."),
+    ),
 )
 @quiet_option
 @log_options

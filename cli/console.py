@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
 from sat_intervals.cli import signals
+from sat_intervals.cli.options import PICTURES
 
 STAGES = {
     "scene": "making a scene",
@@ -35,8 +36,7 @@ STAGES = {
 
 
 # Files that other commands write to the folder of a run.
-_PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
-_MADE_FROM_RUNS = ("points.tif", "dsm.tif", "report.html", "project.qgz", "stac.json", *(f"{n}.png" for n in _PICTURES))
+_MADE_FROM_RUNS = ("points.tif", "dsm.tif", "report.html", "project.qgz", "stac.json", *(f"{n}.png" for n in PICTURES))
 
 
 def _is_older(file: Path, other: Path) -> bool:

@@ -1,6 +1,6 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -156,7 +156,17 @@ _SEARCH_OPTIONS = (
         "--range-grid", callback=named, metavar="FILE", help="Raster of two bands, minimum and maximum of each pixel."
     ),
 )
-_COVERAGE = "Share of true disparities to be inside, .5 to .99, instead of alpha."
+_LEVEL_OPTIONS = (
+    click.option(
+        "--coverage",
+        type=float,
+        metavar="C",
+        help="Share of true disparities to be inside, .5 to .99, instead of alpha.",
+    ),
+    click.option(
+        "--calibration", callback=named, metavar="FILE", help="Calibration for --coverage; default the built-in one."
+    ),
+)
 _FIRST_SETTINGS = (
     click.option(
         "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
@@ -194,10 +204,10 @@ _PLACES = {
 }
 
 
-def settings_options(command: Command, coverage: str = _COVERAGE, hides_calibration: bool = False) -> Command:
+def settings_options(command: Command, levels: Sequence[Callable[[Command], Command]] = _LEVEL_OPTIONS) -> Command:
     """Add options for settings; the command gets ``settings``, a `SettingsArguments`.
 
-    ``coverage`` is the help of its option. A command that refuses --calibration hides it.
+    ``levels`` are the options --coverage and --calibration, where they mean something else than in `match`.
     """
 
     @wraps(command)
@@ -214,19 +224,7 @@ def settings_options(command: Command, coverage: str = _COVERAGE, hides_calibrat
             sections["cluster"] = sections.get("cluster", {}) | chosen
         return command(settings=SettingsArguments(config_file, sections, names), **others)
 
-    return with_options(
-        with_settings,
-        *_FIRST_SETTINGS,
-        click.option("--coverage", type=float, metavar="C", help=coverage),
-        click.option(
-            "--calibration",
-            callback=named,
-            metavar="FILE",
-            hidden=hides_calibration,
-            help="Calibration for --coverage; default the built-in one.",
-        ),
-        *_LAST_SETTINGS,
-    )
+    return with_options(with_settings, *_FIRST_SETTINGS, *levels, *_LAST_SETTINGS)
 
 
 def search_options(command: Command) -> Command:

@@ -14,6 +14,9 @@ from sat_intervals.cli.logs import logged
 COSTS = ("census", "mccnn")
 PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homogeneous", "mccnn")
 
+# Pictures that `plot` writes to the folder of a run, without their ending.
+PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
+
 Command = Callable[..., Any]
 
 

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.judging import finite
-from sat_intervals.cli.options import log_options
+from sat_intervals.cli.options import PICTURES, log_options
 
 if TYPE_CHECKING:
     from sat_intervals.results import Results
 
 _FILE = click.Path(path_type=Path)
-_PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
@@ -71,7 +70,7 @@ def plot(
     is_judged = None not in (results.truth, results.config.interval)
     if beside and not is_judged:
         raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
-    results.check_kept([out / f"{name}.png" for name in _PICTURES], [truth, out / "dsm.tif"])
+    results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
     if is_judged:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)

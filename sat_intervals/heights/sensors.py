@@ -12,7 +12,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.grids import read_grid
 from sat_intervals.kernels.lattice import interpolate
-from sat_intervals.raster import Georeferencing, watched_rasters
+from sat_intervals.raster import GROUND, Georeferencing, watched_rasters
 from sat_intervals.tiling import Window
 
 try:
@@ -30,8 +30,6 @@ _AT_ONCE = 100_000
 _CHECKED = 9
 # Metres: lines of sight of one scene meet within centimetres, those of two scenes miss by hundreds of metres.
 _FOREIGN_RESIDUAL = 10.0
-# Range of ground heights on Earth, metres above the ellipsoid.
-_GROUND = -600.0, 9500.0
 
 
 class Points(NamedTuple):
@@ -236,7 +234,7 @@ def _median_residual(sensors: Sensors, region: Window, minimum: int, maximum: in
             "across the 180th meridian"
         )
     residual, height = float(np.median(points[:, 3])), float(np.median(points[:, 2]))
-    if not (residual <= _FOREIGN_RESIDUAL and _GROUND[0] <= height <= _GROUND[1]):
+    if not (residual <= _FOREIGN_RESIDUAL and GROUND[0] <= height <= GROUND[1]):
         raise SatIntervalsError(
             f"the models do not fit these images: lines of sight miss each other by {residual:.1f} m at a height "
             f"of {height:.0f} m (medians): check which model and which grid belong to the left and the right image"
