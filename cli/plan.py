@@ -45,6 +45,7 @@ def plan(pair: PairArguments, settings: SettingsArguments, memory: str | None, a
     seams = "exact seams" if is_exact else f"overlap {config.tiles.overlap} px"
     at_once = "1 tile" if made.workers == 1 else f"{made.workers} tiles"
     lines = {
+        "search range": f"{made.search_range[0]} to {made.search_range[1]} px",
         "tiles": f"{made.tiles} of {made.tile_size} px{smaller}, {seams}",
         f"extra work of the {'seams' if is_exact else 'overlap'}": f"{100 * made.extra_work:.0f} %",
         "memory of a worker": f"{made.worker_bytes / 1e6:.0f} MB{one}",

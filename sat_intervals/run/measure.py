@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.config import Calibration, Config, Interval, key_of
+from sat_intervals.config import Calibration, Config, Interval, Mccnn, key_of
 from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ladder, measure
@@ -28,6 +29,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, Layer, open_image, watched_images
+from sat_intervals.raster.identity import watched
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
 from sat_intervals.run.scale import checked_scale
@@ -119,7 +121,9 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
         Tiles failed.
     """
     found: list[Measured] = []
-    check_unchanged = watched_images(subject.truth.image for subject in subjects)
+    cost = subjects[0].config.cost
+    check_truths = watched_images(subject.truth.image for subject in subjects)
+    check_weights = watched([weights_file(cost.weights)] if isinstance(cost, Mccnn) else [])
     levels = ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with (
@@ -130,7 +134,8 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
             found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
-    check_unchanged()
+    check_truths()
+    check_weights()  # between subjects: each job checks its own
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found

@@ -38,6 +38,8 @@ class Plan:
 
     Attributes
     ----------
+    search_range
+        Smallest and largest disparity in pixels.
     tile_size, tiles
         Side of a core in pixels, reduced to fit in memory, and number of tiles.
     workers
@@ -54,6 +56,7 @@ class Plan:
         Time estimated from the sample.
     """
 
+    search_range: tuple[int, int]
     tile_size: int
     tiles: int
     workers: int
@@ -116,6 +119,7 @@ def plan(
     waiting = readers(config.cluster) * waiting_bytes(config)
     task = max(tile_bytes(config), strip_bytes(*strip, config.products.compression))
     return Plan(
+        search_range=(int(config.disparity.minimum), int(config.disparity.maximum)),
         tile_size=config.tiles.size,
         tiles=len(grid),
         workers=workers,

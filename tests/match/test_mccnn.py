@@ -12,7 +12,7 @@ import reference
 from helpers import bands, hashes, invoke, write_pair
 from networks import random_weights, slow_features, trained_network, write_network
 
-from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair
+from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair, open_image
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.config.weights import weights_file
 from sat_intervals.demo import make_scene
@@ -26,6 +26,7 @@ from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.results import open_results
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
+from sat_intervals.run.measure import Subject, measure_subjects, truth_of
 from sat_intervals.run.tile import match_block
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.tiling import Window
@@ -374,6 +375,21 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     write_network(file, random_weights(seed=1))
     with pytest.raises(SatIntervalsError, match=r"network\.onnx differs in sha256 from .* of the run"):
         match_block(job, next(iter(job.store.grid)))
+
+
+def test_measure_subjects__other_weights_between_two_pairs_are_noticed(tmp_path):
+    write_pair(tmp_path, make_scene(60, 80))
+    file = write_network(tmp_path / "network.onnx", random_weights())
+    left, right = (open_image(tmp_path / name) for name in ("left.tif", "right.tif"))
+    config = settings(-4, 6, file)
+    subject = Subject("one", "one", left, right, truth_of(left, tmp_path / "truth.tif"), config)
+
+    def exchange_for_a_moment(stage, done, total):
+        if (stage, done) == ("tiles", total):
+            file.write_bytes(file.read_bytes())
+
+    with pytest.raises(RunError, match=r"network\.onnx was replaced or changed while it was read: rerun the command"):
+        measure_subjects([subject], tmp_path, exchange_for_a_moment)
 
 
 @pytest.mark.parametrize("name", ["int8", "fp32"])

@@ -475,6 +475,7 @@ def test_plan__prints_what_a_run_will_take(images):
     result = invoke("plan", *pair, "--memory", "400MB", "--workers", "3")
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith("preparing kernels")
+    assert re.search(r"search range: +-18 to 40 px\n", result.stdout)
     assert "expected time, 3 tiles at once" in result.stdout
     assert "smaller than set, to fit: give --tile-size " in result.stdout
     assert re.search(r"memory of a worker: +\d+ MB, fits in 400 MB\n", result.stdout)
