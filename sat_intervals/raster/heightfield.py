@@ -5,6 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from rasterio.io import DatasetReader
 from rasterio.transform import Affine
 
 from sat_intervals.errors import SatIntervalsError
@@ -15,6 +16,8 @@ from sat_intervals.tiling import Window
 
 # Heights of the ground on Earth in metres; others are no-data values that the file does not declare.
 GROUND = -600.0, 9500.0
+# Names of the metre in the unit of a band; without one heights are taken for metres.
+_METRE = "", "m", "metre", "metres", "meter", "meters"
 # Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
 _BLOCK, _KEPT = 512, 128
 
@@ -43,10 +46,12 @@ class HeightRaster:
         with opened(self._image.path) as dataset:
             own = dataset.crs.to_wkt() if dataset.crs else None
             self._scale, self._offset = dataset.scales[0], dataset.offsets[0]
-            level = dataset.tags().get("HEIGHTS", "")
+            level, unit = dataset.tags().get("HEIGHTS", ""), other_unit(dataset)
         if place.transform is None:
             raise SatIntervalsError(f"{path} has no transform from pixels to its CRS: give a georeferenced raster")
         self.frame = Frame(str(path), crs or own, vertical, level)
+        if unit and self.frame.unit == 1:
+            raise SatIntervalsError(f"{path} has heights in {unit}: convert them to metres")
         self._to_cells: Affine = ~place.transform
         self.shape = self._image.height, self._image.width
         """Rows and columns."""
@@ -79,3 +84,9 @@ class HeightRaster:
         heights = (pixels * self._scale + self._offset).astype(np.float32)
         metres = heights * self.frame.unit
         return np.where((state == 0) & (metres >= GROUND[0]) & (metres <= GROUND[1]), heights, np.float32(np.nan))
+
+
+def other_unit(dataset: DatasetReader) -> str | None:
+    """Return the unit of the heights in the first band if it is not the metre."""
+    unit = (dataset.units[0] or "").strip()
+    return None if unit.lower() in _METRE else unit

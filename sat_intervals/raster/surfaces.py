@@ -15,6 +15,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
+from sat_intervals.raster.heightfield import other_unit
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.seal import check_seal
 from sat_intervals.tiling import Window
@@ -46,15 +47,15 @@ def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
 
 
 def check_reference(path: Path, surface: Path) -> None:
-    """Raise if reference heights cannot be resampled to a surface model, or have another vertical datum.
+    """Raise if reference heights cannot be resampled to a surface model, or have another unit or vertical datum.
 
     Raises
     ------
     SatIntervalsError
-        The CRS is local, or has heights above a geoid while the surface has heights above the ellipsoid.
+        The CRS is local, heights are not in metres, or above a geoid while the surface has heights above the ellipsoid.
     """
     with opened(str(path)) as dataset:
-        crs = pyproj.CRS.from_wkt(dataset.crs.to_wkt())
+        crs, unit = pyproj.CRS.from_wkt(dataset.crs.to_wkt()), other_unit(dataset)
     with opened(str(surface)) as dataset:
         level = dataset.tags().get("HEIGHTS", "")
     parts = crs.sub_crs_list if crs.is_compound else [crs]
@@ -62,6 +63,10 @@ def check_reference(path: Path, surface: Path) -> None:
         raise SatIntervalsError(
             f"the CRS of {path}, {crs.name}, is a local one: give a reference with a CRS of the Earth"
         )
+    if len(crs.axis_info) > 2 and crs.axis_info[2].unit_conversion_factor != 1:
+        unit = crs.axis_info[2].unit_name
+    if unit:
+        raise SatIntervalsError(f"{path} has heights in {unit}: convert them to metres")
     if len(parts) > 1 and level.endswith("ellipsoid") and "ellipsoid" not in parts[1].name.lower():
         raise SatIntervalsError(
             f"{path} has heights of {parts[1].name}, {surface} heights {level}: make the surface with --geoid, or "

@@ -276,3 +276,12 @@ def test_evaluate_surface__refuses_a_reference_of_a_local_crs(tmp_path):
     reference = write(tmp_path / "reference.tif", np.full((9, 9), 10, np.float32), crs=LOCAL)
     with pytest.raises(SatIntervalsError, match=r"the CRS of .*reference.tif, site grid, is a local one: give a"):
         evaluate_surface(dsm(tmp_path / "dsm.tif", "above the WGS 84 ellipsoid"), reference)
+
+
+@pytest.mark.parametrize(("crs", "unit"), [("EPSG:32631", "ft"), ("EPSG:32631+6360", None)])
+def test_evaluate_surface__refuses_a_reference_in_feet(tmp_path, crs, unit):
+    reference = write(tmp_path / "reference.tif", np.full((9, 9), 10, np.float32), crs=crs)
+    with rasterio.open(reference, "r+") as dataset:
+        dataset.units = (unit,) if unit else dataset.units
+    with pytest.raises(SatIntervalsError, match=r"reference.tif has heights in (ft|US survey foot): convert them to m"):
+        evaluate_surface(dsm(tmp_path / "dsm.tif", "above egm96.gtx"), reference)

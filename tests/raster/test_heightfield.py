@@ -92,3 +92,15 @@ def test_height_raster__says_what_is_missing(tmp_path):
         with pytest.raises(SatIntervalsError) as error:
             HeightRaster(path, crs, vertical)
         assert message in str(error.value)
+
+
+@pytest.mark.parametrize(("unit", "is_metre"), [("ft", False), ("US survey foot", False), ("metre", True), ("m", True)])
+def test_height_raster__refuses_bands_in_feet(tmp_path, unit, is_metre):
+    path = write(tmp_path / "a.tif", np.zeros((5, 7), np.float32))
+    with rasterio.open(path, "r+") as dataset:
+        dataset.units = (unit,)
+    if is_metre:
+        HeightRaster(path, None, ELLIPSOID)
+        return
+    with pytest.raises(SatIntervalsError, match=f"a.tif has heights in {unit}: convert them to metres"):
+        HeightRaster(path, None, ELLIPSOID)
