@@ -35,15 +35,15 @@ def check_output(out: Path, overwrite: bool) -> None:
 
 
 def check_replaceable(out: Path) -> None:
-    """Raise if a folder has files with the names of a run's files, but none that a run made.
+    """Raise if a folder has a file with the name of a run's file that no run made.
 
     Call it before overwriting.
     """
-    there = [out / name for name in OUTPUTS if (out / name).exists()]
-    if there and not any(_is_of_run(file) for file in there):
-        raise SatIntervalsError(
-            f"{there[0]} exists and was not made by sat-intervals, or is damaged: move it away or choose another folder"
-        )
+    for file in (out / name for name in OUTPUTS):
+        if file.exists() and not _is_of_run(file):
+            raise SatIntervalsError(
+                f"{file} exists and was not made by sat-intervals, or is damaged: move it away or choose another folder"
+            )
 
 
 def _is_of_run(file: Path) -> bool:

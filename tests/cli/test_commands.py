@@ -717,10 +717,15 @@ def test_match__nodata_of_the_command_line_takes_the_place_of_the_files_own(fold
 
 def test_match__overwrites_when_asked(folder, tmp_path):
     out = tmp_path / "out"
-    out.mkdir()
-    for name in OUTPUTS:
-        (out / name).write_text('{"settings": {}, "inputs": {}, "tiles": {}}')  # a run whose bands are damaged
+    assert invoke(*matching(folder, out)).exit_code == 0
     (out / "notes.txt").write_text("mine")
+    for name, own in (("validity.tif", (folder / "left.tif").read_bytes()), ("run.json", b"{}")):
+        of_run = (out / name).read_bytes()
+        (out / name).write_bytes(own)
+        refused = invoke(*matching(folder, out, "--overwrite"))
+        assert (refused.exit_code, f"{out / name} exists and was not made by" in refused.stderr) == (2, True)
+        assert (out / name).read_bytes() == own
+        (out / name).write_bytes(of_run)
     assert invoke(*matching(folder, out, "--overwrite")).exit_code == 0
     assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, "notes.txt"])
     assert (out / "notes.txt").read_text() == "mine"
