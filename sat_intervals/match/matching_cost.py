@@ -85,6 +85,7 @@ def cost_areas(
     areas: Sequence[Area],
     config: Config,
     statistics: PairStatistics | None = None,
+    network: Network | None = None,
     made: Sequence[np.ndarray] | None = None,
 ) -> list[MatchingCost]:
     """Costs and gradients of areas of two views.
@@ -99,13 +100,16 @@ def cost_areas(
         Settings.
     statistics
         Mean and standard deviation of the whole images; None if the matching cost needs none.
+    network
+        Of MC-CNN; by default that of the settings.
     made
         Precomputed costs of the areas from an earlier call, ``Costs.left``, so that they are not computed again.
     """
     if isinstance(config.cost, Mccnn):
         assert statistics is not None  # MC-CNN always comes with statistics
         if made is None:
-            made = _correlations(views, areas, statistics, load_network(weights_file(config.cost.weights)))
+            network = network or load_network(weights_file(config.cost.weights))
+            made = _correlations(views, areas, statistics, network)
         states = [window_state(view.state, RADIUS) for view in views]
         costs = [
             Costs(of_area, None, *_of_area(area, views, states, RADIUS))

@@ -4,6 +4,7 @@ The network maps one normalised band, ``(rows, columns)``, to a unit vector for 
 inside: ``(features, rows - 10, columns - 10)``, a convolution without padding.
 """
 
+import hashlib
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from sat_intervals.config.weights import INSTALL_MCCNN
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster.identity import ChangedInputError
 
 # Radius of the window of a feature, in pixels.
 RADIUS = 5
@@ -22,15 +24,15 @@ _UNIT = 1e-3
 class Network:
     """A network that was checked to have the form above. Any number of threads may call it at once."""
 
-    def __init__(self, file: Path) -> None:
-        """Load and check a network.
+    def __init__(self, file: Path, content: bytes) -> None:
+        """Make a network of the content of a file, and check it; ``file`` is for messages.
 
         Raises
         ------
         SatIntervalsError
             If onnxruntime is not installed, or the network has another form.
         """
-        self._session = _session(file)
+        self._session = _session(file, content)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         form = f"{[i.shape for i in inputs]} to {[o.shape for o in outputs]}"
         if len(inputs) != 1 or len(inputs[0].shape) != 2 or inputs[0].type != "tensor(float)" or len(outputs) != 1:
@@ -49,6 +51,7 @@ class Network:
             if not (np.abs(lengths - 1) <= _UNIT).all():
                 raise _wrong(file, f"gives vectors of length {lengths.min():.3g} to {lengths.max():.3g}, not 1")
         self.count = int(features.shape[0])
+        self.sha256 = hashlib.sha256(content).hexdigest()
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
         """Features ``(count, rows - 10, columns - 10)`` of normalised pixels ``(rows, columns)``, float32.
@@ -63,7 +66,7 @@ class Network:
         return features
 
 
-def _session(file: Path) -> Any:
+def _session(file: Path, content: bytes) -> Any:
     try:
         import onnxruntime
     except ImportError as error:
@@ -72,7 +75,7 @@ def _session(file: Path) -> Any:
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # tiles are the only parallelism
     options.log_severity_level = 4
     try:
-        return onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:
         raise SatIntervalsError(f"{file} is not a valid ONNX network: {' '.join(str(error).split())}") from error
 
@@ -84,12 +87,26 @@ def _wrong(file: Path, what: str) -> SatIntervalsError:
     )
 
 
-def load_network(file: Path) -> Network:
-    """Load the network of a file, once per process and again when the file has changed."""
-    status = file.stat()
-    return _loaded(file, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
+def load_network(file: Path, sha256: str | None = None) -> Network:
+    """Load the network of a file, once per process for the same content.
+
+    The content itself is compared with the ``sha256`` of a run, not the file, which may be another one for a moment.
+
+    Raises
+    ------
+    SatIntervalsError
+        See `Network`.
+    ChangedInputError
+        The content has another SHA-256.
+    """
+    network = _loaded(file, file.read_bytes())
+    if sha256 not in (None, network.sha256):
+        raise ChangedInputError(
+            f"{file} has other weights than the run: restore it, and give all workers the same weights"
+        )
+    return network
 
 
-@lru_cache(maxsize=4)
-def _loaded(file: Path, stamp: tuple[int, ...]) -> Network:
-    return Network(file)
+@lru_cache(maxsize=2)
+def _loaded(file: Path, content: bytes) -> Network:
+    return Network(file, content)

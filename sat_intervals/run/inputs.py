@@ -8,6 +8,7 @@ from typing import Any
 
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
+from sat_intervals.match.mccnn import Network, load_network
 from sat_intervals.raster import Image, other_files, stamps_of
 from sat_intervals.raster.identity import ChangedInputError, identity
 from sat_intervals.store.manifest import differences
@@ -84,21 +85,19 @@ def _weights_identity(cost: Mccnn) -> dict[str, Any]:
     return {**identity(str(weights_file(cost.weights))), "onnxruntime": version("onnxruntime")}
 
 
-def check_weights(cost: Mccnn, wanted: Mapping[str, Any]) -> None:
-    """Raise if this process has other weights or another onnxruntime than the run.
+def network_of(cost: Mccnn, weights: Mapping[str, Any]) -> Network:
+    """Return the network of a run, whose inputs describe its ``weights``.
 
     Raises
     ------
     ChangedInputError
-        Names the file and what differs.
+        This process has other weights or another onnxruntime.
     """
-    here = _weights_identity(cost)
-    for key in ("sha256", "onnxruntime"):
-        if here[key] != wanted[key]:
-            raise ChangedInputError(
-                f"{here['path']} differs in {key} from {wanted['path']} of the run: restore it, and give all workers "
-                "the same weights and onnxruntime"
-            )
+    if (here := version("onnxruntime")) != weights["onnxruntime"]:
+        raise ChangedInputError(
+            f"onnxruntime is {here} here, but the run has {weights['onnxruntime']}: give all workers the same version"
+        )
+    return load_network(weights_file(cost.weights), weights["sha256"])
 
 
 def with_range_of(report: Mapping[str, Any], config: Config) -> Config:

@@ -7,6 +7,7 @@ import numpy as np
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
+from sat_intervals.match.mccnn import Network
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, patch_areas
 from sat_intervals.progress import timed
@@ -20,10 +21,11 @@ from sat_intervals.tiling import Tile, Views, Window, hull
 
 
 class Source(NamedTuple):
-    """Both images in windows that contain those of some tiles, and the image statistics if the cost needs these."""
+    """Both images in windows that contain those of some tiles, with the image statistics and the network of MC-CNN."""
 
     views: Views
     statistics: PairStatistics | None
+    network: Network | None
 
 
 def frame_of(job: Job, tile: Tile) -> Frame:
@@ -35,11 +37,11 @@ def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict
     """Read both images in the windows of a block's tiles."""
     job.store.check(job.manifest)
     job.check_inputs()  # before any work
-    statistics = job.statistics()
+    statistics, network = job.statistics(), job.network()
     windows = [view_windows(_areas(job, tile, ranges), job.config) for tile in job.store.grid.within(block.core)]
     left, right = map(hull, zip(*windows, strict=True))
     with timed(seconds, "read"):
-        return Source(_views(job, block, (left, right)), statistics)
+        return Source(_views(job, block, (left, right)), statistics, network)
 
 
 def _views(job: Job, block: Tile, windows: tuple[Window, Window]) -> Views:
@@ -75,21 +77,22 @@ def costed(
     Precomputed costs take longer than SGM: the first of the tile's steps keeps them for the others, uncompressed, since
     those of noisy images hardly shrink.
     """
-    areas, statistics, config, name = _areas(job, tile, ranges), source.statistics, job.config, tile.name
+    areas, config, name = _areas(job, tile, ranges), job.config, tile.name
+    of_pair = source.statistics, source.network
     left, right = zip(source.views, view_windows(areas, config), strict=True)
     views = left[0].cropped(left[1]), right[0].cropped(right[1])
     if not (config.cost.precomputed and job.hands_states_on):
         with timed(seconds, "match"):
-            return views, cost_areas(views, areas, config, statistics)
+            return views, cost_areas(views, areas, config, *of_pair)
     with timed(seconds, "read"):
         kept = job.store.steps.read(COSTS, name)
     if kept is None:
         with timed(seconds, "costs"):
-            made = cost_areas(views, areas, config, statistics)
+            made = cost_areas(views, areas, config, *of_pair)
             kept = [cost.costs.left[:, :, : area.disparities] for area, cost in zip(areas, made, strict=True)]
             job.store.steps.write(COSTS, name, *kept)
         return views, made
     missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
     padded = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]
     with timed(seconds, "match"):
-        return views, cost_areas(views, areas, config, statistics, padded)
+        return views, cost_areas(views, areas, config, *of_pair, padded)

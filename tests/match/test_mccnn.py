@@ -24,6 +24,7 @@ from sat_intervals.match.patch import kernel_settings
 from sat_intervals.match.whole import _view
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.results import open_results
+from sat_intervals.run import source
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
@@ -91,7 +92,7 @@ def test_weights_file__names_the_missing_extra(monkeypatch):
 def test_network__names_the_missing_onnxruntime(network_file, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(SatIntervalsError, match=r"needs onnxruntime: pip install 'sat-intervals\[mccnn\]'"):
-        Network(network_file)
+        Network(network_file, network_file.read_bytes())
 
 
 def test_network__is_a_valid_convolution(network_file, weights):
@@ -102,7 +103,7 @@ def test_network__is_a_valid_convolution(network_file, weights):
 
 def test_network__without_a_unit_vector_makes_zeros(tmp_path, weights):
     unbiased = {name: value * (not name.endswith("bias")) for name, value in weights.items()}
-    network = Network(write_network(tmp_path / "unbiased.onnx", unbiased))
+    network = load_network(write_network(tmp_path / "unbiased.onnx", unbiased))
     pixels = np.random.default_rng(0).standard_normal((19, 40), np.float32)
     pixels[:, 10:30] = 0
     features = network(pixels)
@@ -130,7 +131,7 @@ def test_network__no_network_is_refused(tmp_path):
     file = tmp_path / "text.onnx"
     file.write_text("weights")
     with pytest.raises(SatIntervalsError, match=r"text\.onnx is not a valid ONNX network"):
-        Network(file)
+        load_network(file)
     with pytest.raises(SatIntervalsError, match=r"cost\.weights .*none\.onnx: no such file"):
         match_arrays(np.zeros((20, 20)), np.zeros((20, 20)), settings(0, 1, tmp_path / "none.onnx"))
 
@@ -373,8 +374,30 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     job.begin()
     job.store.write_normalization(PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 80.0)).report())
     write_network(file, random_weights(seed=1))
-    with pytest.raises(SatIntervalsError, match=r"network\.onnx differs in sha256 from .* of the run"):
+    with pytest.raises(SatIntervalsError, match=r"network\.onnx has other weights than the run"):
         match_block(job, next(iter(job.store.grid)))
+
+
+def test_match_pair__weights_that_are_others_for_a_moment_are_not_used(tmp_path, monkeypatch):
+    left, right = masked_images(60, 80)
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    file = write_network(tmp_path / "network.onnx", random_weights())
+    content = file.read_bytes()
+    other = write_network(tmp_path / "other.onnx", random_weights(seed=1)).read_bytes()
+    match_pair(*images, tmp_path / "alone", settings(-4, 6, file))
+    computed = source.cost_areas
+
+    def exchanged(*arguments):
+        file.write_bytes(other)
+        try:
+            return computed(*arguments)
+        finally:
+            file.write_bytes(content)
+
+    monkeypatch.setattr(source, "cost_areas", exchanged)
+    match_pair(*images, tmp_path / "out", settings(-4, 6, file))
+    for one, expected in zip(bands(tmp_path / "out"), bands(tmp_path / "alone"), strict=True):
+        np.testing.assert_array_equal(one, expected)
 
 
 def test_measure_subjects__other_weights_between_two_pairs_are_noticed(tmp_path):
