@@ -19,6 +19,10 @@ class RunError(SatIntervalsError):
     """A run that failed although its arguments are correct; finished tiles are kept, so it can be resumed."""
 
 
+class ChangedInputError(RunError):
+    """An input that was replaced or changed during a run."""
+
+
 class RemovedTilesError(RunError):
     """Tiles that the run itself removed, since they cannot be trusted."""
 

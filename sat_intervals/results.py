@@ -28,6 +28,7 @@ from sat_intervals.raster import (
     read_tags,
 )
 from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, stamp_of, watched
+from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.tiling import Window, strips
 
 # Pixels in a strip, and band count of each file.
@@ -254,7 +255,10 @@ def open_run(out: str | Path) -> Run:
     try:
         check_regular(file)
         which = _which(out)
-        report = json.loads(file.read_text(encoding="utf-8"), parse_int=_integer)
+        text = file.read_text(encoding="utf-8")
+        report = json.loads(text, parse_int=_integer)
+        if report.pop(SEAL, None) is not None and unsealed(text) is None:
+            raise SatIntervalsError("it is damaged or was changed: restore it, or match again with --overwrite")
         json.dumps(report, ensure_ascii=False, allow_nan=False).encode()  # raises for NaN and lone surrogates
         config = load_config(report["settings"])
         images = {side: report["inputs"][side] for side in ("left", "right")}  # MC-CNN has weights, too

@@ -5,15 +5,16 @@ inside: ``(features, rows - 10, columns - 10)``, a convolution without padding.
 """
 
 import hashlib
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.config.weights import INSTALL_MCCNN
-from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster.identity import ChangedInputError
+from sat_intervals.config import Census, Mccnn
+from sat_intervals.config.weights import INSTALL_MCCNN, weights_file
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
 
 # Radius of the window of a feature, in pixels.
 RADIUS = 5
@@ -87,20 +88,27 @@ def _wrong(file: Path, what: str) -> SatIntervalsError:
     )
 
 
-def load_network(file: Path, sha256: str | None = None) -> Network:
-    """Load the network of a file, once per process for the same content.
+def load_network(file: Path) -> Network:
+    """Load the network of a file, once per process for the same content; raises as `Network` does."""
+    return _loaded(file, file.read_bytes())
 
-    The content itself is compared with the ``sha256`` of a run, not the file, which may be another one for a moment.
+
+def network_of(cost: Census | Mccnn, inputs: Mapping[str, Any]) -> Network | None:
+    """Return the network of a run with these inputs; None if its cost needs none.
+
+    The content that is loaded is compared, not the file, which may be another one for a moment.
 
     Raises
     ------
     SatIntervalsError
         See `Network`.
     ChangedInputError
-        The content has another SHA-256.
+        The weights have another SHA-256 than those of the run.
     """
-    network = _loaded(file, file.read_bytes())
-    if sha256 not in (None, network.sha256):
+    if not isinstance(cost, Mccnn):
+        return None
+    network = load_network(file := weights_file(cost.weights))
+    if network.sha256 != inputs["weights"]["sha256"]:
         raise ChangedInputError(
             f"{file} has other weights than the run: restore it, and give all workers the same weights"
         )

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rasterio import Env
+from rasterio.io import MemoryFile
 from rasterio.shutil import copy
 
 from sat_intervals.raster import gdal
@@ -56,22 +57,21 @@ CopyParts = Callable[[Path, Sequence[tuple[int, Part]]], None]
 """Writes parts into a file, each at its offset."""
 
 
-def template(file: File, place: Georeferencing, tags: Mapping[str, str], scratch: Path) -> bytes:
-    """Return a small Cloud-Optimized GeoTIFF with one overview and all tags of a file; ``scratch`` is a path for it."""
+def template(file: File, place: Georeferencing, tags: Mapping[str, str]) -> bytes:
+    """Return a small Cloud-Optimized GeoTIFF with one overview and all tags of a file.
+
+    It is made in memory: GDAL says nothing of some failures to write to a disk.
+    """
     kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata, "sparse_ok": True}
-    small = scratch.with_name(f"strips-{scratch.name}")
     predictor = {"PREDICTOR": file.predictor} if file.compression in ("deflate", "zstd") else {}
     options = {"COMPRESS": file.compression.upper(), "OVERVIEW_RESAMPLING": "NEAREST", "BLOCKSIZE": _SMALL, **predictor}
     kind |= tiled(file) | {"blockxsize": _SMALL, "blockysize": _SMALL, "height": _SMALL + 1, "width": _SMALL + 1}
-    with Env(GDAL_TIFF_ENDIANNESS="LITTLE"):
-        with gdal.create(str(small), **kind, **place.creation_options()) as dataset:
+    with Env(GDAL_TIFF_ENDIANNESS="LITTLE"), MemoryFile() as small, MemoryFile() as made:
+        with gdal.create(small.name, **kind, **place.creation_options()) as dataset:
             dataset.update_tags(**tags)
             file.describe(dataset)
-        copy(str(small), str(scratch), driver="COG", SPARSE_OK="YES", **options)
-    made = scratch.read_bytes()
-    for path in (small, scratch):
-        path.unlink()
-    return made
+        copy(small.name, made.name, driver="COG", SPARSE_OK="YES", **options)
+        return bytes(made.getbuffer())
 
 
 def assemble(

@@ -23,8 +23,11 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
-# With these a damaged image is an error. rasterio ignores a failure without a message, and returns zeros.
+# With these a damaged image is an error. rasterio ignores a failure without a message, and returns zeros. The
+# environment of a worker may have others.
 _STRICT = {
+    "GDAL_DISABLE_READDIR_ON_OPEN": "FALSE",  # otherwise masks beside an image are not seen
+    "GDAL_PAM_ENABLED": "YES",  # nor no data in .aux.xml
     "GDAL_NUM_THREADS": "1",  # a failure in another thread has no message in this one
     "VRT_NUM_THREADS": "1",
     "GTIFF_DIRECT_IO": "NO",

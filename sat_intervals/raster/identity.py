@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any, NamedTuple, TypeVar
 from urllib.request import Request, urlopen
 
-from sat_intervals.errors import RunError, SatIntervalsError, check_regular
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
 from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
@@ -29,10 +29,6 @@ _TIMEOUT = 30
 _TRIES = 3
 
 _Read = TypeVar("_Read")
-
-
-class ChangedInputError(RunError):
-    """An input that was replaced or changed during a run."""
 
 
 def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:
@@ -73,9 +69,11 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
 
 
 def stamp_of(path: str) -> str | None:
-    """Return the stamp of a file as `identity` gives it; None where it gives none."""
-    file = _local_file(path)
-    return _stamp(file) if file else None
+    """Return the stamp of a file as `identity` gives it, size and ETag of a remote one; None where it gives none."""
+    if file := _local_file(path):
+        return _stamp(file)
+    now = identity(path)
+    return f"{now['bytes']}-{now['etag']}" if now.get("etag") else None
 
 
 def _local_file(path: str) -> Path | None:

@@ -13,10 +13,10 @@ import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.identity import ChangedInputError, stamp_of, watched
+from sat_intervals.raster.identity import stamp_of, watched
 from sat_intervals.raster.seal import check_seal, has_statistics_only
 from sat_intervals.tiling import Window
 

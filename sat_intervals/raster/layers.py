@@ -20,7 +20,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import OutputError, rename_new, stamps
+from sat_intervals.raster.publishing import OutputError, exchange, rename_new, stamps
 from sat_intervals.raster.seal import check_beside
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
@@ -56,14 +56,17 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     path = Path(path)
     before = stamps(path.parent, [path.name])
     try:
+        if path.is_dir() and not path.is_symlink():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         with LocalFolder(path.parent).scratch(path.name) as folder:
-            yield folder / path.name
-            if stamps(path.parent, [path.name]) != before:
-                raise OutputError(f"{path} was written by another process meanwhile: choose another name")
-            if before:
-                os.replace(folder / path.name, path)
-            else:
-                rename_new(folder / path.name, path)
+            new = folder / path.name
+            yield new
+            if before == stamps(path.parent, [path.name]):
+                (exchange if before else rename_new)(new, path)
+                if not before or stamps(folder, [path.name]) in ({}, before):
+                    return
+                exchange(new, path)  # another file came in between
+            raise OutputError(f"{path} was written by another process meanwhile: choose another name")
     except (*gdal.GDAL_ERRORS, OSError) as error:
         reason = getattr(error, "strerror", None) or gdal.reason(error)
         raise OutputError(f"{path} cannot be written: {reason}: make room or check its rights") from error

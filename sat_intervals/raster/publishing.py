@@ -1,5 +1,6 @@
 """Give finished files their final names, all of them or none, and replace no file that is not to be replaced."""
 
+import ctypes
 import errno
 import filecmp
 import json
@@ -12,6 +13,8 @@ from sat_intervals.errors import SatIntervalsError
 
 # Reports that are published with files: of a run, and of its points.
 REPORTS = "run.json", "points.json"
+# Arguments of Linux' renameat2: paths are relative to the working directory; exchange two files.
+_HERE, _EXCHANGE = -100, 2
 # Folder of the replaced files, among the finished ones.
 REPLACED = "replaced"
 
@@ -120,3 +123,10 @@ def rename_new(source: Path, target: Path) -> None:
         os.replace(source, target)
     else:
         os.unlink(source)
+
+
+def exchange(new: Path, place: Path) -> None:
+    """Exchange two files in one step, so that the replaced one can be examined; elsewhere than on Linux, replace it."""
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    if rename is None or rename(_HERE, os.fsencode(new), _HERE, os.fsencode(place), _EXCHANGE):
+        os.replace(new, place)

@@ -180,7 +180,7 @@ class OutputWriter:
         (file,) = (file for file in self._files if file.name == name)
         self._check_links()
         with self._failing(self._folder / name):
-            made = template(file, self._georeferencing, self._tags, self._scratch / name)
+            made = template(file, self._georeferencing, self._tags)
             # a name of its own: a worker that was lost must not write into the file of a later run
             path = self._scratch / f"strips-{uuid.uuid4().hex}-{name}"
             self._made[name] = assemble(path, made, self._shape, levels, copy_parts, is_sealed=file.is_sealed)

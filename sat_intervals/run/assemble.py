@@ -1,6 +1,5 @@
 """Assemble the files of a run from its tiles: strips, final bands, report."""
 
-import json
 import logging
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,6 +26,7 @@ from sat_intervals.run.seams import seam_report
 from sat_intervals.run.statistics import Tally
 from sat_intervals.run.strips import finish_strips
 from sat_intervals.run.workers import Workers, reason
+from sat_intervals.store.manifest import sealed
 from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, replaceable_files
 
 # Meanings of some of the counts, for readers of run.json.
@@ -49,7 +49,7 @@ def assemble(
     *,
     keep_tiles: bool = False,
 ) -> dict[str, Any]:
-    """Write the files of a run whose tiles are done; return the content of run.json.
+    """Write the files of a run whose tiles are done; return the content of run.json without its checksum.
 
     Parameters
     ----------
@@ -125,8 +125,7 @@ def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_til
         if not keep_tiles:
             mark_finished(home, job.name, stamps)
 
-    text = json.dumps(report, indent=1) + "\n"
-    writer.publish(("run.json", text), replaceable=replaceable_files(home), announce=announce)
+    writer.publish(("run.json", sealed(report) + "\n"), replaceable=replaceable_files(home), announce=announce)
     mark_replaced(home)
     if keep_tiles:  # otherwise the parts are removed with them
         try:

@@ -17,7 +17,7 @@ from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
-from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch
+from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch, whole_file
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.run.before import report_before
 from sat_intervals.run.job import Job, Search, prepare
@@ -119,10 +119,13 @@ class _Report:
         for name, how in states.items():
             _LOG.info("pair %s: %s", name, how.get("error", how["state"]))
         self.states.update(states)
-        if self._written and self._folder.read(REPORT) not in (None, self._written):
-            raise RunError(f"{self._folder}/{REPORT} was replaced during the batch: move it away and rerun the batch")
-        self._written = json.dumps(self.states, indent=1) + "\n"
-        self._folder.write(REPORT, self._written)
+        with whole_file(self._folder.path / REPORT) as new:
+            if self._written and self._folder.read(REPORT) not in (None, self._written):
+                raise RunError(
+                    f"{self._folder}/{REPORT} was replaced during the batch: move it away and rerun the batch"
+                )
+            self._written = json.dumps(self.states, indent=1) + "\n"
+            new.write_text(self._written)
 
 
 def _check_not_replaced(

@@ -8,9 +8,9 @@ from typing import Any
 
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
-from sat_intervals.match.mccnn import Network, load_network
+from sat_intervals.errors import ChangedInputError
 from sat_intervals.raster import Image, other_files, stamps_of
-from sat_intervals.raster.identity import ChangedInputError, identity
+from sat_intervals.raster.identity import identity
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
 
@@ -85,19 +85,13 @@ def _weights_identity(cost: Mccnn) -> dict[str, Any]:
     return {**identity(str(weights_file(cost.weights))), "onnxruntime": version("onnxruntime")}
 
 
-def network_of(cost: Mccnn, weights: Mapping[str, Any]) -> Network:
-    """Return the network of a run, whose inputs describe its ``weights``.
-
-    Raises
-    ------
-    ChangedInputError
-        This process has other weights or another onnxruntime.
-    """
-    if (here := version("onnxruntime")) != weights["onnxruntime"]:
+def check_onnxruntime(inputs: Mapping[str, Any]) -> None:
+    """Raise if this process has another onnxruntime than the one that a run with MC-CNN began with."""
+    wanted = inputs.get("weights", {}).get("onnxruntime")
+    if wanted and (here := version("onnxruntime")) != wanted:
         raise ChangedInputError(
-            f"onnxruntime is {here} here, but the run has {weights['onnxruntime']}: give all workers the same version"
+            f"onnxruntime is {here} here, but the run has {wanted}: give all workers the same version"
         )
-    return load_network(weights_file(cost.weights), weights["sha256"])
 
 
 def with_range_of(report: Mapping[str, Any], config: Config) -> Config:

@@ -13,7 +13,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.mccnn import Network, load_network
+from sat_intervals.match.mccnn import load_network, network_of
 from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
@@ -31,7 +31,7 @@ from sat_intervals.raster import (
     stamps,
 )
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
-from sat_intervals.run.inputs import describe_inputs, network_of
+from sat_intervals.run.inputs import check_onnxruntime, describe_inputs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
 from sat_intervals.run.parts import codecs_of, parts_of, rows_of_levels
@@ -183,11 +183,8 @@ class Job:
             Names the first changed input.
         """
         check_unchanged(self.files)
-        self.network()
-
-    def network(self) -> Network | None:
-        """Return the network of MC-CNN, None for other costs; see `network_of`."""
-        return network_of(self.config.cost, self.inputs["weights"]) if isinstance(self.config.cost, Mccnn) else None
+        check_onnxruntime(self.inputs)
+        network_of(self.config.cost, self.inputs)
 
     def statistics(self) -> PairStatistics | None:
         """Return mean and standard deviation of both images, None if the run needs none.

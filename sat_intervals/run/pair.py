@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sat_intervals.config import Config, load_config
-from sat_intervals.errors import RunError
+from sat_intervals.errors import ChangedInputError, RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.match.search_range import Found
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import RUN_FILES, Image, remove_scratch
-from sat_intervals.raster.identity import ChangedInputError
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.job import Job, prepare
@@ -67,7 +66,7 @@ def match_pair(
 
     Returns
     -------
-    The content of ``run.json``.
+    The content of ``run.json`` without its checksum.
 
     Raises
     ------

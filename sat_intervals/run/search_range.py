@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.normalization import blocks
 from sat_intervals.match.sampling import Look, Sample, coarse_rows, look, samples, summary
 from sat_intervals.match.search_range import (
@@ -24,7 +24,7 @@ from sat_intervals.match.search_range import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, read_window, watched_images
-from sat_intervals.raster.identity import ChangedInputError, read_unchanged
+from sat_intervals.raster.identity import read_unchanged
 from sat_intervals.run.quality import COLLAR, is_plain
 from sat_intervals.run.workers import Connection, Task, Workers, reason
 from sat_intervals.tiling import Window

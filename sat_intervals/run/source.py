@@ -7,7 +7,7 @@ import numpy as np
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import Area, MatchingCost, cost_areas, view_windows
-from sat_intervals.match.mccnn import Network
+from sat_intervals.match.mccnn import Network, network_of
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, patch_areas
 from sat_intervals.progress import timed
@@ -37,7 +37,7 @@ def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict
     """Read both images in the windows of a block's tiles."""
     job.store.check(job.manifest)
     job.check_inputs()  # before any work
-    statistics, network = job.statistics(), job.network()
+    statistics, network = job.statistics(), network_of(job.config.cost, job.inputs)
     windows = [view_windows(_areas(job, tile, ranges), job.config) for tile in job.store.grid.within(block.core)]
     left, right = map(hull, zip(*windows, strict=True))
     with timed(seconds, "read"):

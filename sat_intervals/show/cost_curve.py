@@ -4,14 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Mccnn
-from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.curves import read_alpha_cuts, read_subpixel_cut, read_winners
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
-from sat_intervals.match.mccnn import load_network
+from sat_intervals.match.mccnn import network_of
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import kernel_settings
 from sat_intervals.products import FLAGS, IMPOSSIBLE_COST, REGULARIZED
@@ -76,9 +74,7 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     views = read_views((results.left, results.right), view_windows([area], config))
     normalization = results.report.get("normalization")
     statistics = PairStatistics.of_report(normalization) if normalization else None
-    network = None
-    if isinstance(config.cost, Mccnn):
-        network = load_network(weights_file(config.cost.weights), results.report["inputs"]["weights"]["sha256"])
+    network = network_of(config.cost, results.report["inputs"])
     (cost,) = cost_areas(views, [area], config, statistics, network)
     volume = cost_volume(cost.costs, settings, cost.gradients)
     curve = np.ascontiguousarray(volume[pixel.relative_to(base).slices])

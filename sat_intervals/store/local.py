@@ -261,12 +261,17 @@ class LocalFolder:
 
     @contextmanager
     def _emptied(self) -> Iterator[Path]:
-        """Lock the folder for the block; yield the place of its temporary files, which are then deleted."""
+        """Lock the folder for the block; yield the place of its temporary files, which are then deleted.
+
+        They are deleted in this folder, even if a link has taken its place.
+        """
         with self.locked():
+            folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             try:
                 yield self.path / _FILES
             finally:
-                shutil.rmtree(self.path / _FILES, ignore_errors=True)
+                shutil.rmtree(_FILES, ignore_errors=True, dir_fd=folder)
+                os.close(folder)
 
 
 def _depth(folder: LocalFolder) -> int:

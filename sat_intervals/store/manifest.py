@@ -12,7 +12,7 @@ from sat_intervals.tiling import Grid, Window
 
 MANIFEST = "manifest.json"
 # Key of the checksum of all other keys.
-_SEAL = "crc32"
+SEAL = "crc32"
 # Keys of a file that do not matter if its SHA-256 agrees.
 _IGNORED = ("modified", "stamp")
 # Characters of a value that a message shows.
@@ -28,7 +28,7 @@ def sealed(content: Mapping[str, Any], of: str = "") -> str:
 
     ``of`` says what the object belongs to, so that one of another run or tile is not taken for it.
     """
-    return json.dumps({**content, _SEAL: _checksum(content, of)}, indent=1)
+    return json.dumps({**content, SEAL: _checksum(content, of)}, indent=1)
 
 
 def unsealed(text: str | None, of: str = "") -> dict[str, Any] | None:
@@ -37,7 +37,7 @@ def unsealed(text: str | None, of: str = "") -> dict[str, Any] | None:
         content = json.loads(text or "")
     except (ValueError, RecursionError):
         return None
-    is_whole = isinstance(content, dict) and content.pop(_SEAL, None) == _checksum(content, of)
+    is_whole = isinstance(content, dict) and content.pop(SEAL, None) == _checksum(content, of)
     return content if is_whole else None
 
 
@@ -57,11 +57,11 @@ def parsed(manifest: str, folder: Folder) -> dict[str, Any]:
         there = json.loads(manifest)
         if not isinstance(there, dict):
             raise ValueError("it is not an object")
-        if _SEAL in there and unsealed(manifest) is None:
+        if SEAL in there and unsealed(manifest) is None:
             raise ValueError("it is damaged")
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{folder}/{MANIFEST} cannot be read, {error}: start again with --overwrite") from error
-    there.pop(_SEAL, None)
+    there.pop(SEAL, None)
     return there
 
 

@@ -11,6 +11,7 @@ from helpers import COMMAND, invoke, write_pair
 
 from sat_intervals.cli.app import STEPS, main
 from sat_intervals.demo import make_scene
+from sat_intervals.results import open_run
 
 # Commands that print figures.
 WITH_JSON = (
@@ -60,7 +61,7 @@ def test_match__prints_json_or_ends_with_the_next_command(pair, tmp_path):
     assert done.stdout.splitlines()[-1] == f"next: sat-intervals report '{out}'"
     assert invoke(*shlex.split(done.stdout.splitlines()[-1])[2:]).exit_code == 0
     done = invoke("match", *words[:2], tmp_path / "other", *words[2:], "--json")
-    assert json.loads(done.stdout) == json.loads((tmp_path / "other" / "run.json").read_text())
+    assert json.loads(done.stdout) == open_run(tmp_path / "other").report
     found = json.loads(invoke("status", out, "--json").stdout)
     assert found == {str(out): {"state": "complete"}}
     found = json.loads(invoke("plan", *words, "--json").stdout)

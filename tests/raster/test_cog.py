@@ -45,7 +45,7 @@ def parts_of(bands: np.ndarray, file: File, order: random.Random | None = None) 
 
 
 def write(path: Path, bands: np.ndarray, file: File, place: Georeferencing = PLACE, **options) -> dict[str, int]:
-    made = template(file, place, {"ALPHA": "0.9"}, path)
+    made = template(file, place, {"ALPHA": "0.9"})
     return assemble(path, made, bands.shape[1:], parts_of(bands, file, **options), copy_parts)
 
 
@@ -139,7 +139,7 @@ def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
         stream.write(row, bands[:, row : row + rows])
     for found, expected in zip(stream.parts, parts_of(bands, INTERVALS), strict=True):
         assert [part[:2] for part in found] == [part[:2] for part in expected]
-    made = template(INTERVALS, PLACE, {"ALPHA": "0.9"}, tmp_path / "a.tif")
+    made = template(INTERVALS, PLACE, {"ALPHA": "0.9"})
     assemble(tmp_path / "a.tif", made, bands.shape[1:], stream.parts, stream.copy_parts)
     write(tmp_path / "b.tif", bands, INTERVALS)
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import subprocess
+import sys
 import time
 from http.server import ThreadingHTTPServer
 from pathlib import Path
@@ -13,8 +14,8 @@ from helpers import COMMAND, OUTPUTS, hashes
 
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError
-from sat_intervals.raster.identity import ChangedInputError, identity, is_changed, read_unchanged
+from sat_intervals.errors import ChangedInputError, RunError
+from sat_intervals.raster.identity import identity, is_changed, read_unchanged
 from sat_intervals.tiling import Window
 
 SIDE = 1024
@@ -151,3 +152,26 @@ def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(we
 @pytest.mark.parametrize("path", ["http://127.0.0.1:1/image.tif", "/vsimem/image.tif", "nowhere://image.tif"])
 def test_identity__of_what_nobody_tells_more_of_is_its_name(path):
     assert identity(path) == {"path": path}
+
+
+OPEN_AND_DESCRIBE = """import sys
+from sat_intervals import load_config, open_image
+from sat_intervals.run.inputs import describe_inputs
+images = [open_image(name) for name in sys.argv[1:]]
+print("opened", flush=True)
+sys.stdin.readline()
+describe_inputs(*images, load_config({}), {})"""
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_describe_inputs__of_an_image_on_a_server_that_is_replaced_when_it_is_open(web_server, images, is_replaced):
+    put(images, web_server.folder)
+    names = [f"http://127.0.0.1:{web_server.server_address[1]}/{side}.tif" for side in ("left", "right")]
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen([sys.executable, "-c", OPEN_AND_DESCRIBE, *names], text=True, **pipes) as process:
+        assert process.stdout.readline() == "opened\n"
+        if is_replaced:
+            put({"right.tif": images["left.tif"]}, web_server.folder)
+        _, errors = process.communicate("\n", timeout=60)
+    expected = "right.tif or a file beside it was replaced or changed since it was opened"
+    assert (process.returncode != 0, expected in errors) == (is_replaced, is_replaced)

@@ -1,6 +1,7 @@
 """Reading and writing of rasters, on real files: refusals, pixels, metadata, temporary files."""
 
 import itertools
+import json
 import os
 import pickle
 import subprocess
@@ -36,7 +37,9 @@ from sat_intervals.raster import (
     OutputWriter,
     check_pair,
     gdal,
+    layers,
     open_image,
+    publishing,
     read_layers,
     read_window,
     surface_file,
@@ -513,6 +516,32 @@ def test_read_window__names_a_damaged_file_whatever_the_users_options(tmp_path, 
     assert f"InputError: {path} cannot be read at rows 0 to 1499" in done.stderr.decode()
 
 
+STATE = """import sys
+from sat_intervals.raster import open_image, read_window
+from sat_intervals.tiling import Window
+pixels, state = read_window(open_image(sys.argv[1]), Window(0, 0, 20, 30))
+print(state.any(axis=1).tolist())"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("setting", [{"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}, {"GDAL_PAM_ENABLED": "NO"}])
+def test_read_window__sees_files_beside_an_image_whatever_the_users_options(tmp_path, setting):
+    path = tmp_path / "left.tif"
+    with rasterio.open(path, "w", "GTiff", 30, 20, 1, dtype="uint8", **UTM) as dataset:
+        dataset.write(np.full((20, 30), 7, np.uint8), 1)
+        masked = np.arange(20)[:, None].repeat(30, 1) < 5
+        if "GDAL_PAM_ENABLED" in setting:
+            dataset.write(np.where(masked, 9, 7).astype(np.uint8), 1)
+        else:
+            with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False):
+                dataset.write_mask(~masked)
+    if "GDAL_PAM_ENABLED" in setting:
+        band = "<PAMRasterBand band='1'><NoDataValue>9</NoDataValue></PAMRasterBand>"
+        (tmp_path / "left.tif.aux.xml").write_text(f"<PAMDataset>{band}</PAMDataset>")
+    done = subprocess.run([sys.executable, "-c", STATE, path], env=os.environ | setting, capture_output=True, text=True)
+    assert json.loads(done.stdout.lower()) == [True] * 5 + [False] * 15
+
+
 def test_read_window__is_quiet_and_right_in_many_threads(tmp_path):
     noise = np.random.default_rng(0).integers(0, 65535, (256, 256), np.uint16)
     image = open_image(make(tmp_path / "left.tif", noise))
@@ -854,6 +883,33 @@ def test_whole_file__keeps_a_file_that_appears_meanwhile(tmp_path, was_there):
             new.write_text("new")
             path.write_text("of the user")
 
+    with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile"):
+        write()
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
+
+
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monkeypatch, can_exchange):
+    path = tmp_path / "new.yaml"
+    path.write_text("before")
+    renamed = layers.exchange
+
+    def late(new, place):
+        if can_exchange and place.read_text() == "before":
+            (tmp_path / "other").write_text("of the user")
+            os.replace(tmp_path / "other", place)
+        renamed(new, place)
+
+    def write():
+        with whole_file(path) as new:
+            new.write_text("new")
+
+    monkeypatch.setattr(layers, "exchange", late)
+    if not can_exchange:
+        monkeypatch.setattr(publishing.ctypes, "CDLL", lambda name: None)
+        write()
+        assert path.read_text() == "new"
+        return
     with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile"):
         write()
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]

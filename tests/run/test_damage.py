@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import re
 import shutil
 from contextlib import suppress
 
@@ -453,10 +454,21 @@ def test_commands__refuse_a_result_of_another_size(scene, tmp_path, command):
     assert result.exit_code == 2
 
 
+def test_open_run__refuses_a_report_with_one_other_digit(scene, tmp_path):
+    shutil.copytree(scene / "kept", tmp_path / "out")
+    file = tmp_path / "out" / "run.json"
+    report = file.read_text()
+    digits = [found.start() for found in re.finditer("[0-9]", report)]
+    for place in digits[:: len(digits) // 20]:
+        file.write_text(f"{report[:place]}{9 - int(report[place])}{report[place + 1 :]}")
+        with pytest.raises(SatIntervalsError, match=r"run.json: it is damaged or was changed: restore it, or match ag"):
+            open_run(tmp_path / "out")
+
+
 def test_open_run__of_a_report_without_sizes_opens(scene, tmp_path):
     shutil.copytree(scene / "kept", tmp_path / "out")
     report = json.loads((tmp_path / "out" / "run.json").read_text())
-    del report["files"]
+    del report["files"], report["crc32"]
     (tmp_path / "out" / "run.json").write_text(json.dumps(report))
     open_run(tmp_path / "out")
 

@@ -23,7 +23,7 @@ from helpers import COMMAND, PLACE, hashes, invoke, write_pair
 
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.heights import dsm
 from sat_intervals.interop.export import export
 from sat_intervals.raster import (
@@ -45,7 +45,7 @@ from sat_intervals.raster import (
     watched_rasters,
     write_layer,
 )
-from sat_intervals.raster.identity import ChangedInputError, identity
+from sat_intervals.raster.identity import identity
 from sat_intervals.results import Run, open_results
 from sat_intervals.run import search_range, source, strips
 from sat_intervals.run.batch import match_batch
@@ -618,6 +618,15 @@ def test_scratch__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
         (used.parent / "link").unlink()
     assert sorted(tmp_path.iterdir()) == [link, foreign, elsewhere]
     assert sorted(path.name for path in elsewhere.rglob("*")) == [LOCK, "file", "files", "tiles"]
+
+
+def test_scratch__deletes_nothing_behind_a_link_that_took_its_place(tmp_path):
+    (tmp_path / "mine" / "files").mkdir(parents=True)
+    (tmp_path / "mine" / "files" / "precious").write_text("mine")
+    with LocalFolder(tmp_path).scratch("work") as used:
+        used.parent.rename(tmp_path / "moved")
+        used.parent.symlink_to(tmp_path / "mine")
+    assert (tmp_path / "mine" / "files" / "precious").read_text() == "mine"
 
 
 @pytest.mark.parametrize("inner", ["", "files", "files/replaced"])

@@ -1,7 +1,6 @@
 """Whole runs on real workers: tiles against the whole image, resuming, reports."""
 
 import errno
-import json
 import logging
 import os
 import shutil
@@ -26,7 +25,7 @@ from sat_intervals.run.job import prepare
 from sat_intervals.run.output import is_complete
 from sat_intervals.run.tile import match_block
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.manifest import differences, digest
+from sat_intervals.store.manifest import differences, digest, unsealed
 from sat_intervals.tiling import Window
 
 
@@ -193,7 +192,7 @@ def test_match_pair__reports_what_a_small_overlap_left(pair, tmp_path):
 def test_match_pair__writes_a_complete_report(pair, tmp_path):
     left, right, settings = pair
     report = match_pair(left, right, tmp_path / "out", settings)
-    assert report == json.loads((tmp_path / "out" / "run.json").read_text())
+    assert report == open_run(tmp_path / "out").report
     counts, validity = report["counts"], bands(tmp_path / "out")[1]
     assert counts["pixels"] == validity.size
     assert counts["valid"] == (validity & INVALID == 0).sum()
@@ -274,7 +273,7 @@ def test_match_pair__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(p
             with pytest.raises(RunError, match="tile 1_2: disk gone"):
                 match_pair(left, right, out, settings, overwrite=True)
         assert {name: (out / name).read_bytes() for name in before} == before
-        assert open_run(out).report == json.loads(before["run.json"])
+        assert open_run(out).report == unsealed(before["run.json"])
         assert not is_complete(out)
     done = {file: file.stat().st_mtime_ns for file in (out / "tiles" / "records").glob("[0-9]*.json")}
     assert len(done) == 5

@@ -37,7 +37,7 @@ from sat_intervals.products import (
     Bands,
 )
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
-from sat_intervals.results import open_results
+from sat_intervals.results import open_results, open_run
 from sat_intervals.run.statistics import Tally
 from sat_intervals.show import dsm, maps
 from sat_intervals.show.canvas import widest
@@ -385,7 +385,7 @@ def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run,
     bands[1:3, 60, 90] = 1.0
     with OutputWriter(out, RUN_FILES, 130, 170, PLACE, {}) as writer:
         writer.write(0, bands, read_layers(out / "validity.tif")[0])
-        report = json.loads((out / "run.json").read_text())
+        report = open_run(out).report
         del report["files"]
         writer.publish(("run.json", json.dumps(report)))
     write_layer(tmp_path / "far.tif", np.full((130, 170), 999.5, np.float32), np.nan, PLACE)
