@@ -137,8 +137,9 @@ def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
 
 def _check_texts(folder: Path) -> None:
     """Raise if a text file exists there without a mark."""
-    from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.errors import SatIntervalsError, check_regular
 
     for path in (folder / name for name in _TEXTS):
+        check_regular(path, "move it away")
         if path.exists() and not path.read_bytes().startswith(tuple(mark.encode() for mark in _MARKS)):
             raise SatIntervalsError(f"{path} exists and was not made by sat-intervals: move it away")

@@ -24,5 +24,7 @@ def check_process() -> None:
             "raise ulimit -v"
         )
     threads = os.environ.get("NUMBA_NUM_THREADS", "1")
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        raise SatIntervalsError("NUMBA_DISABLE_JIT is set, but the kernels need numba's compiler: unset it")
     if not threads.isdecimal() or int(threads) < 1:
         raise SatIntervalsError(f"NUMBA_NUM_THREADS is {threads!r}: set it to a number above 0, or not at all")

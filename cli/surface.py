@@ -55,7 +55,7 @@ def surface(
         from sat_intervals.config import resolved
         from sat_intervals.heights.dsm import make_surface
         from sat_intervals.heights.triangulate import triangulate
-        from sat_intervals.run.before import report_before
+        from sat_intervals.run.before import report_before, tidy
 
         _check_kept(out, cells, sensor_files, settings.file)
         check_unchanged = _watched(sensor_files, cells)
@@ -64,6 +64,8 @@ def surface(
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
+        else:
+            tidy(out, run.keep_tiles, config.cluster.store)
         check_unchanged()
         points = triangulate(out, *sensor_files, progress=console.progress)
         made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
 from sat_intervals.raster import (
     Georeferencing,
@@ -87,6 +87,7 @@ def _check_own(file: Path) -> None:
     """Raise if the file exists and is not an item of this tool. Links pass: they are replaced, never followed."""
     if not os.path.lexists(file) or file.is_symlink():
         return
+    check_regular(file, "move it away")
     with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
         if "sat-intervals" in json.loads(file.read_text(encoding="utf-8"))["properties"]["processing:software"]:
             return
@@ -166,6 +167,7 @@ def _has_tag(path: Path, name: str, finished: str) -> bool:
 
 
 def _file(path: Path) -> dict[str, Any]:
+    check_regular(path)
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {"href": f"./{path.name}", "file:size": path.stat().st_size, "file:checksum": _SHA256 + digest}

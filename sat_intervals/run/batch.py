@@ -17,18 +17,15 @@ from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
-from sat_intervals.raster import RUN_FILES, Image, open_image, other_files, remove_scratch, whole_file
+from sat_intervals.raster import Image, open_image, other_files, whole_file
 from sat_intervals.raster.identity import check_not_replaced
-from sat_intervals.run.before import report_before
+from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
-from sat_intervals.run.output import OUTPUTS, check_as_published, is_complete
+from sat_intervals.run.output import OUTPUTS, is_complete
 from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, find_on, match_jobs, measure_images
 from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Connection, Workers
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.manifest import StoreError
-from sat_intervals.store.place import is_own, place_of
-from sat_intervals.store.tiles import finished_run, remove_tiles
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
@@ -95,7 +92,7 @@ def match_batch(
                 if before is None:
                     jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find)
                 else:
-                    _tidy(out / pair.name, keep_tiles, cluster.store)
+                    tidy(out / pair.name, keep_tiles, cluster.store)
                     note({pair.name: {"state": "done before", **before}})
             except Exception as error:  # one pair's failure must not stop the others
                 note({pair.name: _failed(error)})
@@ -168,23 +165,6 @@ def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stac
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin(overwrite=overwrite)
     return job
-
-
-def _tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
-    """Remove what a run left that was killed after it published its files; tiles are kept if asked for."""
-    remove_scratch(folder, RUN_FILES)
-    home = folder / "tiles"
-    if keep_tiles or home.is_symlink() or finished_run(home) is None:
-        return
-    try:
-        place = place_of(home, store)
-    except StoreError as error:
-        _LOG.warning("%s", error)
-        return
-    if place == LocalFolder(home.absolute()) or is_own(place):
-        with LocalFolder(home).locked():
-            check_as_published(folder)
-            remove_tiles(home, place)
 
 
 def _failed(error: Exception) -> dict[str, Any]:

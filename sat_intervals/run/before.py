@@ -1,16 +1,23 @@
-"""Find the run that an earlier call of the same command has finished."""
+"""Find the run that an earlier call of the same command has finished, and remove what that call left."""
 
+import logging
 from pathlib import Path
 from typing import Any
 
 from sat_intervals.config import Config, resolved
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import Image
+from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.results import open_run
 from sat_intervals.run.inputs import changes_since, with_range_of
 from sat_intervals.run.job import fitted_to_jobs
-from sat_intervals.run.output import is_complete
+from sat_intervals.run.output import check_as_published, is_complete
+from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.manifest import StoreError
+from sat_intervals.store.place import is_own, place_of
+from sat_intervals.store.tiles import finished_run, remove_tiles
 from sat_intervals.tiling import Window
+
+_LOG = logging.getLogger(__name__)
 
 
 def report_before(
@@ -32,3 +39,20 @@ def report_before(
             f"{folder} already holds another run: {'; '.join(changes)} (choose another folder or --overwrite)"
         )
     return run.report
+
+
+def tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
+    """Remove what a run left that was killed after it published its files; tiles are kept if asked for."""
+    remove_scratch(folder, RUN_FILES)
+    home = folder / "tiles"
+    if keep_tiles or home.is_symlink() or finished_run(home) is None:
+        return
+    try:
+        place = place_of(home, store)
+    except StoreError as error:
+        _LOG.warning("%s", error)
+        return
+    if place == LocalFolder(home.absolute()) or is_own(place):
+        with LocalFolder(home).locked():
+            check_as_published(folder)
+            remove_tiles(home, place)

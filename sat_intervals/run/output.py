@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import RUN_FILES, is_marked, stamps
 from sat_intervals.store.tiles import finished_run, has_begun, is_replacing
 
@@ -40,6 +40,7 @@ def check_replaceable(out: Path) -> None:
     Call it before overwriting.
     """
     for file in (out / name for name in OUTPUTS):
+        check_regular(file, "move it away or choose another folder")
         if file.exists() and not _is_of_run(file):
             raise SatIntervalsError(
                 f"{file} exists and was not made by sat-intervals, or is damaged: move it away or choose another folder"

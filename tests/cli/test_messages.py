@@ -65,6 +65,12 @@ def test_main__names_a_variable_that_numba_cannot_start_with(threads, monkeypatc
     assert f"NUMBA_NUM_THREADS is {threads!r}: set it to a number above 0, or not at all" in result.stderr
 
 
+def test_main__needs_the_compiler(monkeypatch):
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    result = invoke("match", "a", "b", "c", "--disparity", "0", "4")
+    assert (result.exit_code, "NUMBA_DISABLE_JIT is set, but the kernels need" in result.stderr) == (2, True)
+
+
 @pytest.mark.process
 def test_main__names_a_malformed_dask_configuration(tmp_path):
     (tmp_path / "distributed.yaml").write_text("a: [1\n b: }")
