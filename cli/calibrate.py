@@ -121,8 +121,8 @@ def calibrate(
         if tune:
             _tune(subjects, output, folder, name, console, as_json)
             return
-        parts = measure_subjects(subjects, folder, console.progress)
-    calibration, expected = calibration_from(parts, subjects, name or output.stem)
+        parts, key = measure_subjects(subjects, folder, console.progress)
+    calibration, expected = calibration_from(parts, subjects, name or output.stem, key)
     write_calibration(output, calibration)
     if as_json:
         say_json({"calibration": calibration.model_dump(mode="json"), "expected": expected})

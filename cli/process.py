@@ -23,8 +23,8 @@ def check_process() -> None:
             f"the address space is limited to {limit / 1e9:.1f} GB, at least {_ADDRESSES / 1e9:.1f} GB are needed: "
             "raise ulimit -v"
         )
-    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         raise SatIntervalsError("NUMBA_DISABLE_JIT is set, but the kernels need numba's compiler: unset it")
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1")
     if not threads.isdecimal() or int(threads) < 1:
         raise SatIntervalsError(f"NUMBA_NUM_THREADS is {threads!r}: set it to a number above 0, or not at all")

@@ -70,6 +70,7 @@ def surface(
         points = triangulate(out, *sensor_files, progress=console.progress)
         made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
         check_unchanged()
+        _check_of_run(out, report["finished"], points["file"])
     if as_json:
         say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
@@ -97,6 +98,16 @@ def _watched(sensor_files: Sequence[str | Path], cells: dict[str, Any]) -> Calla
 
     like = cells["resolution"] if isinstance(cells["resolution"], Path) else None
     return watched_rasters([*sensor_files, cells["geoid"], like])
+
+
+def _check_of_run(out: Path, finished: str, points: dict[str, int]) -> None:
+    """Raise if the surface is of a run that ended at another time, or of other points: a command replaced these."""
+    from sat_intervals.errors import RunError
+    from sat_intervals.raster import read_tags
+    from sat_intervals.raster.published import published_points
+
+    if read_tags(out / "dsm.tif").get("RUNS") != finished or published_points(out) != points:
+        raise RunError(f"the run in {out} or its points were replaced before the surface was made: rerun the command")
 
 
 def _check(out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
@@ -135,7 +146,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
             errors[pair.name] = error
             click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
 
-    def surface_of(pair: "PairOfBatch") -> dict[str, Any]:
+    def surface_of(pair: "PairOfBatch", finished: str) -> dict[str, Any]:
         from sat_intervals.heights.dsm import make_surface
         from sat_intervals.heights.triangulate import triangulate
 
@@ -148,6 +159,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         points = triangulate(folder, *pair.sensors, console.progress)
         made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
         checks[pair.name]()
+        _check_of_run(folder, finished, points["file"])
         return {"points": points, "surface": made}
 
     return surface_of

@@ -258,7 +258,7 @@ def open_run(out: str | Path) -> Run:
         text = file.read_text(encoding="utf-8")
         report = json.loads(text, parse_int=_integer)
         if report.pop(SEAL, None) is not None and unsealed(text) is None:
-            raise SatIntervalsError("it is damaged or was changed: restore it, or match again with --overwrite")
+            raise SatIntervalsError("it is damaged or was changed: restore it, or move it away and match again")
         json.dumps(report, ensure_ascii=False, allow_nan=False).encode()  # raises for NaN and lone surrogates
         config = load_config(report["settings"])
         images = {side: report["inputs"][side] for side in ("left", "right")}  # MC-CNN has weights, too
@@ -276,7 +276,9 @@ def open_run(out: str | Path) -> Run:
         raise SatIntervalsError(f"{file}: {error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
-        raise SatIntervalsError(f"{file} is not the report of a run{where}: rerun match with --overwrite") from error
+        raise SatIntervalsError(
+            f"{file} is not the report of a run{where}: move it away and match again with --overwrite"
+        ) from error
     for name, bands in _BANDS.items():
         _check_raster(out / name, bands, region, files.get(name))
     return Run(out, report, config, region, which)
@@ -322,13 +324,13 @@ def _check_raster(file: Path, bands: int, region: Window, published: dict[str, i
     if found != needed:
         raise SatIntervalsError(
             f"{file} has {found[0]} bands of {found[1]} x {found[2]} pixels, but run.json says {needed[0]} of "
-            f"{needed[1]} x {needed[2]}: rerun match with --overwrite"
+            f"{needed[1]} x {needed[2]}: move it away and match again with --overwrite"
         )
 
 
 def _damaged(file: Path, how: str) -> SatIntervalsError:
     return SatIntervalsError(
-        f"{file} {how}; it is damaged or was changed: move {file.parent} away, or match again with --overwrite"
+        f"{file} {how}; it is damaged or was changed: move it away and match again with --overwrite"
     )
 
 

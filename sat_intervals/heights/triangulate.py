@@ -54,11 +54,11 @@ def triangulate(
 
     Returns
     -------
-    ``points``, the number of points; ``lost``, the number of valid pixels without a point, because grids or models have
-    no values there; ``beyond``, the number of pixels by which the left grid reaches beyond the left image, and the
-    ``grid_step`` in pixels; if there are points, minimum and maximum of ``height`` (metres above the ellipsoid) and
-    ``residual`` (metres); ``median_residual`` (metres) at some positions across the region, far below 0.1 m if models
-    and grids belong to these images, for any disparities.
+    ``file``, size and CRC-32 of ``points.tif``; ``points``, the number of points; ``lost``, the number of valid pixels
+    without a point, because grids or models have no values there; ``beyond``, the number of pixels by which the left
+    grid reaches beyond the left image, and the ``grid_step`` in pixels; if there are points, minimum and maximum of
+    ``height`` (metres above the ellipsoid) and ``residual`` (metres); ``median_residual`` (metres) at some positions
+    across the region, far below 0.1 m if models and grids belong to these images, for any disparities.
 
     Raises
     ------
@@ -72,8 +72,8 @@ def triangulate(
         [run.out / name for name in (POINTS_FILE, POINTS_REPORT)], [left_model, right_model, left_grid, right_grid]
     )
     search = run.config.disparity
-    files = map(Path, (left_model, right_model, left_grid, right_grid))
-    sensors = Sensors.load(*files, left=run.left_georeferencing)
+    models = map(Path, (left_model, right_model, left_grid, right_grid))
+    sensors = Sensors.load(*models, left=run.left_georeferencing)
     right_width = run.report["inputs"]["right"]["width"]
     lattice = Lattice(sensors, run.region, right_width, search.minimum, search.maximum)
     tags = {"RUN": run.report["finished"], "LEFT_MODEL": str(left_model), "RIGHT_MODEL": str(right_model)}
@@ -86,9 +86,11 @@ def triangulate(
             tally.add(int(np.isfinite(disparities[0]).sum()), height=bands[2], residual=bands[5])
             progress("points", window.row_stop, run.shape[0])
         progress("files", 0, 1)
-        writer.publish((POINTS_REPORT, json.dumps({"files": writer.build()}, indent=1) + "\n"))
+        files = writer.build()
+        writer.publish((POINTS_REPORT, json.dumps({"files": files}, indent=1) + "\n"))
         progress("files", 1, 1)
-    return tally.report() | _beyond(sensors.left_grid, run) | {"median_residual": lattice.residual}
+    more = {"file": files[POINTS_FILE], "median_residual": lattice.residual}
+    return tally.report() | _beyond(sensors.left_grid, run) | more
 
 
 def _beyond(grid: Any, run: Run) -> dict[str, float]:

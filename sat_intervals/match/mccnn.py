@@ -6,6 +6,7 @@ inside: ``(features, rows - 10, columns - 10)``, a convolution without padding.
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from sat_intervals.errors import ChangedInputError, SatIntervalsError
 
 # Radius of the window of a feature, in pixels.
 RADIUS = 5
+# How an ONNX file says that weights are in another file: the key "location" and the tag of its value.
+_ELSEWHERE = b"\n\x08location\x12"
 # Largest deviation of a feature's length from 1.
 _UNIT = 1e-3
 
@@ -52,7 +55,6 @@ class Network:
             if not (np.abs(lengths - 1) <= _UNIT).all():
                 raise _wrong(file, f"gives vectors of length {lengths.min():.3g} to {lengths.max():.3g}, not 1")
         self.count = int(features.shape[0])
-        self.sha256 = hashlib.sha256(content).hexdigest()
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
         """Features ``(count, rows - 10, columns - 10)`` of normalised pixels ``(rows, columns)``, float32.
@@ -72,6 +74,10 @@ def _session(file: Path, content: bytes) -> Any:
         import onnxruntime
     except ImportError as error:
         raise SatIntervalsError(f"cost mccnn needs onnxruntime: {INSTALL_MCCNN}") from error
+    if _ELSEWHERE in content:
+        raise SatIntervalsError(
+            f"{file} has weights in another file, whose changes would not be noticed: save the network as one file"
+        )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # tiles are the only parallelism
     options.log_severity_level = 4
@@ -89,8 +95,8 @@ def _wrong(file: Path, what: str) -> SatIntervalsError:
 
 
 def load_network(file: Path) -> Network:
-    """Load the network of a file, once per process for the same content; raises as `Network` does."""
-    return _loaded(file, file.read_bytes())
+    """Load the network of a file; raises as `Network` does."""
+    return _loaded(_Weights.of(file))
 
 
 def network_of(cost: Census | Mccnn, inputs: Mapping[str, Any]) -> Network | None:
@@ -100,21 +106,37 @@ def network_of(cost: Census | Mccnn, inputs: Mapping[str, Any]) -> Network | Non
 
     Raises
     ------
-    SatIntervalsError
-        See `Network`.
     ChangedInputError
         The weights have another SHA-256 than those of the run.
     """
     if not isinstance(cost, Mccnn):
         return None
-    network = load_network(file := weights_file(cost.weights))
-    if network.sha256 != inputs["weights"]["sha256"]:
+    weights = _Weights.of(weights_file(cost.weights))
+    if weights.sha256 != inputs["weights"]["sha256"]:
         raise ChangedInputError(
-            f"{file} has other weights than the run: restore it, and give all workers the same weights"
+            f"{weights.file} has other weights than the run: restore it, and give all workers the same weights"
         )
-    return network
+    return _loaded(weights)
 
 
-@lru_cache(maxsize=2)
-def _loaded(file: Path, content: bytes) -> Network:
-    return Network(file, content)
+@dataclass(frozen=True)
+class _Weights:
+    """A file of weights and its content, known by its SHA-256."""
+
+    file: Path
+    sha256: str
+    content: bytes = field(compare=False)
+
+    @classmethod
+    def of(cls, file: Path) -> "_Weights":
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: name an ONNX network") from error
+        return cls(file, hashlib.sha256(content).hexdigest(), content)
+
+
+@lru_cache(maxsize=4)
+def _loaded(weights: _Weights) -> Network:
+    """Make a network, once per process for the same content."""
+    return Network(weights.file, weights.content)

@@ -1,6 +1,7 @@
 """Open and create rasters with GDAL: no warning about missing georeferencing, and errors in one line."""
 
 import errno
+import os
 import re
 import threading
 import warnings
@@ -23,17 +24,23 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
-# With these a damaged image is an error. rasterio ignores a failure without a message, and returns zeros. The
-# environment of a worker may have others.
+# GDAL's prefixes of files on servers.
+_REMOTE = "vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift", "vsiwebhdfs"
+# With these, all files of an image are read as they are now, whatever the environment of a worker, and damage is an
+# error: rasterio ignores a failure without a message, and returns zeros.
 _STRICT = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "FALSE",  # otherwise masks beside an image are not seen
-    "GDAL_PAM_ENABLED": "YES",  # nor no data in .aux.xml
+    "GDAL_PAM_ENABLED": "YES",  # otherwise no-data values in .aux.xml are not seen
+    "CPL_VSIL_CURL_NON_CACHED": ":".join(f"/{name}/" for name in _REMOTE),  # a later run may find another file there
     "GDAL_NUM_THREADS": "1",  # a failure in another thread has no message in this one
     "VRT_NUM_THREADS": "1",
     "GTIFF_DIRECT_IO": "NO",
     "GTIFF_IGNORE_READ_ERRORS": "NO",
     "GDAL_PNG_WHOLE_IMAGE_OPTIM": "NO",  # reads what is missing from memory that was never written
 }
+_EXTENSIONS = "CPL_VSIL_CURL_ALLOWED_EXTENSIONS"  # often .tif alone, without masks
+if _EXTENSIONS in os.environ:
+    _STRICT[_EXTENSIONS] = f"{os.environ[_EXTENSIONS]},.msk,.ovr,.aux.xml"
 # A source of a VRT that cannot be opened fails without a message in each other dataset until the first is closed.
 _OF_SOURCES = threading.RLock()
 

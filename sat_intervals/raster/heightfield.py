@@ -17,7 +17,7 @@ from sat_intervals.tiling import Window
 # Heights of the ground on Earth in metres; others are no-data values that the file does not declare.
 GROUND = -600.0, 9500.0
 # Names of the metre in the unit of a band; without one heights are taken for metres.
-_METRE = "", "m", "metre", "metres", "meter", "meters"
+_METRE = "", "m", "metre", "metres", "meter", "meters", "unknown"
 # Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
 _BLOCK, _KEPT = 512, 128
 
@@ -51,7 +51,9 @@ class HeightRaster:
             raise SatIntervalsError(f"{path} has no transform from pixels to its CRS: give a georeferenced raster")
         self.frame = Frame(str(path), crs or own, vertical, level)
         if unit and self.frame.unit == 1:
-            raise SatIntervalsError(f"{path} has heights in {unit}: convert them to metres")
+            raise SatIntervalsError(
+                f"{path} has heights in {unit}: convert them to metres, or correct the unit of the band"
+            )
         self._to_cells: Affine = ~place.transform
         self.shape = self._image.height, self._image.width
         """Rows and columns."""

@@ -69,11 +69,16 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
 
 
 def stamp_of(path: str) -> str | None:
-    """Return the stamp of a file as `identity` gives it, size and ETag of a remote one; None where it gives none."""
+    """Return the stamp of a local file as `identity` gives it, size and ETag of a remote one.
+
+    None if a server gives none or does not answer, "missing" for a local file that does not exist.
+    """
     if file := _local_file(path):
         return _stamp(file)
     now = identity(path)
-    return f"{now['bytes']}-{now['etag']}" if now.get("etag") else None
+    if now.get("etag"):
+        return f"{now['bytes']}-{now['etag']}"
+    return None if "://" in path or path.startswith("/vsi") else "missing"
 
 
 def _local_file(path: str) -> Path | None:

@@ -343,7 +343,7 @@ def watched_images(images: Iterable[Image]) -> Callable[[], None]:
     images = list(images)
     check = watched_rasters(file for image in images for file in (image.path, image.mask))
     for image in images:
-        if stamps_of(image.path) != image.stamps:
+        if is_replaced(image):
             raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: rerun the command")
     return check
 
@@ -355,5 +355,16 @@ def read_files(name: str) -> list[str]:
 
 
 def stamps_of(name: str) -> tuple[str | None, ...]:
-    """Return the stamps of the `read_files` of a raster, see `identity`; None for one that is not local."""
+    """Return the stamps of the `read_files` of a raster, see `stamp_of`; None for one that has none."""
     return tuple(map(stamp_of, read_files(name)))
+
+
+def is_replaced(image: Image) -> bool:
+    """Return whether a file of an image was made, replaced or changed since it was opened.
+
+    A server that does not answer does not change a file.
+    """
+    now = stamps_of(image.path)
+    return len(now) != len(image.stamps) or any(
+        None not in (stamp, before) and stamp != before for stamp, before in zip(now, image.stamps, strict=True)
+    )

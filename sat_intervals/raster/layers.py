@@ -20,7 +20,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import OutputError, exchange, rename_new, stamps
+from sat_intervals.raster.publishing import OutputError, rename_new, replace_same, stamps
 from sat_intervals.raster.seal import check_beside
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
@@ -51,7 +51,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        Names ``path`` and the system's reason, or says that another process wrote it meanwhile.
+        Names ``path`` and the system's reason, or says that another file came there meanwhile.
     """
     path = Path(path)
     before = stamps(path.parent, [path.name])
@@ -61,12 +61,12 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         with LocalFolder(path.parent).scratch(path.name) as folder:
             new = folder / path.name
             yield new
-            if before == stamps(path.parent, [path.name]):
-                (exchange if before else rename_new)(new, path)
-                if not before or stamps(folder, [path.name]) in ({}, before):
-                    return
-                exchange(new, path)  # another file came in between
-            raise OutputError(f"{path} was written by another process meanwhile: choose another name")
+            if before:
+                replace_same(new, path, before[path.name])
+            else:
+                rename_new(new, path)
+    except FileExistsError as error:
+        raise OutputError(f"{path} was written by another process meanwhile: move it away") from error
     except (*gdal.GDAL_ERRORS, OSError) as error:
         reason = getattr(error, "strerror", None) or gdal.reason(error)
         raise OutputError(f"{path} cannot be written: {reason}: make room or check its rights") from error

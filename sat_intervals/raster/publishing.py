@@ -125,8 +125,28 @@ def rename_new(source: Path, target: Path) -> None:
         os.unlink(source)
 
 
-def exchange(new: Path, place: Path) -> None:
-    """Exchange two files in one step, so that the replaced one can be examined; elsewhere than on Linux, replace it."""
+def replace_same(new: Path, place: Path, stamp: str) -> None:
+    """Replace a file that still has its stamp, see `stamps`; the replaced one is then where the new one was.
+
+    Raises
+    ------
+    FileExistsError
+        Another file came there meanwhile, and stays.
+    """
+    own = stamps(new.parent, [new.name])[new.name]
+    try:
+        if stamps(place.parent, [place.name]).get(place.name) == stamp:
+            _exchange(new, place)
+    finally:  # of a signal, too
+        there = stamps(new.parent, [new.name]).get(new.name)
+        if there not in (stamp, own, None):
+            _exchange(new, place)
+    if there not in (stamp, None):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
+
+
+def _exchange(new: Path, place: Path) -> None:
+    """Exchange two files in one step, so that the replaced one can be examined; replace it where that is impossible."""
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
     if rename is None or rename(_HERE, os.fsencode(new), _HERE, os.fsencode(place), _EXCHANGE):
         os.replace(new, place)

@@ -66,7 +66,9 @@ def check_reference(path: Path, surface: Path) -> None:
     if len(crs.axis_info) > 2 and crs.axis_info[2].unit_conversion_factor != 1:
         unit = crs.axis_info[2].unit_name
     if unit:
-        raise SatIntervalsError(f"{path} has heights in {unit}: convert them to metres")
+        raise SatIntervalsError(
+            f"{path} has heights in {unit}: convert them to metres, or correct the unit of the band"
+        )
     if len(parts) > 1 and level.endswith("ellipsoid") and "ellipsoid" not in parts[1].name.lower():
         raise SatIntervalsError(
             f"{path} has heights of {parts[1].name}, {surface} heights {level}: make the surface with --geoid, or "

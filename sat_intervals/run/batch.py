@@ -17,7 +17,7 @@ from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
-from sat_intervals.raster import Image, open_image, other_files, whole_file
+from sat_intervals.raster import Image, OutputError, open_image, other_files, whole_file
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
@@ -29,7 +29,9 @@ from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
-Finish = Callable[[PairOfBatch], Mapping[str, Any]]
+# What `batch.json` has of a run's report.
+_KEPT = "finished", "counts", "seconds", "warnings"
+Finish = Callable[[PairOfBatch, str], Mapping[str, Any]]
 
 
 def match_batch(
@@ -41,7 +43,7 @@ def match_batch(
     overwrite: bool = False,
     keep_tiles: bool = False,
     progress: Progress = lambda stage, done, total: None,
-    finish: Finish = lambda pair: {},
+    finish: Finish = lambda pair, ended: {},
 ) -> dict[str, dict[str, Any]]:
     """Match many pairs; a failed pair does not stop the others.
 
@@ -56,12 +58,14 @@ def match_batch(
     overwrite, keep_tiles, progress
         See `match_pair`.
     finish
-        What to do with each complete pair at the end, such as its surface model; what it returns is added to its state.
+        What to do with each complete pair at the end, such as its surface model; it gets the time at which the run
+        ended. What it returns is added to the pair's state.
 
     Returns
     -------
-    By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``counts`` and ``seconds``, or all of them if
-    ``finish`` failed. ``batch.json`` has the same during the batch, with "waiting" for pairs that have not ended.
+    By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``finished``, ``counts`` and ``seconds``, or
+    all of them if ``finish`` failed. ``batch.json`` has the same during the batch, with "waiting" for pairs that have
+    not ended.
 
     Raises
     ------
@@ -116,13 +120,17 @@ class _Report:
         for name, how in states.items():
             _LOG.info("pair %s: %s", name, how.get("error", how["state"]))
         self.states.update(states)
-        with whole_file(self._folder.path / REPORT) as new:
-            if self._written and self._folder.read(REPORT) not in (None, self._written):
-                raise RunError(
-                    f"{self._folder}/{REPORT} was replaced during the batch: move it away and rerun the batch"
-                )
-            self._written = json.dumps(self.states, indent=1) + "\n"
-            new.write_text(self._written)
+        text = json.dumps(self.states, indent=1) + "\n"
+        try:
+            with whole_file(self._folder.path / REPORT) as new:
+                if self._written and self._folder.read(REPORT) not in (None, self._written):
+                    raise RunError(
+                        f"{self._folder}/{REPORT} was replaced during the batch: move it away and rerun the batch"
+                    )
+                new.write_text(text)
+        except OutputError as error:
+            raise RunError(f"{error}, and rerun the batch: it resumes") from error
+        self._written = text
 
 
 def _check_not_replaced(
@@ -154,7 +162,7 @@ def _window(pair: PairOfBatch) -> Window | None:
 def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
     """Return counts and seconds of a pair's complete run, None without one; raise if settings or images differ."""
     report = report_before(*_images(pair), out / pair.name, settings, _window(pair))
-    return report and {name: report[name] for name in ("counts", "seconds", "warnings") if name in report}
+    return report and {name: report[name] for name in _KEPT if name in report}
 
 
 def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack, find: Search) -> Job:
@@ -176,7 +184,7 @@ def _finished(pair: PairOfBatch, how: dict[str, Any], finish: Finish) -> dict[st
     if how["state"] == "failed":
         return how
     try:
-        more = finish(pair)
+        more = finish(pair, how["finished"])
         return {**how, **more} if more else how
     except Exception as error:  # one pair's failure must not stop the others
         return {**how, **_failed(error)}
@@ -269,4 +277,4 @@ def _assembled(client: Workers, matched: Matched, keep_tiles: bool, progress: Pr
             job.store.remove()
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
-    return {"state": "done", **{name: report[name] for name in ("counts", "seconds", "warnings")}}
+    return {"state": "done", **{name: report[name] for name in _KEPT}}

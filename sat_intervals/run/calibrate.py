@@ -71,12 +71,13 @@ def _checked_truths(subject: Subject) -> tuple[int, int]:
 
 
 def calibration_from(
-    parts: Sequence[Measured], subjects: Sequence[Subject], name: str
+    parts: Sequence[Measured], subjects: Sequence[Subject], name: str, key: dict[str, Any] | None = None
 ) -> tuple[Calibration, list[dict[str, float]]]:
     """Return the calibration of measured subjects, and what to expect of it.
 
     Expected figures are means over the groups, each with the levels chosen on the others, see `left_out`: a row for
-    each coverage. The calibration's provenance has them too.
+    each coverage. The calibration's provenance has them too. The ``key`` is that of `measure_subjects`, by default that
+    of the settings now.
     """
     config = subjects[0].config
     rungs, pool, expected, notes = ladder(config), pooled(parts), [], []
@@ -101,5 +102,5 @@ def calibration_from(
             {key: round(value, 4) if math.isfinite(value) else None for key, value in row.items()} for row in expected
         ],
     }
-    calibration = Calibration(name=name, key=key_of(config), levels=tuple(chosen), provenance=provenance)
+    calibration = Calibration(name=name, key=key or key_of(config), levels=tuple(chosen), provenance=provenance)
     return calibration, expected

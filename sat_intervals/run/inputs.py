@@ -9,7 +9,7 @@ from typing import Any
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
-from sat_intervals.raster import Image, other_files, stamps_of
+from sat_intervals.raster import Image, is_replaced, other_files
 from sat_intervals.raster.identity import identity
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
@@ -51,7 +51,7 @@ def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dic
         A file of the image was made or replaced after it was opened, so its band and no-data value may be wrong.
     """
     files, crs = _with_others(image.path, identified), image.georeferencing.crs
-    if stamps_of(image.path) != image.stamps:
+    if is_replaced(image):
         raise ChangedInputError(
             f"{image.path} or a file beside it was replaced or changed since it was opened: rerun the command"
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -97,7 +98,9 @@ def check_enough(pixels: int, subjects: Sequence[Subject], what: str) -> None:
         )
 
 
-def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progress) -> list[Measured]:
+def measure_subjects(
+    subjects: Sequence[Subject], folder: Path, progress: Progress
+) -> tuple[list[Measured], dict[str, Any]]:
     """Match subjects at every level of the ladder, in ``folder``, and measure their intervals.
 
     Parameters
@@ -111,7 +114,8 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
 
     Returns
     -------
-    One measurement for each subject; for a single one, one for each of 16 blocks.
+    One measurement for each subject, or one for each of 16 blocks of a single one; and the key that they hold for, see
+    `key_of`.
 
     Raises
     ------
@@ -124,7 +128,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
     cost = subjects[0].config.cost
     check_truths = watched_images(subject.truth.image for subject in subjects)
     check_weights = watched([weights_file(cost.weights)] if isinstance(cost, Mccnn) else [])
-    levels = ladder(subjects[0].config)
+    key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with (
         LocalFolder(folder).scratch("calibrate") as scratch,
@@ -138,7 +142,7 @@ def measure_subjects(subjects: Sequence[Subject], folder: Path, progress: Progre
     check_weights()  # between subjects: each job checks its own
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
-    return found
+    return found, key
 
 
 def _of_all(progress: Progress, stage: str, number: int, total: int, *_: object) -> None:

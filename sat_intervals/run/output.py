@@ -80,5 +80,5 @@ def check_as_published(out: Path) -> None:
         if now.get(name) != before:
             raise SatIntervalsError(
                 f"{out / name} was changed after the run, but the tiles still exist: delete it and rerun the same "
-                "command to make it again, or start again with --overwrite"
+                "command to make it again"
             )

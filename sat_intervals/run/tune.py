@@ -88,8 +88,8 @@ def tuned(
 ) -> Tuned:
     """Calibrate pairs with changed settings, and judge these; parameters as in `measure_subjects`."""
     subjects = [replace(subject, config=_changed(subject.config, changes)) for subject in subjects]
-    parts = measure_subjects(subjects, folder, progress)
-    calibration, _ = calibration_from(parts, subjects, name)
+    parts, key = measure_subjects(subjects, folder, progress)
+    calibration, _ = calibration_from(parts, subjects, name, key)
     return Tuned(
         name,
         subjects,

@@ -100,7 +100,7 @@ def measured(preset: str) -> tuple[list[Subject], list[Measured]]:
     kept = KEPT / f"{preset}-{digest.hexdigest()[:16]}.gz"
     if not kept.exists():
         with tempfile.TemporaryDirectory() as folder:
-            found = measure_subjects(subjects, Path(folder), lambda *_: None)
+            found, _ = measure_subjects(subjects, Path(folder), lambda *_: None)
         KEPT.mkdir(parents=True, exist_ok=True)
         with gzip.open(kept.with_suffix(".new"), "wb", 3) as file:
             pickle.dump(found, file)

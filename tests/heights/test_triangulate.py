@@ -455,6 +455,7 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert "% with a height" in result.stdout
     assert "median half width +-" in result.stdout
     noted = list(stamps(out, ("intervals.tif", "validity.tif", "run.json")).values())
+    (out / "tiles").mkdir()
     mark_finished(out / "tiles", "of this run", noted)  # as a run that was killed before it removed its tiles
     figures = json.loads(invoke(*command, "--json").stdout)
     assert not (out / "tiles").exists()
@@ -467,6 +468,15 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert np.array_equal(read(out / "dsm.tif"), read(steps / "dsm.tif"), equal_nan=True)
     other = invoke(*command, "--preset", "satellite")
     assert (other.exit_code, "already holds another run" in other.stderr) == (2, True)
+
+    def late(*arguments, **options):
+        assert invoke("match", *images, str(out), *search[:2], "9", "--overwrite", "--quiet").exit_code == 0
+        return triangulate(*arguments, **options)
+
+    monkeypatch.setattr("sat_intervals.heights.triangulate.triangulate", late)
+    replaced = invoke(*command)
+    assert replaced.exit_code == 1
+    assert "or its points were replaced before the surface was made: rerun the command" in replaced.stderr
 
 
 def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):

@@ -6,6 +6,7 @@ import warnings
 from importlib import metadata
 
 import numpy as np
+import onnx
 import pytest
 import rasterio
 import reference
@@ -13,9 +14,11 @@ from helpers import bands, hashes, invoke, write_pair
 from networks import random_weights, slow_features, trained_network, write_network
 
 from sat_intervals import RunError, SatIntervalsError, load_config, match_arrays, match_pair, open_image
+from sat_intervals.config import key_of
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.config.weights import weights_file
 from sat_intervals.demo import make_scene
+from sat_intervals.errors import ChangedInputError
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import Network, load_network
@@ -78,6 +81,13 @@ def test_weights_file__is_found_without_importing_its_package():
     assert file.is_file()
     assert "mc_cnn" not in sys.modules
     assert load_network(file) is load_network(file)
+
+
+def test_load_network__refuses_weights_in_another_file(tmp_path):
+    model = onnx.load(write_network(tmp_path / "one.onnx", random_weights()))
+    onnx.save(model, tmp_path / "two.onnx", save_as_external_data=True, size_threshold=64)
+    with pytest.raises(SatIntervalsError, match=r"two.onnx has weights in another file, .*: save the netwo"):
+        load_network(tmp_path / "two.onnx")
 
 
 def test_weights_file__names_the_missing_extra(monkeypatch):
@@ -333,6 +343,9 @@ def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
     assert curve.disparity == pytest.approx(raw["disparity"].to_numpy()[row, column])
     assert curve.lower <= found[0, row, column] <= curve.upper
     assert np.nanmin(curve.possibilities) >= 0
+    results.report["inputs"]["weights"]["sha256"] = "0"
+    with pytest.raises(ChangedInputError, match=r"has other weights than the run"):
+        read_curve(results, row, column)
 
 
 def test_evaluate__compares_both_costs_in_one_table(tmp_path):
@@ -374,7 +387,19 @@ def test_match_tile__other_weights_on_a_worker_are_noticed(tmp_path):
     job.begin()
     job.store.write_normalization(PairStatistics(ImageStatistics(500.0, 80.0), ImageStatistics(500.0, 80.0)).report())
     write_network(file, random_weights(seed=1))
-    with pytest.raises(SatIntervalsError, match=r"network\.onnx has other weights than the run"):
+    for content in (file.read_bytes(), file.read_bytes()[:99]):
+        file.write_bytes(content)
+        with pytest.raises(ChangedInputError, match=r"network\.onnx has other weights than the run"):
+            match_block(job, next(iter(job.store.grid)))
+
+
+def test_match_tile__another_onnxruntime_on_a_worker_is_noticed(tmp_path, network_file, monkeypatch):
+    left, right = masked_images(60, 80)
+    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
+    job = prepare(*images, tmp_path / "out", settings(-4, 6, network_file))
+    job.begin()
+    monkeypatch.setattr("sat_intervals.run.inputs.version", lambda name: "0.1")
+    with pytest.raises(ChangedInputError, match=r"onnxruntime is 0.1 here, but the run has .*: give all workers the"):
         match_block(job, next(iter(job.store.grid)))
 
 
@@ -401,7 +426,7 @@ def test_match_pair__weights_that_are_others_for_a_moment_are_not_used(tmp_path,
 
 
 def test_measure_subjects__other_weights_between_two_pairs_are_noticed(tmp_path):
-    write_pair(tmp_path, make_scene(60, 80))
+    write_pair(tmp_path, make_scene(90, 120))
     file = write_network(tmp_path / "network.onnx", random_weights())
     left, right = (open_image(tmp_path / name) for name in ("left.tif", "right.tif"))
     config = settings(-4, 6, file)
@@ -413,6 +438,13 @@ def test_measure_subjects__other_weights_between_two_pairs_are_noticed(tmp_path)
 
     with pytest.raises(RunError, match=r"network\.onnx was replaced or changed while it was read: rerun the command"):
         measure_subjects([subject], tmp_path, exchange_for_a_moment)
+
+    def exchange_at_the_end(stage, done, total):
+        if (stage, done) == ("subjects", 1):
+            write_network(file, random_weights(seed=1))
+
+    before = key_of(config)
+    assert measure_subjects([subject], tmp_path, exchange_at_the_end)[1] == before != key_of(config)
 
 
 @pytest.mark.parametrize("name", ["int8", "fp32"])

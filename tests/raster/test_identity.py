@@ -8,6 +8,7 @@ import time
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rasterio
 from helpers import COMMAND, OUTPUTS, hashes
@@ -175,3 +176,28 @@ def test_describe_inputs__of_an_image_on_a_server_that_is_replaced_when_it_is_op
         _, errors = process.communicate("\n", timeout=60)
     expected = "right.tif or a file beside it was replaced or changed since it was opened"
     assert (process.returncode != 0, expected in errors) == (is_replaced, is_replaced)
+
+
+READ_TWICE = """import sys
+from sat_intervals.raster import open_image, read_window
+from sat_intervals.tiling import Window
+for _ in range(2):
+    pixels, _ = read_window(open_image(sys.argv[1]), Window(0, 0, 9, 9))
+    print(int(pixels[0, 0]), flush=True)
+    sys.stdin.readline()"""
+
+
+def test_read_window__of_an_image_on_a_server_that_was_replaced_since_the_last_run(web_server):
+    def put_level(level: int) -> None:
+        options = {"height": 9, "width": 9, "count": 1, "dtype": "uint16", "transform": rasterio.Affine.scale(2)}
+        with rasterio.open(web_server.folder / "left.tif", "w", "GTiff", **options) as dataset:
+            dataset.write(np.full((1, 9, 9), level, np.uint16))
+
+    put_level(7)
+    name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
+    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+    with subprocess.Popen([sys.executable, "-c", READ_TWICE, name], text=True, **pipes) as process:
+        assert process.stdout.readline() == "7\n"
+        put_level(8)
+        again, _ = process.communicate("\n\n", timeout=60)
+    assert again == "8\n"

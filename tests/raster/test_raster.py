@@ -37,7 +37,6 @@ from sat_intervals.raster import (
     OutputWriter,
     check_pair,
     gdal,
-    layers,
     open_image,
     publishing,
     read_layers,
@@ -888,30 +887,37 @@ def test_whole_file__keeps_a_file_that_appears_meanwhile(tmp_path, was_there):
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
 
 
-@pytest.mark.parametrize("can_exchange", [True, False])
-def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monkeypatch, can_exchange):
+@pytest.mark.parametrize("how", ["late", "late and interrupted", "no exchange"])
+def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monkeypatch, how):
     path = tmp_path / "new.yaml"
     path.write_text("before")
-    renamed = layers.exchange
+    exchange = publishing._exchange
 
     def late(new, place):
-        if can_exchange and place.read_text() == "before":
-            (tmp_path / "other").write_text("of the user")
-            os.replace(tmp_path / "other", place)
-        renamed(new, place)
+        if place.read_text() != "before":
+            return exchange(new, place)
+        (tmp_path / "other").write_text("of the user")
+        os.replace(tmp_path / "other", place)
+        exchange(new, place)
+        if "interrupted" in how:
+            raise KeyboardInterrupt
 
     def write():
         with whole_file(path) as new:
             new.write_text("new")
 
-    monkeypatch.setattr(layers, "exchange", late)
-    if not can_exchange:
+    if how == "no exchange":
         monkeypatch.setattr(publishing.ctypes, "CDLL", lambda name: None)
         write()
         assert path.read_text() == "new"
         return
-    with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile"):
-        write()
+    monkeypatch.setattr(publishing, "_exchange", late)
+    if "interrupted" in how:
+        with pytest.raises(KeyboardInterrupt):
+            write()
+    else:
+        with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile: move it away"):
+            write()
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
 
 

@@ -1,6 +1,8 @@
 """Batches, plans and states of runs, through the library and the command."""
 
+import errno
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -68,13 +70,28 @@ def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
 
 
 def test_match_batch__keeps_the_counts_of_a_pair_whose_last_step_fails(images, tmp_path):
-    def finish(pair):
+    def finish(pair, finished):
         raise SatIntervalsError("no model")
 
     pair = read_batch(rows(images))[0]
     end = match_batch([pair], tmp_path / "batch", finish=finish)[pair.name]
     assert (end["state"], end["error"]) == ("failed", "no model")
     assert end["counts"] == json.loads((tmp_path / "batch" / pair.name / "run.json").read_text())["counts"]
+
+
+def test_match_batch__that_cannot_write_its_report_can_be_run_again(images, tmp_path, monkeypatch):
+    write_text, full = Path.write_text, [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))]
+
+    def fails_once(path, *arguments, **options):
+        if path.name == "batch.json" and full:
+            raise full.pop()
+        return write_text(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "write_text", fails_once)
+    pairs = read_batch(rows(images))[:1]
+    with pytest.raises(RunError, match=r"batch.json cannot be written: No space left .*, and rerun the batch: it resu"):
+        match_batch(pairs, tmp_path)
+    assert match_batch(pairs, tmp_path)[pairs[0].name]["state"] == "done"
 
 
 def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(images, tmp_path):

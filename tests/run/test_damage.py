@@ -424,7 +424,7 @@ def test_match_batch__takes_no_damaged_result_for_done(scene, tmp_path, name, ho
     shown = match_batch(pairs, tmp_path, scene / "settings.yaml", keep_tiles=True)["kept"]
     assert shown["state"] == "failed"
     assert f"{tmp_path}/kept/{name} " in shown["error"]
-    assert shown["error"].endswith(f"move {tmp_path}/kept away, or match again with --overwrite")
+    assert shown["error"].endswith("it is damaged or was changed: move it away and match again with --overwrite")
     assert (tmp_path / "kept" / name).read_bytes() == before
     match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)
     assert_same(scene, tmp_path / "kept")
@@ -461,7 +461,9 @@ def test_open_run__refuses_a_report_with_one_other_digit(scene, tmp_path):
     digits = [found.start() for found in re.finditer("[0-9]", report)]
     for place in digits[:: len(digits) // 20]:
         file.write_text(f"{report[:place]}{9 - int(report[place])}{report[place + 1 :]}")
-        with pytest.raises(SatIntervalsError, match=r"run.json: it is damaged or was changed: restore it, or match ag"):
+        with pytest.raises(
+            SatIntervalsError, match=r"run.json: it is damaged or was changed: restore it, or move it a"
+        ):
             open_run(tmp_path / "out")
 
 

@@ -513,7 +513,7 @@ def test_open_results__refuses_what_is_no_report(tmp_path):
     out = write_run(tmp_path, *random_bands(4, 5))
     for content in (b'{"\xff": 1}', b"[]", b"3", b"{"):
         (out / "run.json").write_bytes(content)
-        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: rerun match"):
+        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: move it away and"):
             open_results(out)
 
 
@@ -523,7 +523,7 @@ def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
     report = json.loads((out / "run.json").read_text())
     report["tiles"]["region"]["height"] = 99999
     (out / "run.json").write_text(json.dumps(report))
-    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 of 99999 x 5: rerun"):
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 of 99999 x 5: move"):
         open_results(out)
     write_run(tmp_path, bands, validity)
     write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)
