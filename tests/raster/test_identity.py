@@ -201,3 +201,21 @@ def test_read_window__of_an_image_on_a_server_that_was_replaced_since_the_last_r
         put_level(8)
         again, _ = process.communicate("\n\n", timeout=60)
     assert again == "8\n"
+
+
+STATE = """import sys
+from sat_intervals.raster import open_image, read_window
+from sat_intervals.tiling import Window
+print(read_window(open_image(sys.argv[1]), Window(0, 0, 9, 9))[1].any())"""
+
+
+def test_read_window__sees_a_mask_on_a_server_whatever_the_users_options(web_server):
+    options = {"height": 9, "width": 9, "count": 1, "dtype": "uint16", "transform": rasterio.Affine.scale(2)}
+    with rasterio.open(web_server.folder / "left.tif", "w", "GTiff", **options) as dataset:
+        dataset.write(np.full((1, 9, 9), 7, np.uint16))
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False):
+            dataset.write_mask(np.eye(9, dtype=bool))
+    name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
+    setting = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".tif"}
+    done = subprocess.run([sys.executable, "-c", STATE, name], env=os.environ | setting, capture_output=True, text=True)
+    assert done.stdout == "True\n"
