@@ -53,7 +53,7 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     ChangedInputError
         The file is being written.
     SatIntervalsError
-        The path is a pipe or a device.
+        The path is a pipe or a device, or a server does not say which file it sends.
     """
     check_regular(path)
     if file := _local_file(path):
@@ -186,7 +186,13 @@ def checksum_of(file: Path) -> dict[str, int]:
 
 
 def _of_url(url: str) -> dict[str, Any]:
-    """Return size and ETag of a URL; requests one byte, since some servers refuse HEAD."""
+    """Return size and ETag of a URL; requests one byte, since some servers refuse HEAD.
+
+    Raises
+    ------
+    SatIntervalsError
+        The server says neither ETag nor time.
+    """
     try:
         with urlopen(Request(url, headers={"Range": "bytes=0-0"}), timeout=_TIMEOUT) as answer:
             headers = answer.headers
@@ -194,6 +200,11 @@ def _of_url(url: str) -> dict[str, Any]:
         return {}
     size = headers.get("Content-Range", "").rpartition("/")[2] or headers.get("Content-Length", "")
     tag = headers.get("ETag") or headers.get("Last-Modified")
+    if not tag:
+        raise SatIntervalsError(
+            f"{url}: its server sends neither ETag nor Last-Modified, so a change during the run would not be noticed: "
+            "download it"
+        )
     return {"bytes": int(size) if size.isdigit() else None, "etag": tag}
 
 

@@ -270,8 +270,13 @@ class LocalFolder:
             try:
                 yield self.path / _FILES
             finally:
-                shutil.rmtree(_FILES, ignore_errors=True, dir_fd=folder)
-                os.close(folder)
+                try:
+                    shutil.rmtree(_FILES, ignore_errors=True, dir_fd=folder)
+                except BaseException:  # a signal: without the lock file nobody would delete the rest
+                    shutil.rmtree(_FILES, ignore_errors=True, dir_fd=folder)
+                    raise
+                finally:
+                    os.close(folder)
 
 
 def _depth(folder: LocalFolder) -> int:

@@ -15,7 +15,7 @@ from helpers import COMMAND, OUTPUTS, hashes
 
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import ChangedInputError, RunError
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.raster.identity import identity, is_changed, read_unchanged
 from sat_intervals.tiling import Window
 
@@ -176,6 +176,17 @@ def test_describe_inputs__of_an_image_on_a_server_that_is_replaced_when_it_is_op
         _, errors = process.communicate("\n", timeout=60)
     expected = "right.tif or a file beside it was replaced or changed since it was opened"
     assert (process.returncode != 0, expected in errors) == (is_replaced, is_replaced)
+
+
+def test_identity__of_a_server_that_does_not_say_which_file_it_sends(web_server, images):
+    put(images, web_server.folder)
+    name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
+    assert identity(name)["etag"]
+    web_server.has_tags = False
+    with pytest.raises(
+        SatIntervalsError, match=r"left.tif: its server sends neither ETag nor Last-Modified, .*: downl"
+    ):
+        identity(name)
 
 
 READ_TWICE = """import sys
