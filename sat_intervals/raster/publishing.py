@@ -59,6 +59,10 @@ def publish(
     OutputError
         Names a file that must not be replaced.
     """
+    own: dict[str, os.stat_result] = {}
+    for name in names:
+        with failing(folder / name):
+            own[name] = (finished / name).lstat()
     try:
         for name in reversed(names):
             with failing(folder / name):
@@ -68,10 +72,9 @@ def publish(
                 rename_new(finished / name, folder / name)
     except BaseException:
         for name in names:
-            new, place = finished / name, folder / name
             with suppress(OSError):
-                if not new.exists() or os.path.samefile(new, place):
-                    os.unlink(place)
+                if os.path.samestat(own[name], (folder / name).lstat()):
+                    os.unlink(folder / name)
         put_back(finished, folder, names)
         raise
 

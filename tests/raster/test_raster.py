@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import time
@@ -755,6 +756,22 @@ def test_output_writer__publishes_no_report_of_files_that_failed(tmp_path, produ
     produce(tmp_path, products, report=("run.json", "{}"))
     assert (tmp_path / "run.json").read_text() == "{}"
     np.testing.assert_array_equal(look(tmp_path / "validity.tif")[0], products[1])
+
+
+def test_output_writer__deletes_no_other_file_where_its_temporary_folder_is_deleted(tmp_path, products, monkeypatch):
+    for name in OUTPUTS:
+        (tmp_path / name).write_text("of the run before")
+    put_aside = publishing._put_aside
+
+    def late(new, *arguments):
+        shutil.rmtree(new.parent)
+        put_aside(new, *arguments)
+
+    monkeypatch.setattr(publishing, "_put_aside", late)
+    with pytest.raises(OutputError, match="cannot be written: No such file or directory"):
+        produce(tmp_path, products, report=("run.json", "{}"))
+    assert left_behind(tmp_path) == OUTPUTS
+    assert [(tmp_path / name).read_text() for name in OUTPUTS] == ["of the run before"] * 3
 
 
 def test_output_writer__refuses_a_name_that_is_no_files_before_the_work(tmp_path, products):
