@@ -329,8 +329,10 @@ class Store:
             ) from error
 
     def remove(self) -> None:
-        """Delete the tiles and no other files."""
-        remove_tiles(self.home, self.folder)
+        """Delete the tiles of this run and no other files; those of another run may have taken their place."""
+        there = unsealed(self.folder.read(MANIFEST))
+        if there is None or digest(there) == self.run:
+            remove_tiles(self.home, self.folder)
 
 
 def remove_tiles(home: Path, place: Folder) -> None:

@@ -400,6 +400,22 @@ def test_match_tile__does_not_match_in_vain(pair, monkeypatch):
         match_block(job, next(iter(job.store.grid)))
 
 
+# Tiles of another run
+
+
+def test_store__removes_no_tiles_of_another_run_that_took_their_place(pair):
+    folder, settings = pair
+    images, out = (folder / "left.tif", folder / "right.tif"), folder / "out"
+    match_pair(*images, folder / "kept", settings, keep_tiles=True)
+    job = prepare(*images, out, settings | {"sgm": {"p2": 48}})
+    job.begin()
+    (out / "tiles").rename(folder / "away")
+    (folder / "kept" / "tiles").rename(out / "tiles")
+    before = sorted((out / "tiles").rglob("*"))
+    job.store.remove()
+    assert sorted((out / "tiles").rglob("*")) == before
+
+
 # Inputs among the outputs
 
 
