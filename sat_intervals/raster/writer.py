@@ -227,7 +227,10 @@ class OutputWriter:
         announce
             Called before, with the `stamps` that the files will have, the report last.
         """
-        self.build()
+        for name, made in self.build().items():
+            with self._failing(self._folder / name):
+                if checksum_of(self._scratch / name) != made:
+                    raise OSError(errno.EIO, "the content read back differs from that written")
         self._check_links()
         names = [file.name for file in self._files]
         if report:

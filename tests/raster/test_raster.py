@@ -823,6 +823,25 @@ def test_output_writer__publishes_no_file_that_differs_from_what_was_written(tmp
     assert left_behind(tmp_path) == []
 
 
+@pytest.mark.parametrize("damage", ["cut short", "zeroed"])
+def test_output_writer__publishes_no_file_that_was_damaged_since_it_was_made(tmp_path, products, monkeypatch, damage):
+    build = OutputWriter.build
+
+    def damaging(writer):
+        made = build(writer)
+        file = writer._scratch / "intervals.tif"
+        length = file.stat().st_size
+        os.truncate(file, length // 2)
+        if damage == "zeroed":
+            os.truncate(file, length)
+        return made
+
+    monkeypatch.setattr(OutputWriter, "build", damaging)
+    with pytest.raises(OutputError, match=r"intervals\.tif cannot be written: the content read back differs"):
+        produce(tmp_path, products)
+    assert left_behind(tmp_path) == []
+
+
 def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_path, products):
     intervals, validity = products
     with OutputWriter(tmp_path, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
