@@ -330,8 +330,7 @@ class Store:
 
     def remove(self) -> None:
         """Delete the tiles of this run and no other files; those of another run may have taken their place."""
-        there = unsealed(self.folder.read(MANIFEST))
-        if there is None or digest(there) == self.run:
+        if (there := unsealed(self.folder.read(MANIFEST))) is None or digest(there) == self.run:
             remove_tiles(self.home, self.folder)
 
 
@@ -368,10 +367,9 @@ def is_replacing(home: Path) -> bool:
 
 def replaceable_files(home: Path) -> dict[str, str]:
     """Return the stamps of the files that an unfinished run is to replace, by name."""
-    try:
+    with suppress(ValueError, TypeError, RecursionError):
         return dict(json.loads(folder_at(home).read(_REPLACING) or "{}"))
-    except (ValueError, TypeError, RecursionError):
-        return {}
+    return {}
 
 
 def has_begun(home: Path) -> bool:
