@@ -145,7 +145,7 @@ def checked_cells(
         The file to write is something else, or an argument cannot be used.
     """
     if path.exists() and not is_surface(path):
-        raise SatIntervalsError(f"{path} exists and is not a surface model: choose another --output")
+        raise SatIntervalsError(f"{path} exists and is not a surface model: move it away")
     grid = None
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)

@@ -30,6 +30,9 @@ class PointSight:
         Change of disparity for a height of one pixel's size on the ground; signed.
     """
 
+    NAMES = r"strip\d+"
+    """Pattern of the files' names."""
+
     def __init__(self, folder: Path, region: Window, rise: float) -> None:
         self._folder, self._region, self._rise = folder, region, rise
         self.points = 0

@@ -132,7 +132,7 @@ def make_truth(
     tally = _Tally(run)
     with (
         OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer,
-        writer.scratch("reference") as scratch,
+        writer.scratch("reference", PointSight.NAMES) as scratch,
     ):
         for row, strip in work.strips(shift, scratch, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))

@@ -58,7 +58,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        with LocalFolder(path.parent).scratch(path.name) as folder:
+        with LocalFolder(path.parent).scratch(path.name, re.escape(path.name) + ".*") as folder:
             new = folder / path.name
             yield new
             if before:

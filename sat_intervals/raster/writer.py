@@ -87,6 +87,7 @@ class OutputWriter:
         self._folder = Path(folder)
         self._hidden = self._folder / _SCRATCH.format(files[0].name)
         self._scratch, self._replaced = self._hidden / "files", self._hidden / "files" / REPLACED
+        self._folders: dict[Path, os.stat_result] = {}
         self._locked = ExitStack()
         self._files = tuple(files)
         self._names = (*(file.name for file in files), *REPORTS)
@@ -115,6 +116,7 @@ class OutputWriter:
                 self._remove_scratch()
                 (self._hidden / _MADE).touch()
                 self._replaced.mkdir(parents=True, exist_ok=True)
+                self._folders = {place: place.lstat() for place in (self._hidden, self._scratch, self._replaced)}
                 self._there = stamps(self._folder, self._names)
             self._check_space(1)
         except BaseException:
@@ -138,6 +140,9 @@ class OutputWriter:
         for place in (self._hidden, self._scratch, self._replaced):
             if place.is_symlink():
                 raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
+        for place, made in self._folders.items():
+            if not (place.exists() and os.path.samestat(made, place.lstat())):
+                raise OutputError(f"{place}, a folder of temporary files, was moved away: rerun the same command")
 
     def _unfinished(self) -> Iterator[Path]:
         """Yield files with names of temporary ones, the replaced ones first."""
@@ -227,7 +232,9 @@ class OutputWriter:
         announce
             Called before, with the `stamps` that the files will have, the report last.
         """
-        for name, made in self.build().items():
+        made_files = self.build()
+        self._check_links()
+        for name, made in made_files.items():
             with self._failing(self._folder / name):
                 if checksum_of(self._scratch / name) != made:
                     raise OSError(errno.EIO, "the content read back differs from that written")
@@ -243,9 +250,9 @@ class OutputWriter:
         publish(self._scratch, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
         self._is_published = True
 
-    def scratch(self, name: str) -> AbstractContextManager[Path]:
+    def scratch(self, name: str, names: str) -> AbstractContextManager[Path]:
         """Return the context of a folder for temporary files of the caller, see `LocalFolder.scratch`."""
-        return LocalFolder(self._folder).scratch(name)
+        return LocalFolder(self._folder).scratch(name, names)
 
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:

@@ -27,7 +27,8 @@ from sat_intervals.run.statistics import Tally
 from sat_intervals.run.strips import finish_strips
 from sat_intervals.run.workers import Workers, reason
 from sat_intervals.store.manifest import sealed
-from sat_intervals.store.tiles import Records, mark_finished, mark_replaced, replaceable_files
+from sat_intervals.store.marks import replaceable_files
+from sat_intervals.store.tiles import Records
 
 # Meanings of some of the counts, for readers of run.json.
 _COUNTS_MEANING = {
@@ -119,14 +120,13 @@ def _check_content(job: Job, name: str | None) -> None:
 
 
 def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> None:
-    home = job.store.home
-
     def announce(stamps: list[str]) -> None:
         if not keep_tiles:
-            mark_finished(home, job.name, stamps)
+            job.store.mark_finished(job.name, stamps)
 
-    writer.publish(("run.json", sealed(report) + "\n"), replaceable=replaceable_files(home), announce=announce)
-    mark_replaced(home)
+    there = replaceable_files(job.store.home)
+    writer.publish(("run.json", sealed(report) + "\n"), replaceable=there, announce=announce)
+    job.store.mark_replaced()
     if keep_tiles:  # otherwise the parts are removed with them
         try:
             job.parts().drop()

@@ -13,8 +13,9 @@ from sat_intervals.run.job import fitted_to_jobs
 from sat_intervals.run.output import check_as_published, is_complete
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
+from sat_intervals.store.marks import finished_run
 from sat_intervals.store.place import is_own, place_of
-from sat_intervals.store.tiles import finished_run, remove_tiles
+from sat_intervals.store.tiles import remove_tiles
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)

@@ -40,8 +40,9 @@ from sat_intervals.run.workers import parse_memory, readers
 from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import digest
+from sat_intervals.store.marks import finished_run
 from sat_intervals.store.parts import Parts
-from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store, finished_run
+from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store
 from sat_intervals.tiling import Grid, Tile, Window
 
 Search = Callable[[Image, Image, dict[str, dict[str, Any]]], Found]

@@ -131,7 +131,7 @@ def measure_subjects(
     key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with (
-        LocalFolder(folder).scratch("calibrate") as scratch,
+        LocalFolder(folder).scratch("calibrate", r"\d+|logs") as scratch,
         connected(subjects[0].config.cluster, scratch) as client,
     ):
         for number, subject in enumerate(subjects):

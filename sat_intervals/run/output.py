@@ -8,7 +8,8 @@ from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import RUN_FILES, is_marked, stamps
-from sat_intervals.store.tiles import finished_run, has_begun, is_replacing
+from sat_intervals.store.marks import finished_run, is_replacing
+from sat_intervals.store.tiles import has_begun
 
 OUTPUTS = (*(file.name for file in RUN_FILES), "run.json")
 

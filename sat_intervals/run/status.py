@@ -9,10 +9,11 @@ from sat_intervals.config.pairs import REPORT
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import BLOCK
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.marks import is_replacing
 from sat_intervals.store.parts import parts_in
 from sat_intervals.store.place import ElsewhereError
 from sat_intervals.store.removal import BORDERS
-from sat_intervals.store.tiles import is_replacing, store_of
+from sat_intervals.store.tiles import store_of
 
 __all__ = ["ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
 

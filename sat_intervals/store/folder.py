@@ -4,10 +4,10 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from sat_intervals.store.local import LocalFolder
+from sat_intervals.store.local import MADE, LocalFolder
 from sat_intervals.store.remote import RemoteFolder, object_tag
 
-__all__ = ["Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
+__all__ = ["MADE", "Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
 
 
 class Folder(Protocol):
@@ -51,6 +51,9 @@ class Folder(Protocol):
 
     def inside(self, folder: str) -> "Folder":
         """Return a subfolder."""
+
+    def of_run(self, run: str) -> "Folder":
+        """Return the folder, in which nothing is written or deleted once MADE has the digest of another run."""
 
     def make(self, folder: str) -> None:
         """Create a folder if the file system needs that."""

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -11,17 +12,21 @@ import uuid
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from glob import escape
 from itertools import groupby
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, check_regular
 
+# File with the digest of the run that made a folder. Its name outlasts a power loss, which truncates files.
+MADE = ".sat-intervals.tiles"
 # The lock file is regular and empty; any other file of this name is left unchanged.
 _LOCK = ".sat-intervals.lock"
 # Folder of the files of `LocalFolder.scratch`, beside the lock.
 _FILES = "files"
+# Flags to open a folder that is not a link.
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 # Seconds to wait for a lock.
 _TIMEOUT = 0.2
 # Empty folders deleted at once.
@@ -32,18 +37,22 @@ _AT_ONCE = 16
 class LocalFolder:
     """See `Folder`. Files are renamed when complete; runs exclude each other with ``flock``.
 
-    Nothing is written or deleted behind a link in the folder: its files are those of somebody else.
+    Nothing is written or deleted behind a link that is the folder or in it, nor in the folder of another run that took
+    its place: files there are those of somebody else.
 
     Attributes
     ----------
     path
         The folder.
     depth
-        Number of the last parts of ``path`` that are folders of the store, too.
+        Number of the folders above ``path`` that are folders of the store, too.
+    run
+        See `of_run`.
     """
 
     path: Path
-    depth: int = 0
+    depth: int = field(default=0, compare=False)
+    run: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """Return the path."""
@@ -129,11 +138,15 @@ class LocalFolder:
         self._own(name).unlink(missing_ok=True)
 
     def _own(self, name: str) -> Path:
-        """Return the path of what is written or deleted; raise if a folder of the store on the way is a link."""
+        """Return the path of what is written or deleted; raise if that would be somebody else's."""
         place = self.path / name
-        for folder in place.parents[: max(0, self.depth + len(Path(name).parts) - 1)]:
+        for folder in place.parents[: self.depth + len(Path(name).parts)]:
             if folder.is_symlink():
                 raise OSError(errno.ELOOP, f"{folder} has become a symbolic link", str(place))
+        top = (self.path, *self.path.parents)[self.depth]
+        made_by = LocalFolder(top).read(MADE) if self.run and name != MADE else None
+        if made_by and not self.run.startswith(made_by):  # after a power loss it may be shorter
+            raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
         return place
 
     def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
@@ -153,7 +166,11 @@ class LocalFolder:
 
     def inside(self, folder: str) -> "LocalFolder":
         """See `Folder`."""
-        return LocalFolder(self.path / folder, self.depth + len(Path(folder).parts))
+        return LocalFolder(self.path / folder, self.depth + len(Path(folder).parts), self.run)
+
+    def of_run(self, run: str) -> "LocalFolder":
+        """See `Folder`."""
+        return replace(self, run=run)
 
     def make(self, folder: str) -> None:
         """See `Folder`."""
@@ -245,38 +262,53 @@ class LocalFolder:
         return False
 
     @contextmanager
-    def scratch(self, name: str) -> Iterator[Path]:
+    def scratch(self, name: str, names: str) -> Iterator[Path]:
         """Yield a hidden folder for temporary files, new in this one; delete it after the block.
 
+        Only files and folders there whose names match the pattern ``names`` are deleted; with any others it stays.
         Those of this name that killed processes left are deleted before. They are known by the lock file that is left.
         """
         for left in self.path.glob(f".{escape(name)}-*"):
             with suppress(OSError, SatIntervalsError):  # it is in use, or cannot be deleted
                 if not left.is_symlink() and LocalFolder(left).has_lock():
-                    with LocalFolder(left)._emptied():
+                    with LocalFolder(left)._emptied(names):
                         pass
-        with LocalFolder(Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)))._emptied() as files:
+        with LocalFolder(Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)))._emptied(names) as files:
             files.mkdir()
             yield files
 
     @contextmanager
-    def _emptied(self) -> Iterator[Path]:
+    def _emptied(self, names: str) -> Iterator[Path]:
         """Lock the folder for the block; yield the place of its temporary files, which are then deleted.
 
         They are deleted in this folder, even if a link has taken its place.
         """
         with self.locked():
-            folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            folder = os.open(self.path, _FOLDER)
             try:
                 yield self.path / _FILES
             finally:
                 try:
-                    shutil.rmtree(_FILES, ignore_errors=True, dir_fd=folder)
+                    _empty(folder, names)
                 except BaseException:  # a signal: without the lock file nobody would delete the rest
-                    shutil.rmtree(_FILES, ignore_errors=True, dir_fd=folder)
+                    _empty(folder, names)
                     raise
                 finally:
                     os.close(folder)
+
+
+def _empty(folder: int, names: str) -> None:
+    """Delete what has these names in the temporary files of a folder, and their folder if it is then empty."""
+    with suppress(OSError):
+        files = os.open(_FILES, _FOLDER, dir_fd=folder)
+        try:
+            for name in filter(re.compile(names).fullmatch, os.listdir(files)):
+                shutil.rmtree(name, ignore_errors=True, dir_fd=files)
+                with suppress(OSError):
+                    os.unlink(name, dir_fd=files)
+        finally:
+            os.close(files)
+        os.rmdir(_FILES, dir_fd=folder)
 
 
 def _depth(folder: LocalFolder) -> int:

@@ -126,6 +126,10 @@ class RemoteFolder:
         """See `Folder`."""
         return RemoteFolder(f"{self.url}/{folder}")
 
+    def of_run(self, run: str) -> "RemoteFolder":
+        """See `Folder`; nothing can be put in the place of a prefix."""
+        return self
+
     def make(self, folder: str) -> None:
         """See `Folder`."""
         with suppress(FileExistsError), self._reached(folder) as (system, path):

@@ -3,15 +3,13 @@
 import re
 from contextlib import suppress
 
-from sat_intervals.store.folder import Folder
+from sat_intervals.store.folder import MADE, Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed
 
 ARRAYS, RECORDS, FAILURES = "arrays.zarr", "records", "failures"
 BORDERS, PIXELS, COSTS, PARTS = "borders", "pixels", "costs", "parts"
 FOLDERS = RECORDS, FAILURES, BORDERS, PIXELS, COSTS, PARTS
 NORMALIZATION, SEARCH = "normalization.json", "range.json"
-# Empty file that says that a run made the folder: its name outlasts a power loss, which truncates other files.
-MADE = ".sat-intervals.tiles"
 _OF_RUN = re.compile(
     rf"{re.escape(MADE)}|{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
 )
@@ -103,8 +101,9 @@ def final_name(name: str) -> str:
 
 
 def is_of_run(folder: Folder) -> bool:
-    """Return whether a run made a folder: it has its mark or a manifest."""
-    if folder.read(MADE) is not None:
+    """Return whether a run made a folder: it has its mark, perhaps truncated by a power loss, or a manifest."""
+    made_by = folder.read(MADE)
+    if made_by is not None and re.fullmatch("[0-9a-f]{0,32}", made_by):
         return True
     with suppress(StoreError):
         return {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys()

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import RemovedTilesError, RunError
-from sat_intervals.store.folder import Folder, folder_at
+from sat_intervals.store.folder import MADE, Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
+from sat_intervals.store.marks import FINISHED, REPLACING
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
     FAILURES,
     FOLDERS,
-    MADE,
     NORMALIZATION,
     RECORDS,
     SEARCH,
@@ -45,10 +45,6 @@ Records = Mapping[str, Mapping[str, Any]]
 
 # Increase when arrays or records change: older tiles cannot be resumed.
 LAYOUT = 11
-
-# Marker files in the folder of a run: present while it replaces an earlier run; its name, from the publication of its
-# files to the removal of its tiles.
-_REPLACING, _FINISHED = ".sat-intervals.replacing", ".sat-intervals.finished"
 
 
 class DamagedTilesError(RunError):
@@ -94,7 +90,12 @@ class Store:
     @property
     def folder(self) -> Folder:
         """Return the folder of the tiles."""
-        return folder_at(self.elsewhere or self.home)
+        return folder_at(self.elsewhere or self.home).of_run(self.run)
+
+    @property
+    def _marks(self) -> Folder:
+        """Return the folder of the marker files."""
+        return folder_at(self.home).of_run(self.run)
 
     @property
     def _arrays(self) -> TileArrays:
@@ -127,7 +128,8 @@ class Store:
         StoreError
             The existing store has other settings, inputs or versions, is at another place, or cannot be used.
         """
-        home, folder = folder_at(self.home), self.folder
+        home, folder = self._marks, self.folder
+        there = folder_at(self.elsewhere or self.home)  # perhaps of another run, until that is deleted
         try:
             before = self._place_before(overwrite)
             check_not_foreign(folder)
@@ -139,22 +141,23 @@ class Store:
                         f"the tiles of the run in {self.home.parent} are in {before}, not in {folder}: give the same "
                         "--store as before (or none) to resume, or --overwrite to start again"
                     )
-            folder.make("")  # fails before anything is deleted
+            there.make("")  # fails before anything is deleted
             if overwrite and before is not None:
                 with suppress(OSError):  # an unreachable store is kept
                     if before == home or is_own(before):
                         drop(before)
             if overwrite or (text is None and not self.elsewhere):
-                drop(folder)
+                drop(there)
+            there.make("")
+            there.write(MADE, self.run)
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
-            for name in ("", *FOLDERS):
+            for name in FOLDERS:
                 folder.make(name)
-            folder.write(MADE, "")
             home.make("")
-            home.delete(_FINISHED)
+            home.delete(FINISHED)
             if overwrite:
-                home.write(_REPLACING, json.dumps(dict(replaceable or {})))
+                home.write(REPLACING, json.dumps(dict(replaceable or {})))
             if self.elsewhere:
                 home.write(PLACE, json.dumps(str(folder)))
             else:
@@ -333,43 +336,23 @@ class Store:
         if (there := unsealed(self.folder.read(MANIFEST))) is None or digest(there) == self.run:
             remove_tiles(self.home, self.folder)
 
+    def mark_finished(self, name: str, stamps: Sequence[str]) -> None:
+        """Mark a run as finished, so that its tiles are removed even if it is killed before.
+
+        Call it before its files are published, with the stamps that they will have.
+        """
+        self._marks.write(FINISHED, "\n".join([name, *stamps]))
+
+    def mark_replaced(self) -> None:
+        """Mark the earlier run's files as replaced, see `is_replacing`."""
+        self._marks.delete(REPLACING)
+
 
 def remove_tiles(home: Path, place: Folder) -> None:
     """Delete a run's tiles in ``place``, and its marker files in ``home``."""
     drop(place)
-    names = PLACE, _REPLACING, _FINISHED
+    names = PLACE, REPLACING, FINISHED
     folder_at(home).delete_all([name for name in folder_at(home).sizes() if final_name(name) in names])
-
-
-def mark_finished(home: Path, run: str, stamps: Sequence[str]) -> None:
-    """Mark a run as finished, so that its tiles are removed even if it is killed before.
-
-    Call it before its files are published, with the stamps that they will have.
-    """
-    folder_at(home).write(_FINISHED, "\n".join([run, *stamps]))
-
-
-def finished_run(home: Path) -> tuple[str, list[str]] | None:
-    """Return run and stamps of `mark_finished`; None if not marked or the tiles were removed since."""
-    run, *stamps = (folder_at(home).read(_FINISHED) or "").split("\n")
-    return (run, stamps) if run else None
-
-
-def mark_replaced(home: Path) -> None:
-    """Mark the earlier run's files as replaced, see `is_replacing`."""
-    folder_at(home).delete(_REPLACING)
-
-
-def is_replacing(home: Path) -> bool:
-    """Return whether an unfinished run is to replace the files of an earlier one."""
-    return folder_at(home).read(_REPLACING) is not None
-
-
-def replaceable_files(home: Path) -> dict[str, str]:
-    """Return the stamps of the files that an unfinished run is to replace, by name."""
-    with suppress(ValueError, TypeError, RecursionError):
-        return dict(json.loads(folder_at(home).read(_REPLACING) or "{}"))
-    return {}
 
 
 def has_begun(home: Path) -> bool:

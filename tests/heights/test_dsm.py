@@ -599,9 +599,9 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         (
             [far[0]],
             ["--output", str(far[0] / "points.tif")],
-            "exists and is not a surface model: choose another --output",
+            "exists and is not a surface model: move it away",
         ),
-        ([far[0]], ["--output", str(tmp_path)], "exists and is not a surface model: choose another --output"),
+        ([far[0]], ["--output", str(tmp_path)], "exists and is not a surface model: move it away"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "has -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(tmp_path / "none.gtx")], "none.gtx: no such file"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "a,@b.tif", 9.0))], "a,@b.tif: PROJ reads no file with a co"),

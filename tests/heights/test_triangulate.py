@@ -21,7 +21,6 @@ from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.raster import stamps
 from sat_intervals.results import open_run
-from sat_intervals.store.tiles import mark_finished
 from sat_intervals.tiling import Window
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
@@ -456,7 +455,8 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert "median half width +-" in result.stdout
     noted = list(stamps(out, ("intervals.tif", "validity.tif", "run.json")).values())
     (out / "tiles").mkdir()
-    mark_finished(out / "tiles", "of this run", noted)  # as a run that was killed before it removed its tiles
+    mark = out / "tiles" / ".sat-intervals.finished"
+    mark.write_text("\n".join(["of this run", *noted]))  # as a run that was killed before it removed its tiles
     figures = json.loads(invoke(*command, "--json").stdout)
     assert not (out / "tiles").exists()
     assert figures["run"] == open_run(out).report

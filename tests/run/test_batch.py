@@ -33,7 +33,6 @@ from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_block
 from sat_intervals.run.workers import connected, parse_memory
 from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.tiles import mark_finished
 
 
 @pytest.fixture(scope="module")
@@ -346,7 +345,8 @@ def test_match_batch__removes_tiles_that_a_death_left_beside_a_result_and_none_t
     pairs = read_batch(rows(images))
     first = match_batch(pairs, tmp_path, keep_tiles=True)
     noted = list(stamps(tmp_path / "pair2", ("intervals.tif", "validity.tif", "run.json")).values())
-    mark_finished(tmp_path / "pair2" / "tiles", "the run of pair2", noted)  # as a run does before it removes its tiles
+    mark = tmp_path / "pair2" / "tiles" / ".sat-intervals.finished"
+    mark.write_text("\n".join(["the run of pair2", *noted]))  # as a run does before it removes its tiles
     again = match_batch(pairs, tmp_path)
     assert [path.parent.name for path in tmp_path.glob("*/tiles")] == ["pair1"]
     assert (tmp_path / "pair1" / "tiles" / "manifest.json").exists()

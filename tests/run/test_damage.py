@@ -8,12 +8,14 @@ from contextlib import suppress
 from functools import reduce
 from operator import getitem
 
+import numpy as np
 import pytest
 import yaml
 from helpers import OUTPUTS, hashes, invoke, write_pair
 from networks import random_weights, write_network
 
 from sat_intervals import match_pair
+from sat_intervals.config import load_config
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -335,6 +337,10 @@ def with_files(folder, names):
     return {folder / name: f"mine: {name}" for name in names}
 
 
+def contents(folder):
+    return {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
 def assert_kept(mine):
     assert {file: file.read_text() for file in mine} == mine
 
@@ -377,27 +383,62 @@ def test_match__keeps_files_of_the_user_in_the_folder_of_its_tiles(scene, tmp_pa
     assert {file for file in tiles.rglob("*") if file.is_file()} == {file for file in mine if tiles in file.parents}
 
 
-@pytest.mark.parametrize("name", ["records", "arrays.zarr", "arrays.zarr/int16/c/0"])
-def test_match_block__keeps_files_behind_a_folder_that_becomes_a_link(scene, tmp_path, name):
-    job = prepare(scene / "left.tif", scene / "right.tif", tmp_path / "out", scene / "settings.yaml")
+def begun(scene, out, **overrides):
+    config = load_config(scene / "settings.yaml", overrides)
+    job = prepare(scene / "left.tif", scene / "right.tif", out, config)
     job.begin()
+    return job
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+@pytest.mark.parametrize("name", ["", "records", "arrays.zarr", "arrays.zarr/int16/c/0"])
+def test_match_block__keeps_files_behind_a_folder_that_becomes_a_link(scene, tmp_path, name, elsewhere):
+    job = begun(scene, tmp_path / "out", cluster={"store": str(tmp_path / "store") if elsewhere else None})
     first, second, *_ = job.store.grid
     match_block(job, first)
-    folder, user = tmp_path / "out" / "tiles" / name, tmp_path / "user"
+    folder, user = job.store.folder.place(name), tmp_path / "user"
     folder.rename(user)
     folder.symlink_to(user)
-    written = [str(file.relative_to(user)) for file in user.rglob("*") if file.is_file()]
-    mine = with_files(user, written)
+    written = {str(file.relative_to(user)) for file in user.rglob("*") if file.is_file()}
+    kept = {user / name: (user / name).read_text() for name in written & {"manifest.json", ".sat-intervals.tiles"}}
+    mine = kept | with_files(user, written - {file.name for file in kept})
     with pytest.raises(OSError, match=f"{folder} has become a symbolic link"):
         match_block(job, second)
-    with suppress(OSError):
-        job.store._arrays.drop(first)
-    job.store.remove()
+    for delete in (lambda: job.store._arrays.drop(first), job.store.remove):
+        with suppress(OSError):
+            delete()
     assert_kept(mine)
     assert {file for file in user.rglob("*") if file.is_file()} == set(mine)
 
 
-@pytest.mark.parametrize("name", ["records/0_0.json", *SHARDS[:1], "normalization.json", "manifest.json"])
+def test_match_block__keeps_the_tiles_of_another_run_that_take_the_place_of_its_own(scene, tmp_path):
+    job, another = begun(scene, tmp_path / "out"), begun(scene, tmp_path / "another", sgm={"p1": 9})
+    first, *_ = job.store.grid
+    match_block(another, first)
+    (tmp_path / "out" / "tiles").rename(tmp_path / "moved")
+    there = (tmp_path / "another" / "tiles").rename(tmp_path / "out" / "tiles")
+    before = contents(there)
+    writes = [
+        lambda: match_block(job, first),
+        lambda: job.store.write_record(first, {"files": {}}),
+        lambda: job.store.write_normalization({}),
+        lambda: job.store.write_search({}, ""),
+        lambda: job.store.mark_finished("run", []),
+        lambda: job.store.steps.write("pixels", "0_0", np.zeros(1)),
+        lambda: job.parts().begin(),
+        lambda: job.store._arrays.drop(first),
+    ]
+    for write in writes:
+        with pytest.raises((OSError, SatIntervalsError), match=r"has become the folder of another run|holds the tiles"):
+            write()
+    job.store.write_failure(first.name, "a reason")
+    job.store.remove()
+    assert contents(there) == before
+
+
+@pytest.mark.parametrize(
+    "name", ["records/0_0.json", ".sat-intervals.tiles", *SHARDS[:1], "normalization.json", "manifest.json"]
+)
 @pytest.mark.parametrize("options", [[], ["--overwrite"]])
 def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
     mine = with_files(tmp_path / "out" / "tiles", [name])

@@ -618,7 +618,7 @@ def test_locked__keeps_what_is_not_its_lock(tmp_path, kind):
 
 def test_scratch__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
     elsewhere, foreign, link = tmp_path / "elsewhere", tmp_path / ".work-mine", tmp_path / ".work-link"
-    with LocalFolder(tmp_path).scratch("work") as used:
+    with LocalFolder(tmp_path).scratch("work", "tiles") as used:
         (used / "tiles").mkdir()
         (used / "tiles" / "file").write_text("half")
         left = shutil.copytree(used.parent, tmp_path / ".work-left")
@@ -627,7 +627,7 @@ def test_scratch__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
         link.symlink_to(elsewhere)
         foreign.mkdir()
         (foreign / "files").write_text("mine")
-        with LocalFolder(tmp_path).scratch("work") as new:
+        with LocalFolder(tmp_path).scratch("work", "tiles") as new:
             assert (list(new.iterdir()), new.parent.parent) == ([], tmp_path)
         assert not left.exists()
         assert (used / "tiles" / "file").exists()
@@ -639,10 +639,21 @@ def test_scratch__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
 def test_scratch__deletes_nothing_behind_a_link_that_took_its_place(tmp_path):
     (tmp_path / "mine" / "files").mkdir(parents=True)
     (tmp_path / "mine" / "files" / "precious").write_text("mine")
-    with LocalFolder(tmp_path).scratch("work") as used:
+    with LocalFolder(tmp_path).scratch("work", "precious") as used:
         used.parent.rename(tmp_path / "moved")
         used.parent.symlink_to(tmp_path / "mine")
     assert (tmp_path / "mine" / "files" / "precious").read_text() == "mine"
+
+
+def test_scratch__keeps_what_is_put_beside_its_files(tmp_path):
+    with LocalFolder(tmp_path).scratch("work", r"\d+|table.*") as used:
+        for name in ("1/notes.txt", "table.tif.aux.xml", "table.tif"):
+            (used / name).parent.mkdir(exist_ok=True)
+            (used / name).write_text("half")
+        (used / "2").symlink_to(tmp_path)
+        (used / "notes.txt").write_text("mine")
+        (used / "dir").mkdir()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [used.parent.name, "dir", "files", "notes.txt"]
 
 
 @pytest.mark.parametrize("inner", ["", "files", "files/replaced"])
@@ -695,6 +706,33 @@ def test_output_writer__does_not_follow_a_link_that_appears_meanwhile(tmp_path):
     with pytest.raises(OutputError, match="files is a symbolic link"):
         write()
     assert contents(tmp_path / "user") == {str(tmp_path / "user" / "intervals.tif"): b"mine"}
+
+
+@pytest.mark.parametrize("inner", ["", "files", "files/replaced"])
+def test_output_writer__deletes_nothing_in_a_folder_that_took_the_place_of_its_own(tmp_path, inner):
+    hidden = tmp_path / "out" / ".unpublished-intervals.tif"
+    place = hidden / inner
+    names = {"": ".sat-intervals.files", "files": "strips-intervals.tif", "files/replaced": "intervals.tif"}
+
+    def exchange():
+        place.rename(tmp_path / "moved")
+        place.mkdir()
+        (place / names[inner]).write_text("mine")
+
+    for before in (True, False):
+        with writer(tmp_path / "out") as output:
+            output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+            if before:
+                output.build()
+                exchange()
+                with pytest.raises(OutputError, match=f"{place}, a folder of temporary files, was moved away: rerun"):
+                    output.publish()
+            else:
+                output.publish()
+                exchange()
+        assert (place / names[inner]).read_text() == "mine"
+        shutil.rmtree(hidden)
+        shutil.rmtree(tmp_path / "moved")
 
 
 def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
