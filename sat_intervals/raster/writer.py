@@ -141,8 +141,8 @@ class OutputWriter:
             if place.is_symlink():
                 raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
         for place, made in self._folders.items():
-            if not (place.exists() and os.path.samestat(made, place.lstat())):
-                raise OutputError(f"{place}, a folder of temporary files, was moved away: rerun the same command")
+            if place.exists() and not os.path.samestat(made, place.lstat()):
+                raise OutputError(f"{place}, a folder of temporary files, was replaced: move it away and rerun")
 
     def _unfinished(self) -> Iterator[Path]:
         """Yield files with names of temporary ones, the replaced ones first."""
