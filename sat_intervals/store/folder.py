@@ -4,10 +4,10 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from sat_intervals.store.local import MADE, LocalFolder
+from sat_intervals.store.local import MADE, LocalFolder, mark
 from sat_intervals.store.remote import RemoteFolder, object_tag
 
-__all__ = ["MADE", "Folder", "LocalFolder", "RemoteFolder", "folder_at", "object_tag"]
+__all__ = ["MADE", "Folder", "LocalFolder", "RemoteFolder", "folder_at", "mark", "object_tag"]
 
 
 class Folder(Protocol):
@@ -53,7 +53,7 @@ class Folder(Protocol):
         """Return a subfolder."""
 
     def of_run(self, run: str) -> "Folder":
-        """Return the folder, in which nothing is written or deleted once MADE has the digest of another run."""
+        """Return the folder, in which nothing is written or deleted once MADE has the mark of another run."""
 
     def make(self, folder: str) -> None:
         """Create a folder if the file system needs that."""

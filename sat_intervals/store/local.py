@@ -9,6 +9,7 @@ import stat
 import tempfile
 import time
 import uuid
+import zlib
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -19,7 +20,7 @@ from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, check_regular
 
-# File with the digest of the run that made a folder. Its name outlasts a power loss, which truncates files.
+# File with the `mark` of the run that made a folder. Its name outlasts a power loss, which empties files.
 MADE = ".sat-intervals.tiles"
 # The lock file is regular and empty; any other file of this name is left unchanged.
 _LOCK = ".sat-intervals.lock"
@@ -145,7 +146,7 @@ class LocalFolder:
                 raise OSError(errno.ELOOP, f"{folder} has become a symbolic link", str(place))
         top = (self.path, *self.path.parents)[self.depth]
         made_by = LocalFolder(top).read(MADE) if self.run and name != MADE else None
-        if made_by and not self.run.startswith(made_by):  # after a power loss it may be shorter
+        if made_by and made_by != mark(self.run) and made_by == mark(made_by[:-8]):  # otherwise it is damaged
             raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
         return place
 
@@ -295,6 +296,11 @@ class LocalFolder:
                     raise
                 finally:
                     os.close(folder)
+
+
+def mark(run: str) -> str:
+    """Return the content of MADE: the digest of a run and its CRC-32, eight digits."""
+    return f"{run}{zlib.crc32(run.encode()):08x}"
 
 
 def _empty(folder: int, names: str) -> None:

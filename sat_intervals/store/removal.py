@@ -101,9 +101,8 @@ def final_name(name: str) -> str:
 
 
 def is_of_run(folder: Folder) -> bool:
-    """Return whether a run made a folder: it has its mark, perhaps truncated by a power loss, or a manifest."""
-    made_by = folder.read(MADE)
-    if made_by is not None and re.fullmatch("[0-9a-f]{0,32}", made_by):
+    """Return whether a run made a folder: it has its mark or a manifest."""
+    if folder.read(MADE) is not None:
         return True
     with suppress(StoreError):
         return {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys()

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import RemovedTilesError, RunError
-from sat_intervals.store.folder import MADE, Folder, folder_at
+from sat_intervals.store.folder import MADE, Folder, folder_at, mark
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.marks import FINISHED, REPLACING
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
@@ -149,7 +149,7 @@ class Store:
             if overwrite or (text is None and not self.elsewhere):
                 drop(there)
             there.make("")
-            there.write(MADE, self.run)
+            there.write(MADE, mark(self.run))
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
             for name in FOLDERS:

@@ -39,6 +39,7 @@ DAMAGES = {
         content[: len(content) // 2] + bytes([content[len(content) // 2] ^ 1]) + content[len(content) // 2 + 1 :]
     ),
     "no text": lambda content: b"\xff\xfe" + content,
+    "zeros": lambda content: bytes(len(content)),  # as some file systems leave it after a power loss
     "gone": None,
 }
 
@@ -90,14 +91,15 @@ THOROUGH = [
     *itertools.product([DESCRIPTIONS[0]], ["bit", "gone"]),
 ]
 ONCE = [SHARDS[0], SHARDS[2], *CHUNKS, *DESCRIPTIONS[1:]]
+MARK = ".sat-intervals.tiles"
 
 
-@pytest.mark.parametrize(("name", "how"), [*THOROUGH, *itertools.product(ONCE, ["bit"])])
+@pytest.mark.parametrize(("name", "how"), [*THOROUGH, *itertools.product(ONCE, ["bit"]), (MARK, "zeros")])
 def test_match__of_a_damaged_store_gives_the_right_bytes_or_names_the_way_out(scene, tmp_path, name, how):
     tiles = unfinished(scene, tmp_path / "out")
     before = {file: file.stat().st_mtime_ns for file in (tiles / "records").iterdir()}
     damage(tiles / name, how)
-    if name == "manifest.json" and how in ("half", "bit", "no text"):
+    if name == "manifest.json" and how in ("half", "bit", "no text", "zeros"):
         assert f"{tiles}/manifest.json cannot be read, " in (said := match(scene, tmp_path / "out", status=2))
         assert "--overwrite" in said
         match(scene, tmp_path / "out", "--overwrite")
@@ -105,7 +107,7 @@ def test_match__of_a_damaged_store_gives_the_right_bytes_or_names_the_way_out(sc
         match(scene, tmp_path / "out", "--keep-tiles")
         if name != "manifest.json":
             again = {file for file in before if file.stat().st_mtime_ns != before[file]}
-            assert again == (set() if name in DESCRIPTIONS else {tiles / "records" / "1_0.json"})
+            assert again == (set() if name in (*DESCRIPTIONS, MARK) else {tiles / "records" / "1_0.json"})
     assert_same(scene, tmp_path / "out")
 
 
@@ -275,8 +277,10 @@ def dies(*arguments, **named):
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-@pytest.mark.parametrize("is_begun", [False, True])
-def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_path, monkeypatch, is_begun, elsewhere):
+@pytest.mark.parametrize(("is_begun", "mark"), [(False, None), *itertools.product([True], ["half", "bit", "zeros"])])
+def test_match__removes_tiles_that_a_death_left_beside_its_result(
+    scene, tmp_path, monkeypatch, is_begun, elsewhere, mark
+):
     out, store = tmp_path / "out", ["--store", tmp_path / "store"] if elsewhere else []
     with monkeypatch.context() as patch:
         patch.setattr(Store, "remove", dies)
@@ -285,6 +289,8 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(scene, tmp_pat
     if is_begun:
         for file in tmp_path.rglob("manifest.json"):
             file.unlink()
+        for file in tmp_path.rglob(MARK):
+            damage(file, mark)
     assert f"{out} already holds a run" in match(scene, out, *store, "--tile-size", "128", status=2)
     settings = yaml.safe_load((scene / "settings.yaml").read_text()) | {"median": None}  # of which no tile knows
     with pytest.raises(SatIntervalsError, match="already holds a run"):
@@ -400,7 +406,7 @@ def test_match_block__keeps_files_behind_a_folder_that_becomes_a_link(scene, tmp
     folder.rename(user)
     folder.symlink_to(user)
     written = {str(file.relative_to(user)) for file in user.rglob("*") if file.is_file()}
-    kept = {user / name: (user / name).read_text() for name in written & {"manifest.json", ".sat-intervals.tiles"}}
+    kept = {user / name: (user / name).read_text() for name in written & {"manifest.json", MARK}}
     mine = kept | with_files(user, written - {file.name for file in kept})
     with pytest.raises(OSError, match=f"{folder} has become a symbolic link"):
         match_block(job, second)
@@ -436,9 +442,7 @@ def test_match_block__keeps_the_tiles_of_another_run_that_take_the_place_of_its_
     assert contents(there) == before
 
 
-@pytest.mark.parametrize(
-    "name", ["records/0_0.json", ".sat-intervals.tiles", *SHARDS[:1], "normalization.json", "manifest.json"]
-)
+@pytest.mark.parametrize("name", ["records/0_0.json", *SHARDS[:1], "normalization.json", "manifest.json"])
 @pytest.mark.parametrize("options", [[], ["--overwrite"]])
 def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
     mine = with_files(tmp_path / "out" / "tiles", [name])

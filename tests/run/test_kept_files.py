@@ -725,7 +725,9 @@ def test_output_writer__deletes_nothing_in_a_folder_that_took_the_place_of_its_o
             if before:
                 output.build()
                 exchange()
-                with pytest.raises(OutputError, match=f"{place}, a folder of temporary files, was replaced: move it away"):
+                with pytest.raises(
+                    OutputError, match=f"{place}, a folder of temporary files, was replaced: move it away"
+                ):
                     output.publish()
             else:
                 output.publish()
