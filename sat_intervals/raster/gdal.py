@@ -24,14 +24,16 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
-# GDAL's prefixes of files on servers.
-_REMOTE = "vsicurl", "vsis3", "vsigs", "vsiaz", "vsiadls", "vsioss", "vsiswift", "vsiwebhdfs"
+# GDAL's prefixes of files on servers, with and without a URL in the form of a query.
+_REMOTE = "vsicurl/", "vsicurl?", "vsis3/", "vsigs/", "vsiaz/", "vsiadls/", "vsioss/", "vsiswift/", "vsiwebhdfs/"
 # With these, all files of an image are read as they are now, whatever the environment of a worker, and damage is an
 # error: rasterio ignores a failure without a message, and returns zeros.
 _STRICT = {
     "GDAL_DISABLE_READDIR_ON_OPEN": "FALSE",  # otherwise masks beside an image are not seen
+    "GDAL_READDIR_LIMIT_ON_OPEN": "1000000",  # of a bucket, GDAL takes the first names for all
     "GDAL_PAM_ENABLED": "YES",  # otherwise no-data values in .aux.xml are not seen
-    "CPL_VSIL_CURL_NON_CACHED": ":".join(f"/{name}/" for name in _REMOTE),  # a later run may find another file there
+    "CPL_VSIL_CURL_NON_CACHED": ":".join(f"/{name}" for name in _REMOTE),  # a later run may find another file there
+    "GDAL_HTTP_MAX_RETRY": os.environ.get("GDAL_HTTP_MAX_RETRY", "3"),  # a busy server seems to have no mask
     "GDAL_NUM_THREADS": "1",  # a failure in another thread has no message in this one
     "VRT_NUM_THREADS": "1",
     "GTIFF_DIRECT_IO": "NO",

@@ -3,9 +3,9 @@
 import logging
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -62,6 +62,8 @@ class Image:
         The user's mask: a file of the same size, not 0 where the image must not be used; None without one.
     georeferencing
         Georeferencing of the file.
+    beside
+        Files with its mask or no-data value.
     stamps
         `stamps_of` its files before it was opened.
     """
@@ -76,7 +78,23 @@ class Image:
     alpha: int | None
     mask: str | None
     georeferencing: Georeferencing
-    stamps: tuple[str | None, ...]
+    beside: tuple[str, ...]
+    stamps: Mapping[str, str | None] = field(hash=False)
+
+    def check_complete(self, dataset: DatasetReader) -> None:
+        """Raise if GDAL did not find a file beside the image now: to GDAL, a busy server has no masks.
+
+        Raises
+        ------
+        InputError
+            Names the first one.
+        """
+        files = dataset.files if self.beside else ()
+        if missing := [file for file in self.beside if file not in files]:
+            raise InputError(
+                f"{missing[0]} was there when {self.path} was opened, but cannot be found now: rerun the same command "
+                "when its server answers: it resumes"
+            )
 
 
 def open_image(
@@ -125,6 +143,7 @@ def open_image(
             alpha=alphas[0] if alphas else None,
             mask=None if mask is None else _absolute(mask),
             georeferencing=Georeferencing.of(dataset),
+            beside=tuple(file for file in dataset.files if file.endswith((".msk", ".aux.xml")) and _is_read(file)),
             stamps=stamps,
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
@@ -289,7 +308,6 @@ def other_files(name: str) -> list[str]:
     seen: set[str] = set()
     asked: set[str] = set()
     listed: dict[str, list[str]] = {}
-    own = Path(name).resolve()
     waiting = [name]
     while waiting:
         path = waiting.pop()
@@ -305,10 +323,17 @@ def other_files(name: str) -> list[str]:
                 waiting += filter(_may_have_others, _sources(path) if dataset.driver == "VRT" else [])
         except gdal.GDAL_ERRORS:  # a sidecar file that is not a raster
             continue
-        new = [file for file in files if file not in seen and Path(file).resolve() != own]
+        new = [file for file in files if file not in seen and not _is_same(file, name)]
         seen.update(new)
         waiting += filter(_may_have_others, new)
     return sorted(seen)
+
+
+def _is_same(file: str, name: str) -> bool:
+    """Return whether GDAL lists a raster of this name as a file."""
+    _, is_url, place = name.partition("://")
+    is_listed = bool(is_url) and file.startswith("/vsi") and file.endswith(place)
+    return is_listed or Path(file).resolve() == Path(name).resolve()
 
 
 def _may_have_others(name: str) -> bool:
@@ -332,8 +357,8 @@ def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:
     return check
 
 
-def watched_images(images: Iterable[Image]) -> Callable[[], None]:
-    """Return what `watched_rasters` returns, for images as they were opened, and their masks.
+def watched_images(images: Iterable[Image], *others: str | Path | None) -> Callable[[], None]:
+    """Return what `watched_rasters` returns, for images as they were opened, their masks, and other rasters.
 
     Raises
     ------
@@ -341,7 +366,7 @@ def watched_images(images: Iterable[Image]) -> Callable[[], None]:
         A file of an image was replaced or changed since it was opened.
     """
     images = list(images)
-    check = watched_rasters(file for image in images for file in (image.path, image.mask))
+    check = watched_rasters([*others, *(file for image in images for file in (image.path, image.mask))])
     for image in images:
         if is_replaced(image):
             raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: rerun the command")
@@ -350,13 +375,16 @@ def watched_images(images: Iterable[Image]) -> Callable[[], None]:
 
 def read_files(name: str) -> list[str]:
     """Return a raster and its `other_files`, but no ``.aux.xml`` that a program wrote which only showed it."""
-    others = (file for file in other_files(name) if not (file.endswith(".aux.xml") and has_statistics_only(Path(file))))
-    return [name, *others]
+    return [name, *filter(_is_read, other_files(name))]
 
 
-def stamps_of(name: str) -> tuple[str | None, ...]:
-    """Return the stamps of the `read_files` of a raster, see `stamp_of`; None for one that has none."""
-    return tuple(map(stamp_of, read_files(name)))
+def _is_read(file: str) -> bool:
+    return not (file.endswith(".aux.xml") and has_statistics_only(Path(file)))
+
+
+def stamps_of(name: str) -> dict[str, str | None]:
+    """Return the stamps of the `read_files` of a raster by name, see `stamp_of`; None for one that has none."""
+    return {file: stamp_of(file) for file in read_files(name)}
 
 
 def is_replaced(image: Image) -> bool:
@@ -365,6 +393,8 @@ def is_replaced(image: Image) -> bool:
     A server that does not answer does not change a file.
     """
     now = stamps_of(image.path)
-    return len(now) != len(image.stamps) or any(
-        None not in (stamp, before) and stamp != before for stamp, before in zip(now, image.stamps, strict=True)
+    stamps = (
+        (now[file] if file in now else stamp_of(file), image.stamps.get(file, "missing"))
+        for file in now.keys() | image.stamps.keys()
     )
+    return any(None not in (after, before) and after != before for after, before in stamps)

@@ -100,6 +100,7 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
     """Read values, in the file's type, and states of a window inside the image, sampled to ``shape`` if given."""
     area = RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(image.path, window) as dataset:
+        image.check_complete(dataset)
         values = dataset.read(image.band, window=area, out_shape=shape)
         usable = np.isfinite(values) & _differs(values, image.nodata)
         # GDAL's mask of a band uses only the first of mask, no-data value and alpha: combine them here.

@@ -1,6 +1,7 @@
 """Identity of input files; inputs on a web server, read by windows and identified by size and ETag."""
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import time
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 
+import boto3
 import numpy as np
 import pytest
 import rasterio
@@ -35,6 +37,16 @@ def images() -> dict[str, bytes]:
                 file.write(getattr(scene, side), 1)
             content[f"{side}.tif"] = memory.read()
     return content
+
+
+def mask_of(side: int) -> bytes:
+    """A mask file without a pixel to leave out."""
+    with rasterio.MemoryFile() as memory:
+        profile = {"driver": "GTiff", "height": side, "width": side, "count": 1, "dtype": "uint8"}
+        with memory.open(**profile, crs="EPSG:32631", transform=rasterio.Affine(0.5, 0, 0, 0, -0.5, 0)) as file:
+            file.update_tags(INTERNAL_MASK_FLAGS_1=2)  # for all bands
+            file.write(np.full((side, side), 255, np.uint8), 1)
+        return bytes(memory.read())
 
 
 def put(images: dict[str, bytes], folder: Path) -> None:
@@ -176,6 +188,35 @@ def test_describe_inputs__of_an_image_on_a_server_that_is_replaced_when_it_is_op
         _, errors = process.communicate("\n", timeout=60)
     expected = "right.tif or a file beside it was replaced or changed since it was opened"
     assert (process.returncode != 0, expected in errors) == (is_replaced, is_replaced)
+
+
+OPENED = """import json, sys
+from sat_intervals import open_image
+image = open_image(sys.argv[1])
+print(json.dumps([image.use_mask, *image.stamps]))"""
+
+
+def opened(name):
+    """Whether an image has a mask, and its files; in a process of its own, since GDAL holds Python's lock."""
+    done = subprocess.run([sys.executable, "-c", OPENED, name], capture_output=True, text=True, timeout=60, check=True)
+    return json.loads(done.stdout)
+
+
+def test_open_image__counts_each_file_on_a_server_once(web_server, images):
+    put({**images, "left.tif.msk": mask_of(SIDE)}, web_server.folder)
+    name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
+    assert opened(name) == [True, name, f"/vsicurl/{name}.msk"]
+
+
+def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, monkeypatch):
+    """A listing has 1000 names; GDAL must not take its first page for all."""
+    monkeypatch.setenv("AWS_S3_ENDPOINT", os.environ["AWS_ENDPOINT_URL"].removeprefix("http://"))
+    monkeypatch.setenv("AWS_HTTPS", "NO")
+    monkeypatch.setenv("AWS_VIRTUAL_HOSTING", "FALSE")
+    objects = dict.fromkeys([f"many/a{number}" for number in range(1100)], b"")
+    for key, content in (objects | {"many/left.tif": images["left.tif"], "many/left.tif.msk": mask_of(SIDE)}).items():
+        boto3.client("s3").put_object(Bucket="bucket", Key=key, Body=content)
+    assert opened(f"{bucket}/many/left.tif") == [True, f"{bucket}/many/left.tif", "/vsis3/bucket/many/left.tif.msk"]
 
 
 def test_identity__of_a_server_that_does_not_say_which_file_it_sends(web_server, images):
