@@ -57,6 +57,7 @@ def plot(
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.raster import watched_images
     from sat_intervals.results import open_results
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
@@ -84,10 +85,12 @@ def plot(
     if _is_current(surface := out / "dsm.tif", results.report["finished"]):
         drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
     check_made_here(out / f"{name}.png" for name in drawings)
+    check_unchanged = watched_images(results.images, judging["mask"])
     with results.unchanged("dsm.tif"):
         for name, draw in drawings.items():
             draw(out / f"{name}.png")
             click.echo(out / f"{name}.png")
+        check_unchanged()
 
 
 def _check(results: "Results", row: int | None, columns: tuple[int, int] | None, pixel: tuple[int, int] | None) -> None:

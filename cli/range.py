@@ -25,17 +25,16 @@ def search_range(pair: PairArguments, output: Path | None, as_json: bool, quiet:
     that of the whole images.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.run.local_ranges import check_replaceable, write_ranges
+    from sat_intervals.run.local_ranges import replaceable_ranges, write_ranges
     from sat_intervals.run.quality import doubts
     from sat_intervals.run.search_range import find_here
 
     with Console(quiet or as_json) as console:
         left, right = pair.open()
-        if output:
-            check_replaceable(output, left, right)
+        there = replaceable_ranges(output, left, right) if output else {}
         found = find_here(left, right, console.progress)
         if output:
-            write_ranges(output, found.local, left)
+            write_ranges(output, found.local, left, there)
     if as_json:
         say_json(found.report())
         return

@@ -187,6 +187,11 @@ class Results(Run):
     right: Image
     truth: Layer | None
 
+    @property
+    def images(self) -> list[Image]:
+        """Return all images that were opened: left, right and, if known, the truth."""
+        return [self.left, self.right, *(layer.image for layer in [self.truth] if layer)]
+
     def read(self, window: Window) -> Bands:
         """Read bands, left image and truth of a window of the results."""
         image = Layer(self.left, self.region.row, self.region.column).read(window)
@@ -285,7 +290,7 @@ def open_run(out: str | Path) -> Run:
 
 
 def _which(out: Path) -> tuple[str | None, ...]:
-    """Return the stamps of the files of a run, None for one that is missing."""
+    """Return the `stamp_of` the files of a run."""
     return tuple(stamp_of(str(out / name)) for name in ("run.json", *_BANDS))
 
 
@@ -315,10 +320,11 @@ def _check_raster(file: Path, bands: int, region: Window, published: dict[str, i
     """
     if not file.exists():
         raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or rerun match")
-    if published and published["bytes"] != file.stat().st_size:
-        raise _damaged(file, f"has {file.stat().st_size} bytes, by run.json {published['bytes']}")
     if published and published != checksum_of(file):
-        raise _damaged(file, "is not what the run published")
+        raise SatIntervalsError(
+            f"{file} is not what the run published; it is damaged or was changed: move it away and match again with "
+            "--overwrite"
+        )
     check_alone(file)
     found, needed = read_shape(file), (bands, region.height, region.width)
     if found != needed:
@@ -326,12 +332,6 @@ def _check_raster(file: Path, bands: int, region: Window, published: dict[str, i
             f"{file} has {found[0]} bands of {found[1]} x {found[2]} pixels, but run.json says {needed[0]} of "
             f"{needed[1]} x {needed[2]}: move it away and match again with --overwrite"
         )
-
-
-def _damaged(file: Path, how: str) -> SatIntervalsError:
-    return SatIntervalsError(
-        f"{file} {how}; it is damaged or was changed: move it away and match again with --overwrite"
-    )
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:

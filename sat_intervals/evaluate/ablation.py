@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Config, Interval, load_config
+from sat_intervals.config import Config, Interval, Mccnn, load_config
 from sat_intervals.config.pairs import Pair
+from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import criteria_of, evaluate
 from sat_intervals.evaluate.paper import METHODS
@@ -17,12 +18,13 @@ from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_right_winners, read_winners
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
+from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import PROCESS_BYTES, check_memory, volume_bytes
 from sat_intervals.match.normalization import PairStatistics, blocks, moments, statistics_of
 from sat_intervals.match.patch import Frame, kernel_settings, match_right, patch_areas
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, confidence_scale, cut_rows, postprocess_strips
 from sat_intervals.products import NO_CANDIDATE, NO_DISPARITY, Bands
-from sat_intervals.raster import Image, check_pair, open_image, read_views, read_window
+from sat_intervals.raster import Image, check_pair, open_image, read_views, read_window, watched_images
 from sat_intervals.tiling import Views, Window, facing
 
 # The baseline keeps disparities whose similarity is at least 1 - 1/10 (paper section 4.1).
@@ -72,6 +74,7 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
     whole = Window(0, 0, left.height, left.width)
     _check_memory(whole, config)
     areas = patch_areas(Frame.of_whole(whole), config)
+    check_unchanged = watched_images((left, right, truth))
     views = read_views((left, right), view_windows(areas, config))
     methods, scale = _all_methods(views, areas, whole, config, _statistics((left, right), config))
     report: dict[str, Any] = {"cost": config.cost.method}
@@ -80,6 +83,7 @@ def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> di
         strips = partial(_final_strips, *_of_method(methods[method], method, config), scale, truth)
         nominal = criteria.nominal if method == "baseline" else float(method.split()[0])
         report[method] = evaluate(strips, replace(criteria, nominal=nominal))["all"]
+    check_unchanged()
     return report
 
 
@@ -109,7 +113,8 @@ def _all_methods(
     """Return the raw products of each of METHODS, and the scale of their confidence."""
     search, settings = config.disparity, kernel_settings(config)
     area, *of_right = areas
-    (cost,) = cost_areas(views, [area], config, statistics)
+    network = load_network(weights_file(config.cost.weights)) if isinstance(config.cost, Mccnn) else None
+    (cost,) = cost_areas(views, [area], config, statistics, network)
     volume = cost_volume(cost.costs, settings, cost.gradients)
     refine = config.refinement is not None
     winner, disparity, ambiguity = read_winners(volume, search.minimum, settings.weights, refine)
@@ -121,7 +126,7 @@ def _all_methods(
     seen = np.asarray(read_right_winners(volume, search.minimum))
     del volume, cost  # free memory before the right view's volume
     if of_right:
-        (cost,) = cost_areas(views, of_right, config, statistics)
+        (cost,) = cost_areas(views, of_right, config, statistics, network)
         reach = facing(whole, search.minimum, search.maximum)
         seen = match_right(cost, of_right[0], reach, settings)[0].winner
     histogram = ambiguity_histogram(ambiguity, winner != NO_DISPARITY, config.largest_ambiguity)

@@ -61,6 +61,20 @@ class PointFile:
             raise _unreadable(self._path, error) from error
 
 
+def files_of_points(path: Path) -> list[Path]:
+    """Return the files, existing or not, that points are read from: a shapefile has several, SQLite writes two beside.
+
+    Raises
+    ------
+    SatIntervalsError
+        It is a virtual file, whose sources could change unnoticed.
+    """
+    if path.suffix.lower() == ".vrt":
+        raise SatIntervalsError(f"{path} is read from other files, which may change meanwhile: convert it with ogr2ogr")
+    parts = [path.with_suffix(end) for end in (".shx", ".dbf", ".prj", ".cpg")] if path.suffix.lower() == ".shp" else []
+    return [path, *parts, *(path.with_name(path.name + end) for end in ("-wal", "-journal"))]
+
+
 def _unreadable(path: Path, error: Exception) -> SatIntervalsError:
     reason = " ".join(str(error).split()) or type(error).__name__
     return SatIntervalsError(f"{path} cannot be read as points: {reason}")

@@ -1,10 +1,12 @@
 """Disparities of points with heights: the visible one of each pixel, strip by strip."""
 
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from sat_intervals.errors import RunError
 from sat_intervals.tiling import Window
 
 # Rows of a strip.
@@ -35,6 +37,7 @@ class PointSight:
 
     def __init__(self, folder: Path, region: Window, rise: float) -> None:
         self._folder, self._region, self._rise = folder, region, rise
+        self._checksums: dict[int, int] = {}  # of the strips' files
         self.points = 0
         """Points in the region."""
 
@@ -51,9 +54,11 @@ class PointSight:
         self.points += records.size
         records = records[np.argsort(records["row"] // _ROWS, kind="stable")]
         strips, begins = np.unique(records["row"] // _ROWS, return_index=True)
-        for strip, part in zip(strips, np.split(records, begins[1:]) if strips.size else (), strict=True):
-            with self._file(int(strip)).open("ab") as stream:
-                part.tofile(stream)
+        for strip, part in zip(strips.tolist(), np.split(records, begins[1:]) if strips.size else (), strict=True):
+            content = part.tobytes()
+            with self._file(strip).open("ab") as stream:
+                stream.write(content)
+            self._checksums[strip] = zlib.crc32(content, self._checksums.get(strip, 0))
 
     @property
     def reach(self) -> int:
@@ -71,8 +76,8 @@ class PointSight:
         reach, sign = self.reach, np.sign(self._rise)
         nearest = np.full((rows + 2 * reach, self._region.width + 2 * reach), -np.inf)
         for strip in range(row // _ROWS - 1, row // _ROWS + 2):
-            if (file := self._file(strip)).exists():
-                records = np.fromfile(file, _RECORD)
+            if strip in self._checksums:
+                records = self._records(strip)
                 place = records["row"] - (row - reach)
                 near = (place >= 0) & (place < nearest.shape[0])
                 np.maximum.at(
@@ -83,6 +88,17 @@ class PointSight:
             explained = _CLEAR + _STEEPEST * reach * abs(self._rise)
             seen = np.where(seen >= _largest_around(nearest, reach) - explained, seen, -np.inf)
         return np.where(np.isfinite(seen), sign * seen, np.nan)
+
+    def _records(self, strip: int) -> np.ndarray:
+        try:
+            content = self._file(strip).read_bytes()
+        except FileNotFoundError:
+            content = b""
+        if zlib.crc32(content) != self._checksums[strip]:
+            raise RunError(
+                f"{self._file(strip)}, a temporary file, was damaged or deleted meanwhile: rerun the command"
+            )
+        return np.frombuffer(content, _RECORD)
 
     def _file(self, strip: int) -> Path:
         return self._folder / f"strip{strip}"

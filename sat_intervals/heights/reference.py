@@ -13,7 +13,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.location import GroundLattice, Location
-from sat_intervals.heights.point_files import PointFile
+from sat_intervals.heights.point_files import PointFile, files_of_points
 from sat_intervals.heights.point_sight import PointSight
 from sat_intervals.heights.points import point_near_the_middle, triangulated
 from sat_intervals.heights.raster_sight import RasterSight, Scene, Shift
@@ -33,6 +33,7 @@ from sat_intervals.raster import (
     utm_of,
     watched_rasters,
 )
+from sat_intervals.raster.identity import watched
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -121,7 +122,8 @@ def make_truth(
     there = replaceable(path.parent, [truth_file(path.name)])
     check_made_by(path, "reference", "REFERENCE")
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
-    check_unchanged = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])
+    check_rasters = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])
+    check_points = watched(files_of_points(reference.path) if reference.is_points else [])
     if registers:
         triangulated([run.out])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
@@ -137,7 +139,8 @@ def make_truth(
         for row, strip in work.strips(shift, scratch, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))
             tally.add(row, strip)
-        check_unchanged()
+        check_rasters()
+        check_points()
         tally.check(reference.path, work.place)
         progress("files", 0, 1)
         writer.publish(replaceable=there)

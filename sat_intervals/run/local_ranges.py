@@ -1,6 +1,6 @@
 """The search range and the local ranges of a pair: given, found, or read from the raster that the user gives."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,17 @@ from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
-from sat_intervals.raster import Image, check_made_by, open_image, other_files, read_shape, read_window, write_rows
+from sat_intervals.raster import (
+    Image,
+    check_made_by,
+    open_image,
+    other_files,
+    read_shape,
+    read_window,
+    stamps,
+    watched_rasters,
+    write_rows,
+)
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.tiling import Window
 
@@ -52,26 +62,31 @@ def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
     return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
 
 
-def check_replaceable(path: Path, left: Image, right: Image) -> None:
-    """Raise if `write_ranges` would replace a file of the images, or one that this tool did not make.
+def replaceable_ranges(path: Path, left: Image, right: Image) -> dict[str, str]:
+    """Return the `stamps` of the file that `write_ranges` may replace, if it exists.
 
     Raises
     ------
     SatIntervalsError
-        Names the file.
+        It is a file of the images, or was not made by this tool.
     """
+    there = stamps(path.parent, [path.name])
     names = [name for image in (left, right) for name in (image.path, image.mask) if name]
     check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
     check_made_by(path, "range", _OF)
+    return there
 
 
-def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
-    """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
+def write_ranges(path: Path, ranges: LocalRanges, left: Image, before: Mapping[str, str]) -> None:
+    """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image.
+
+    ``before`` are the `replaceable_ranges`.
+    """
     rows = (
         np.stack(ranges.at(Window(row, 0, min(_STRIP, left.height - row), left.width)))
         for row in range(0, left.height, _STRIP)
     )
-    write_rows(path, rows, (_BANDS, left.height, left.width), left.georeferencing, {_OF: left.path})
+    write_rows(path, rows, (_BANDS, left.height, left.width), left.georeferencing, {_OF: left.path}, before)
 
 
 def read_ranges(path: str, left: Image) -> LocalRanges:
@@ -83,8 +98,9 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
     Raises
     ------
     SatIntervalsError
-        The raster does not fit the image, or a minimum is above its maximum.
+        The raster does not fit the image, a minimum is above its maximum, or it was replaced meanwhile.
     """
+    check_unchanged = watched_rasters([path])
     bands, height, width = read_shape(path)
     if (bands, height, width) != (_BANDS, left.height, left.width):
         raise SatIntervalsError(
@@ -99,6 +115,7 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
             "image"
         )
     rows = [_row_of_cells(images, Window(row, 0, min(_CELL, height - row), width)) for row in range(0, height, _CELL)]
+    check_unchanged()
     minimum, maximum = (np.stack(bound) for bound in zip(*rows, strict=True))
     return LocalRanges(minimum, maximum, _CELL, _CELL)
 

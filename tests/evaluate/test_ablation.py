@@ -1,6 +1,7 @@
 """Products of a whole volume against the slow twins; the ablation against runs, the paper and Pandora."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from sat_intervals import match_arrays
 from sat_intervals.config import load_config
 from sat_intervals.config.pairs import Pair, find_pairs
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.evaluate import ablation
 from sat_intervals.evaluate.ablation import ablate_pair
 from sat_intervals.evaluate.disparity import criteria_of, evaluate
@@ -143,6 +144,21 @@ def test_ablate_pair__matches_once(folder, monkeypatch):
     monkeypatch.setattr(ablation, "match_right", None)
     ablate_pair(*find_pairs([folder]))
     assert len(calls) == 1
+
+
+@pytest.mark.parametrize("name", ["truth.tif", "left.tif"])
+def test_ablate_pair__ends_where_an_image_is_replaced_meanwhile(folder, tmp_path, monkeypatch, name):
+    shutil.copytree(folder, tmp_path / "pair")
+    file, judge = tmp_path / "pair" / name, ablation.evaluate
+
+    def replaced_before(*arguments):
+        shutil.copy(file, tmp_path / "new.tif")
+        (tmp_path / "new.tif").replace(file)
+        return judge(*arguments)
+
+    monkeypatch.setattr(ablation, "evaluate", replaced_before)
+    with pytest.raises(RunError, match=rf"{name} was replaced or changed while it was read"):
+        ablate_pair(*find_pairs([tmp_path / "pair"]))
 
 
 def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):

@@ -21,6 +21,7 @@ from sat_intervals.products import OCCLUSION
 from sat_intervals.raster import MARK, Georeferencing, Projection, Vertical, write_layer
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
+    from sat_intervals.heights import point_files, point_sight
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
     from sat_intervals.heights.sensors import Sensors
     from sat_intervals.heights.triangulate import triangulate
@@ -402,6 +403,51 @@ def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_
     with pytest.raises(RunError, match=r"heights.tif was replaced or changed while it was read: rerun the command"):
         make_truth(out, SensorFiles(*files), given_heights, path=tmp_path / "truth.tif", progress=replace)
     assert not (tmp_path / "truth.tif").exists()
+
+
+@pytest.mark.parametrize("name", ["p.dbf", "p.gpkg-wal"])
+def test_make_truth__ends_where_another_file_of_the_points_is_replaced_meanwhile(relief, tmp_path, monkeypatch, name):
+    """Else the truth would mix two sets of heights."""
+    out, files, _ = relief
+    points = tmp_path / {"p.dbf": "p.shp", "p.gpkg-wal": "p.gpkg"}[name]
+    write_csv(points, places(hills, 1500))
+    (tmp_path / name).write_text("before")
+    monkeypatch.setattr(point_files, "_crs_of_vectors", point_files._crs_of_table)
+    monkeypatch.setattr(point_files, "_vectors", point_files._table)
+
+    def replace(stage, done, total):
+        if stage == "truth":
+            (tmp_path / name).write_text("after")
+
+    given = Reference(points, True, Vertical(True, None))
+    with pytest.raises(RunError, match=rf"{name} was replaced or changed while it was read: rerun the command"):
+        make_truth(out, SensorFiles(*files), given, path=tmp_path / "truth.tif", registers=False, progress=replace)
+    assert not (tmp_path / "truth.tif").exists()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"0" * 12])
+def test_make_truth__ends_where_its_temporary_points_are_damaged(relief, tmp_path, monkeypatch, content):
+    out, files, _ = relief
+    points = Reference(write_csv(tmp_path / "p.csv", places(hills, 1500)), True, Vertical(True, None))
+    strips = point_sight.PointSight.strips
+
+    def damaged(sight):
+        (file,) = tmp_path.glob(".reference-*/files/strip0")
+        file.unlink() if content is None else file.write_bytes(content)
+        return strips(sight)
+
+    monkeypatch.setattr(point_sight.PointSight, "strips", damaged)
+    path = tmp_path / "truth.tif"
+    with pytest.raises(RunError, match=r"strip0, a temporary file, was damaged or deleted meanwhile: rerun"):
+        make_truth(out, SensorFiles(*files), points, path=path, registers=False)
+    assert not path.exists()
+
+
+def test_make_truth__refuses_virtual_points(relief, tmp_path):
+    out, files, _ = relief
+    (tmp_path / "p.vrt").write_text("<OGRVRTDataSource/>")
+    with pytest.raises(SatIntervalsError, match=r"p.vrt is read from other files, .*: convert it with ogr2ogr"):
+        make_truth(out, SensorFiles(*files), Reference(tmp_path / "p.vrt", True, Vertical(True, None)))
 
 
 def test_make_truth__keeps_a_file_that_appears_after_the_check(relief, tmp_path, monkeypatch):

@@ -15,8 +15,8 @@ from sat_intervals.demo import make_scene
 from sat_intervals.products import BANDS
 from sat_intervals.raster import MARK, File, OutputWriter, write_layer
 from sat_intervals.results import open_results
+from sat_intervals.run import local_ranges, schedule, search_range
 from sat_intervals.run import pair as run_pair
-from sat_intervals.run import schedule
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.run.pair import prepare
 from sat_intervals.show.report.contents import Pixels
@@ -113,6 +113,36 @@ def test_read_ranges__takes_the_hull_of_a_cell_rounded_outwards(folder, tmp_path
     write_layer(file, low, np.nan, PLACE)
     with pytest.raises(SatIntervalsError, match="has 1 bands of 130 x 300 pixels"):
         read_ranges(str(file), left)
+
+
+def test_read_ranges__ends_where_the_raster_is_replaced_meanwhile(folder, tmp_path, monkeypatch):
+    left, file = open_image(folder / "left.tif"), tmp_path / "ranges.tif"
+    write_bands(file, np.full((130, 300), -3), np.full((130, 300), 4))
+    row_of_cells = local_ranges._row_of_cells
+
+    def replaced_before(images, window):
+        write_bands(tmp_path / "new.tif", np.full((130, 300), -9), np.full((130, 300), -4))
+        (tmp_path / "new.tif").replace(file)
+        return row_of_cells(images, window)
+
+    monkeypatch.setattr(local_ranges, "_row_of_cells", replaced_before)
+    with pytest.raises(RunError, match=r"ranges.tif was replaced or changed while it was read"):
+        read_ranges(str(file), left)
+
+
+def test_range__keeps_a_raster_of_another_pair_that_appears_meanwhile(folder, tmp_path, monkeypatch):
+    images, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "ranges.tif"
+    assert invoke("range", *images, "--output", tmp_path / "other.tif").exit_code == 0
+    there, find = (tmp_path / "other.tif").read_bytes(), search_range.find_here
+
+    def appears_before(*arguments):
+        (tmp_path / "other.tif").rename(file)
+        return find(*arguments)
+
+    monkeypatch.setattr(search_range, "find_here", appears_before)
+    result = invoke("range", *images, "--output", file)
+    assert "ranges.tif was written by another process meanwhile: move it away" in result.stderr
+    assert (result.exit_code, file.read_bytes()) == (2, there)
 
 
 def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):

@@ -39,7 +39,7 @@ from sat_intervals.products import (
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results, open_run
 from sat_intervals.run.statistics import Tally
-from sat_intervals.show import dsm, maps
+from sat_intervals.show import coverage, dsm, maps
 from sat_intervals.show.canvas import widest
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.show.dsm import _relief, draw_surface
@@ -342,6 +342,24 @@ def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tm
     shutil.copy(out / "validity.tif", tmp_path / "dsm.tif")
     with pytest.raises(SatIntervalsError, match=r"dsm\.tif is not a surface model of sat-intervals dsm"):
         draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png")
+
+
+@pytest.mark.parametrize("name", ["truth.tif", "left.tif", "mask.tif"])
+def test_plot__ends_where_an_image_is_replaced_meanwhile(tmp_path, monkeypatch, unrendered, name):
+    out = write_run(tmp_path, *random_bands(40, 50))
+    (truth,) = tmp_path.rglob("truth.tif")
+    shutil.copy(truth, tmp_path / "mask.tif")
+    (file,) = tmp_path.rglob(name)
+    counted = coverage.evaluate_run
+
+    def replaced_before(*arguments, **named):
+        shutil.copy(file, tmp_path / "new.tif")
+        (tmp_path / "new.tif").replace(file)
+        return counted(*arguments, **named)
+
+    monkeypatch.setattr(coverage, "evaluate_run", replaced_before)
+    done = invoke("plot", out, "--dpi", "40", "--mask", tmp_path / "mask.tif")
+    assert (done.exit_code, f"{name} was replaced or changed" in done.stderr) == (1, True), done.stderr
 
 
 def test_plot__ends_where_a_surface_is_replaced_meanwhile(tmp_path, monkeypatch, unrendered):

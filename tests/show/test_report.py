@@ -53,6 +53,28 @@ def test_report__names_the_file_it_wrote(tmp_path):
     assert done.output.split() == [str(out / "report.html")]
 
 
+@pytest.mark.parametrize("name", ["truth.tif", "left.tif", "report.html"])
+def test_write_report__ends_where_an_image_or_its_page_is_replaced_meanwhile(tmp_path, monkeypatch, name):
+    """Else the page would mix two truths or images, or replace the page of another run."""
+    out = write_run(tmp_path, *random_bands(40, 50))
+    results = open_results(out)
+    (file,) = tmp_path.rglob(name) if name != "report.html" else [out / name]
+    new = file.read_bytes() if file.exists() else write_report(results).read_bytes()
+    (out / "report.html").unlink(missing_ok=True)
+    report = contents.Counts.report
+
+    def replaced_before(counts):
+        (tmp_path / "new").write_bytes(new)
+        (tmp_path / "new").replace(file)
+        return report(counts)
+
+    monkeypatch.setattr(contents.Counts, "report", replaced_before)
+    with pytest.raises(SatIntervalsError, match=rf"{name} was (replaced or changed|written by another process)"):
+        write_report(results)
+    assert file.read_bytes() == new
+    assert name == "report.html" or not (out / "report.html").exists()
+
+
 def test_report__says_in_one_line_what_is_wrong(tmp_path):
     done = invoke("report", tmp_path)
     assert done.exit_code == 2

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.raster import whole_file
+from sat_intervals.raster import stamps, watched_images, whole_file
 from sat_intervals.results import Results
 from sat_intervals.show.legend import PIXEL_CLASSES
 from sat_intervals.show.marks import check_made_here
@@ -30,15 +30,18 @@ def write_report(results: Results) -> Path:
     """
     path = results.out / "report.html"
     results.check_kept([path], [results.truth.image.path if results.truth else None])
+    there = stamps(path.parent, [path.name])
     check_made_here([path])
+    check_unchanged = watched_images(results.images)
     contents = _contents(results)
+    check_unchanged()
     # A "<" in the contents could end the script element.
     data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
     page = _asset("report.html")
     script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
     parts = {"summary": _summary(contents), "style": _asset("report.css"), "script": script, "contents": data}
     page = re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], page)
-    with whole_file(path) as new:
+    with whole_file(path, there) as new:
         new.write_text(page, encoding="utf-8")
         check_made_here([path])  # again: a file may have appeared meanwhile
     return path
