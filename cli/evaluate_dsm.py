@@ -113,10 +113,10 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
     content = json.dumps({"software": _SOFTWARE} | report, indent=1), surface_markdown(str(given.dsm), report)
-    _check_texts(folder)  # again: a file may have appeared meanwhile
     for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
         with whole_file(path) as new:
             new.write_text(text, encoding="utf-8")
+            _check_texts(folder)  # again: a file may have appeared meanwhile
     draw_reliability(report, paths[0], names[0])
     draw_error_map(compared, report["all"]["nmad"], paths[1])
     draw_height_profile(profile, paths[2], names)

@@ -67,6 +67,7 @@ def surface(
         else:
             tidy(out, run.keep_tiles, config.cluster.store)
         check_unchanged()
+        _check_run(out, report["finished"])
         points = triangulate(out, *sensor_files, progress=console.progress)
         made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
         check_unchanged()
@@ -98,6 +99,15 @@ def _watched(sensor_files: Sequence[str | Path], cells: dict[str, Any]) -> Calla
 
     like = cells["resolution"] if isinstance(cells["resolution"], Path) else None
     return watched_rasters([*sensor_files, cells["geoid"], like])
+
+
+def _check_run(out: Path, finished: str) -> None:
+    """Raise if a folder has no run that ended at this time: another one took its place."""
+    from sat_intervals.errors import RunError
+    from sat_intervals.results import open_run
+
+    if open_run(out).report["finished"] != finished:
+        raise RunError(f"the run in {out} was replaced before its points were made: rerun the command")
 
 
 def _check_of_run(out: Path, finished: str, points: dict[str, int]) -> None:
@@ -156,6 +166,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         if pair.name in errors:
             raise errors[pair.name]
         checks[pair.name]()
+        _check_run(folder, finished)
         points = triangulate(folder, *pair.sensors, console.progress)
         made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
         checks[pair.name]()

@@ -109,7 +109,7 @@ def assemble(
     if is_sealed:
         head = sealed(head, combined(zlib.crc32(head), body, length))
     *offsets, size = accumulate((part.length for part in parts), initial=len(head))
-    with open(path, "wb") as stream:
+    with open(path, "xb") as stream:
         stream.write(head)
         stream.truncate(size)
         stream.flush()

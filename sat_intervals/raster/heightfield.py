@@ -1,6 +1,7 @@
 """Read a raster of reference heights in its own grid and CRS, in parts."""
 
 import math
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,8 +17,9 @@ from sat_intervals.tiling import Window
 
 # Heights of the ground on Earth in metres; others are no-data values that the file does not declare.
 GROUND = -600.0, 9500.0
-# Names of the metre in the unit of a band; without one heights are taken for metres.
-_METRE = "", "m", "metre", "metres", "meter", "meters", "unknown"
+# Names of the metre in the unit of a band, perhaps with more, as in "m above ellipsoid". Without one heights are taken
+# for metres.
+_METRE = re.compile(r"[\[(]?(m|met(re|er)s?|unknown)\b[^/*^\d]*|", re.IGNORECASE)
 # Side of a block in cells, and blocks in memory, a megabyte each: neighbouring windows share most of theirs.
 _BLOCK, _KEPT = 512, 128
 
@@ -91,4 +93,4 @@ class HeightRaster:
 def other_unit(dataset: DatasetReader) -> str | None:
     """Return the unit of the heights in the first band if it is not the metre."""
     unit = (dataset.units[0] or "").strip()
-    return None if unit.lower() in _METRE else unit
+    return None if _METRE.fullmatch(unit) else unit

@@ -16,11 +16,11 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from rasterio.windows import Window as RasterioWindow
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import OutputError, rename_new, replace_same, stamps
+from sat_intervals.raster.publishing import OutputError, pinned, rename_new, replace_same, stamps
 from sat_intervals.raster.seal import check_beside
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
@@ -42,11 +42,12 @@ def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing
 
 
 @contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = None) -> Iterator[Path]:
     """Give the block a temporary file to write; rename it to ``path`` at the end, or delete it on failure.
 
-    A file that appears at ``path`` meanwhile is kept. A symbolic link there is replaced, not followed. What a killed
-    process left is deleted, see `LocalFolder.scratch`.
+    A file that appears at ``path`` meanwhile is kept, also if another has the `stamps` ``before``, which a command
+    takes before its work. A symbolic link there is replaced, not followed. What a killed process left is deleted, see
+    `LocalFolder.scratch`.
 
     Raises
     ------
@@ -54,17 +55,20 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         Names ``path`` and the system's reason, or says that another file came there meanwhile.
     """
     path = Path(path)
-    before = stamps(path.parent, [path.name])
+    if not path.is_symlink():
+        check_regular(path, "move it away")
+    before = stamps(path.parent, [path.name]) if before is None else before
     try:
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        with LocalFolder(path.parent).scratch(path.name, re.escape(path.name) + ".*") as folder:
-            new = folder / path.name
-            yield new
-            if before:
-                replace_same(new, path, before[path.name])
+        scratch = LocalFolder(path.parent).scratch(path.name, re.escape(path.name) + ".*")
+        with scratch as folder, pinned(folder) as own:
+            (own / path.name).touch(exist_ok=False)  # the block would follow a link that is there
+            yield own / path.name
+            if path.name in before and os.path.lexists(path):
+                replace_same(own / path.name, path, before[path.name])
             else:
-                rename_new(new, path)
+                rename_new(own / path.name, path)
     except FileExistsError as error:
         raise OutputError(f"{path} was written by another process meanwhile: move it away") from error
     except (*gdal.GDAL_ERRORS, OSError) as error:
@@ -88,6 +92,7 @@ def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
                     os.link(file, _aside(file, report), follow_symlinks=False)
                 except OSError:  # a file system without hard links
                     with whole_file(_aside(file, report)) as new:
+                        new.unlink()
                         shutil.copy2(file, new, follow_symlinks=False)
             yield
         finally:
@@ -128,12 +133,13 @@ def write_rows(
     shape: tuple[int, int, int],
     georeferencing: Georeferencing,
     tags: Mapping[str, str],
+    before: Mapping[str, str],
 ) -> None:
     """Write int16 rows, ``(bands, some, columns)`` from the top, as a tiled, compressed GeoTIFF with `MARK` and tags.
 
-    ``shape`` has the numbers of bands, rows and columns.
+    ``shape`` has the numbers of bands, rows and columns; ``before`` is that of `whole_file`.
     """
-    _write(path, rows, np.dtype(np.int16), shape, georeferencing, {**MARK, **tags})
+    _write(path, rows, np.dtype(np.int16), shape, georeferencing, {**MARK, **tags}, before=before)
 
 
 def _write(
@@ -144,13 +150,14 @@ def _write(
     georeferencing: Georeferencing,
     tags: Mapping[str, str],
     nodata: float | None = None,
+    before: Mapping[str, str] | None = None,
 ) -> None:
     """Write rows from the top and read them back: GDAL closes a file without an error when the disk is full."""
     bands, height, width = shape
     kind = {"count": bands, "height": height, "width": width, "dtype": dtype.name, "nodata": nodata}
     kind |= {"tiled": True, "compress": "deflate", **georeferencing.creation_options()}
     first = difference = 0
-    with whole_file(path) as new:
+    with whole_file(path, before) as new:
         with Env(), gdal.create(str(new), **kind) as dataset:
             dataset.update_tags(**tags)
             for part in rows:

@@ -5,8 +5,8 @@ import errno
 import filecmp
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
@@ -17,6 +17,17 @@ REPORTS = "run.json", "points.json"
 _HERE, _EXCHANGE = -100, 2
 # Folder of the replaced files, among the finished ones.
 REPLACED = "replaced"
+
+
+@contextmanager
+def pinned(folder: Path) -> Iterator[Path]:
+    """Yield a path of a folder that stays its own, even if a link or another folder takes its place."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        path = Path(f"/proc/self/fd/{descriptor}")
+        yield path if path.exists() else folder
+    finally:
+        os.close(descriptor)
 
 
 class OutputError(SatIntervalsError):

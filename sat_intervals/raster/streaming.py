@@ -38,7 +38,8 @@ class Stream:
 
     def _buffer(self, level: int) -> np.ndarray:
         shape = len(self._file.bands), BLOCK, self._shapes[level][1]
-        with open(self._path("rows", level), "wb") as stream:  # a full disk is an error here, not a signal later
+        self._path("strips", level).touch(exist_ok=False)  # never through a link that is there
+        with open(self._path("rows", level), "xb") as stream:  # a full disk is an error here, not a signal later
             os.posix_fallocate(stream.fileno(), 0, int(np.prod(shape)) * np.dtype(self._file.dtype).itemsize)
         return np.memmap(self._path("rows", level), self._file.dtype, "r+", shape=shape)
 

@@ -23,7 +23,7 @@ from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
-from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, publish, put_back, stamps
+from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, pinned, publish, put_back, stamps
 from sat_intervals.raster.space import WAY_OUT, check_space, file_bytes
 from sat_intervals.raster.streaming import Stream
 from sat_intervals.store.folder import LocalFolder
@@ -88,6 +88,7 @@ class OutputWriter:
         self._hidden = self._folder / _SCRATCH.format(files[0].name)
         self._scratch, self._replaced = self._hidden / "files", self._hidden / "files" / REPLACED
         self._folders: dict[Path, os.stat_result] = {}
+        self._pinned = self._scratch
         self._locked = ExitStack()
         self._files = tuple(files)
         self._names = (*(file.name for file in files), *REPORTS)
@@ -116,6 +117,7 @@ class OutputWriter:
                 self._remove_scratch()
                 (self._hidden / _MADE).touch()
                 self._replaced.mkdir(parents=True, exist_ok=True)
+                self._pinned = self._locked.enter_context(pinned(self._scratch))
                 self._folders = {place: place.lstat() for place in (self._hidden, self._scratch, self._replaced)}
                 self._there = stamps(self._folder, self._names)
             self._check_space(1)
@@ -140,6 +142,8 @@ class OutputWriter:
         for place in (self._hidden, self._scratch, self._replaced):
             if place.is_symlink():
                 raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
+            if place.exists() and not place.is_dir():
+                raise OutputError(f"{place} is not a folder, but temporary files go there: move it away")
         for place, made in self._folders.items():
             if place.exists() and not os.path.samestat(made, place.lstat()):
                 raise OutputError(f"{place}, a folder of temporary files, was replaced: move it away and rerun")
@@ -160,7 +164,7 @@ class OutputWriter:
             with self._failing(self._folder / file.name):
                 if file.driver == "COG":
                     if file.name not in self._streams:
-                        place = self._scratch / file.name
+                        place = self._pinned / file.name
                         self._streams[file.name] = Stream(file, place, self._shape, self._threads)
                     self._streams[file.name].write(row, bands)
                 else:
@@ -172,8 +176,9 @@ class OutputWriter:
             if file.name not in self._pictures:
                 height, width = self._shape
                 kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
-                path = str(self._scratch / f"strips-{file.name}")
-                self._pictures[file.name] = gdal.create(path, height=height, width=width, **kind), 0
+                path = self._pinned / f"strips-{file.name}"
+                path.touch(exist_ok=False)  # GDAL would follow a link that is there
+                self._pictures[file.name] = gdal.create(str(path), height=height, width=width, **kind), 0
                 self._pictures[file.name][0].update_tags(**self._tags)
                 file.describe(self._pictures[file.name][0])
             strips, before = self._pictures[file.name]
@@ -189,7 +194,7 @@ class OutputWriter:
             # a name of its own: a worker that was lost must not write into the file of a later run
             path = self._scratch / f"strips-{uuid.uuid4().hex}-{name}"
             self._made[name] = assemble(path, made, self._shape, levels, copy_parts, is_sealed=file.is_sealed)
-            os.replace(path, self._scratch / name)
+            os.replace(self._pinned / path.name, self._pinned / name)
 
     def build(self) -> dict[str, dict[str, int]]:
         """Build the final files under temporary names; return size and CRC-32 by name."""
@@ -202,12 +207,14 @@ class OutputWriter:
         for name, (strips, expected) in self._pictures.items():
             with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
                 strips.close()
-                copy(strips.name, str(self._scratch / name), driver="PNG", **_PNG)
-                _flush(self._scratch / name)
-                with gdal.reading(str(self._scratch / name)) as dataset:
+                place = self._pinned / name
+                place.touch(exist_ok=False)
+                copy(strips.name, str(place), driver="PNG", **_PNG)
+                _flush(place)
+                with gdal.reading(str(place)) as dataset:
                     if (sum_of_bits(dataset.read()) - expected) % SUM_WRAPS:
                         raise OSError(errno.EIO, "the content read back differs from that written")
-                self._made[name] = checksum_of(self._scratch / name)
+                self._made[name] = checksum_of(place)
             os.unlink(strips.name)
         self._pictures.clear()
         return dict(self._made)
@@ -232,11 +239,11 @@ class OutputWriter:
         announce
             Called before, with the `stamps` that the files will have, the report last.
         """
-        made_files = self.build()
+        made = self.build()
         self._check_links()
-        for name, made in made_files.items():
+        for name, checksum in made.items():
             with self._failing(self._folder / name):
-                if checksum_of(self._scratch / name) != made:
+                if checksum_of(self._pinned / name) != checksum:
                     raise OSError(errno.EIO, "the content read back differs from that written")
         self._check_links()
         names = [file.name for file in self._files]
@@ -244,10 +251,11 @@ class OutputWriter:
             name, text = report
             names.append(name)
             with self._failing(self._folder / name):
-                (self._scratch / name).write_text(text, encoding="utf-8")
-                _flush(self._scratch / name)
-        announce(list(stamps(self._scratch, names).values()))
-        publish(self._scratch, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
+                with (self._pinned / name).open("x", encoding="utf-8") as stream:
+                    stream.write(text)
+                _flush(self._pinned / name)
+        announce(list(stamps(self._pinned, names).values()))
+        publish(self._pinned, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
         self._is_published = True
 
     def scratch(self, name: str, names: str) -> AbstractContextManager[Path]:

@@ -17,7 +17,7 @@ from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
-from sat_intervals.raster import Image, OutputError, open_image, other_files, whole_file
+from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, whole_file
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
@@ -77,12 +77,12 @@ def match_batch(
     common = load_config(config, overrides)
     read = [config if isinstance(config, (str, Path)) else None, common.disparity.grid]
     _check_not_replaced(pairs, read, out, overwrite)
-    cluster, report = common.cluster, _Report(LocalFolder(out))
-    note = report.note
+    cluster = common.cluster
     _raise_file_limit()
     with ExitStack() as stack:
         stack.enter_context(LocalFolder(out).locked())
-        read_report(out)  # raises if it is not ours
+        report = _Report(out)
+        note = report.note
         connection = stack.enter_context(Connection(cluster, out))
         find = partial(find_on, connection, {}, progress)
         note({pair.name: {"state": "waiting"} for pair in pairs})
@@ -109,11 +109,13 @@ def match_batch(
 
 
 class _Report:
-    """The states of the pairs, here and in ``batch.json``."""
+    """The states of the pairs, here and in ``batch.json``; one that is not of a batch is refused."""
 
-    def __init__(self, folder: LocalFolder) -> None:
+    def __init__(self, folder: Path) -> None:
         self.states: dict[str, dict[str, Any]] = {}
-        self._folder, self._written = folder, ""
+        self._file = folder / REPORT
+        self._there = stamps(folder, [REPORT])
+        read_report(folder)
 
     def note(self, states: Mapping[str, dict[str, Any]]) -> None:
         """Add states and write the file; raise if it is no longer the one written before."""
@@ -122,15 +124,12 @@ class _Report:
         self.states.update(states)
         text = json.dumps(self.states, indent=1) + "\n"
         try:
-            with whole_file(self._folder.path / REPORT) as new:
-                if self._written and self._folder.read(REPORT) not in (None, self._written):
-                    raise RunError(
-                        f"{self._folder}/{REPORT} was replaced during the batch: move it away and rerun the batch"
-                    )
+            with whole_file(self._file, self._there) as new:
                 new.write_text(text)
+                there = stamps(new.parent, [REPORT])
         except OutputError as error:
             raise RunError(f"{error}, and rerun the batch: it resumes") from error
-        self._written = text
+        self._there = there
 
 
 def _check_not_replaced(

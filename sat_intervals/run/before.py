@@ -11,6 +11,7 @@ from sat_intervals.results import open_run
 from sat_intervals.run.inputs import changes_since, with_range_of
 from sat_intervals.run.job import fitted_to_jobs
 from sat_intervals.run.output import check_as_published, is_complete
+from sat_intervals.run.workers import reason
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.marks import finished_run
@@ -50,10 +51,9 @@ def tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
         return
     try:
         place = place_of(home, store)
-    except StoreError as error:
-        _LOG.warning("%s", error)
-        return
-    if place == LocalFolder(home.absolute()) or is_own(place):
-        with LocalFolder(home).locked():
-            check_as_published(folder)
-            remove_tiles(home, place)
+        if place == LocalFolder(home.absolute()) or is_own(place):
+            with LocalFolder(home).locked():
+                check_as_published(folder)
+                remove_tiles(LocalFolder(home), place)
+    except (StoreError, OSError) as error:  # the run is complete
+        _LOG.warning("the tiles of the complete run stay: %s", reason(error))

@@ -13,27 +13,24 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.mccnn import load_network, network_of
+from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import (
     BLOCK,
-    RUN_FILES,
     Image,
     check_pair,
     check_space,
     file_bytes,
     open_image,
     part_bytes,
-    restore,
     run_files,
-    stamps,
 )
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
 from sat_intervals.run.inputs import check_onnxruntime, describe_inputs
 from sat_intervals.run.local_ranges import searched
-from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete
+from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete, replaceable
 from sat_intervals.run.parts import codecs_of, parts_of, rows_of_levels
 from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.run.workers import parse_memory, readers
@@ -128,8 +125,7 @@ class Job:
         if not overwrite and is_complete(self.out):  # another run may have ended before this one got the lock
             raise holds_run(self.out, OUTPUTS)
         check_output(self.out, overwrite)
-        restore(self.out, RUN_FILES)
-        self.store.open(self.manifest, overwrite=overwrite, replaceable=stamps(self.out, OUTPUTS))
+        self.store.open(self.manifest, overwrite=overwrite, replaceable=replaceable(self.out, overwrite=overwrite))
         if self.found or self.local:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
             self.store.write_search(search, _origin(self.inputs))
@@ -176,7 +172,7 @@ class Job:
         return handed_bytes(self.store.grid, self.config, (self.left, self.right))
 
     def check_inputs(self) -> None:
-        """Raise if an input changed since the start of the run, or this process has other weights.
+        """Raise if an input changed since the start of the run, or this process has another onnxruntime.
 
         Raises
         ------
@@ -185,7 +181,6 @@ class Job:
         """
         check_unchanged(self.files)
         check_onnxruntime(self.inputs)
-        network_of(self.config.cost, self.inputs)
 
     def statistics(self) -> PairStatistics | None:
         """Return mean and standard deviation of both images, None if the run needs none.

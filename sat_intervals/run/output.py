@@ -5,9 +5,12 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from sat_intervals.errors import SatIntervalsError, check_regular
-from sat_intervals.raster import RUN_FILES, is_marked, stamps
+from sat_intervals.raster import RUN_FILES, is_marked, restore, stamps
+from sat_intervals.raster.identity import checksum_of
+from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.store.marks import finished_run, is_replacing
 from sat_intervals.store.tiles import has_begun
 
@@ -35,26 +38,50 @@ def check_output(out: Path, overwrite: bool) -> None:
         raise SatIntervalsError(f"{out} cannot be written: {error.strerror}: choose another folder") from error
 
 
+def replaceable(out: Path, *, overwrite: bool) -> dict[str, str]:
+    """Return the `stamps` of a run's files, after those that a killed process put aside are restored.
+
+    With ``overwrite`` it raises as `check_replaceable`, of which files may have appeared or been restored since.
+    """
+    restore(out, RUN_FILES)
+    there = stamps(out, OUTPUTS)
+    if overwrite:
+        check_replaceable(out)
+    return there
+
+
 def check_replaceable(out: Path) -> None:
-    """Raise if a folder has a file with the name of a run's file that no run made.
+    """Raise if a folder has a file with the name of a run's file that no run made, or that was changed since.
 
     Call it before overwriting.
     """
+    published = _published(out / "run.json")
+    if published and is_replacing(out / "tiles"):  # a killed run has perhaps replaced some of the files
+        published = {}
     for file in (out / name for name in OUTPUTS):
         check_regular(file, "move it away or choose another folder")
-        if file.exists() and not _is_of_run(file):
+        if file.exists() and not _is_of_run(file, published):
             raise SatIntervalsError(
                 f"{file} exists and was not made by sat-intervals, or is damaged: move it away or choose another folder"
             )
 
 
-def _is_of_run(file: Path) -> bool:
-    if file.name != "run.json":
-        return is_marked(file)
+def _is_of_run(file: Path, published: dict[str, Any] | None) -> bool:
+    if file.name == "run.json":
+        return published is not None
+    return is_marked(file) and (not published or checksum_of(file) == published.get(file.name))
+
+
+def _published(file: Path) -> dict[str, Any] | None:
+    """Return sizes and checksums of rasters from a run's report; empty if there is no report, None if it is none."""
     try:
-        return bool({"settings", "inputs", "tiles"} <= json.loads(file.read_text(encoding="utf-8")).keys())
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return False
+        text = file.read_text(encoding="utf-8")
+        report = (unsealed(text) if SEAL in json.loads(text) else json.loads(text)) or {}
+        return dict(report.get("files", {})) if {"settings", "inputs", "tiles"} <= report.keys() else None
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
+        return None
 
 
 def holds_run(out: Path, there: Sequence[str]) -> SatIntervalsError:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import whole_file
+from sat_intervals.raster import stamps, whole_file
 from sat_intervals.show.marks import check_made_here
 
 try:
@@ -36,11 +36,12 @@ _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 
 @contextmanager
 def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterator[Figure]:
     """Yield a figure of ``size`` inches and write it as a PNG file at the end; a foreign file is kept."""
+    there = stamps(path.parent, [path.name])
     with rc_context(_STYLE):
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
-        with whole_file(path) as new:
+        with whole_file(path, there) as new:
             figure.savefig(new, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
             check_made_here([path])  # again: a file may have appeared meanwhile
 

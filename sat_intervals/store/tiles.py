@@ -43,6 +43,12 @@ from sat_intervals.tiling import Grid, Tile
 Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
 
+# What to do where a store does not answer.
+_WAY_OUT = (
+    "check the path or URL, the credentials, and whether the package of its file system is installed (pip install "
+    "'sat-intervals[remote]' for s3://)"
+)
+
 # Increase when arrays or records change: older tiles cannot be resumed.
 LAYOUT = 11
 
@@ -90,7 +96,12 @@ class Store:
     @property
     def folder(self) -> Folder:
         """Return the folder of the tiles."""
-        return folder_at(self.elsewhere or self.home).of_run(self.run)
+        return self._place.of_run(self.run)
+
+    @property
+    def _place(self) -> Folder:
+        """Return the folder of the tiles, which may still be of another run."""
+        return folder_at(self.elsewhere or self.home)
 
     @property
     def _marks(self) -> Folder:
@@ -128,8 +139,7 @@ class Store:
         StoreError
             The existing store has other settings, inputs or versions, is at another place, or cannot be used.
         """
-        home, folder = self._marks, self.folder
-        there = folder_at(self.elsewhere or self.home)  # perhaps of another run, until that is deleted
+        home, folder = folder_at(self.home), self.folder
         try:
             before = self._place_before(overwrite)
             check_not_foreign(folder)
@@ -141,15 +151,16 @@ class Store:
                         f"the tiles of the run in {self.home.parent} are in {before}, not in {folder}: give the same "
                         "--store as before (or none) to resume, or --overwrite to start again"
                     )
-            there.make("")  # fails before anything is deleted
-            if overwrite and before is not None:
-                with suppress(OSError):  # an unreachable store is kept
-                    if before == home or is_own(before):
-                        drop(before)
+            if self.elsewhere and (there := unsealed(folder.read(MANIFEST))) and digest(there) != self.run:
+                raise StoreError(f"{folder} has the tiles of another run, which were moved there: move them away")
+            self._place.make("")  # fails before anything is deleted
+            with suppress(OSError):  # an unreachable store is kept
+                if before is not None and text is None and (before == home or (overwrite and is_own(before))):
+                    drop(before)
             if overwrite or (text is None and not self.elsewhere):
-                drop(there)
-            there.make("")
-            there.write(MADE, mark(self.run))
+                drop(self._place)
+            self._place.make("")
+            folder.write(MADE, mark(self.run))
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
             for name in FOLDERS:
@@ -166,10 +177,8 @@ class Store:
             if not folder.create(MANIFEST, sealed(manifest)):
                 self.check(manifest)
         except OSError as error:
-            raise StoreError(
-                f"{folder} cannot be used: {error.strerror or error}: check the path or URL, the credentials, and "
-                "whether the package of its file system is installed (pip install 'sat-intervals[remote]' for s3://)"
-            ) from error
+            way_out = "move it away" if error.errno in (errno.ELOOP, errno.ESTALE) else _WAY_OUT
+            raise StoreError(f"{folder} cannot be used: {error.strerror or error}: {way_out}") from error
 
     def _place_before(self, overwrite: bool) -> Folder | None:
         """Return the folder of the earlier run's tiles; with ``overwrite``, None if they must be kept."""
@@ -334,7 +343,7 @@ class Store:
     def remove(self) -> None:
         """Delete the tiles of this run and no other files; those of another run may have taken their place."""
         if (there := unsealed(self.folder.read(MANIFEST))) is None or digest(there) == self.run:
-            remove_tiles(self.home, self.folder)
+            remove_tiles(self._marks, self.folder)
 
     def mark_finished(self, name: str, stamps: Sequence[str]) -> None:
         """Mark a run as finished, so that its tiles are removed even if it is killed before.
@@ -348,11 +357,11 @@ class Store:
         self._marks.delete(REPLACING)
 
 
-def remove_tiles(home: Path, place: Folder) -> None:
+def remove_tiles(home: Folder, place: Folder) -> None:
     """Delete a run's tiles in ``place``, and its marker files in ``home``."""
     drop(place)
     names = PLACE, REPLACING, FINISHED
-    folder_at(home).delete_all([name for name in folder_at(home).sizes() if final_name(name) in names])
+    home.delete_all([name for name in home.sizes() if final_name(name) in names])
 
 
 def has_begun(home: Path) -> bool:

@@ -469,6 +469,18 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     other = invoke(*command, "--preset", "satellite")
     assert (other.exit_code, "already holds another run" in other.stderr) == (2, True)
 
+    def exchanged(*_):
+        shutil.rmtree(out)
+        shutil.copytree(steps, out)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sat_intervals.run.before.tidy", exchanged)
+        replaced = invoke(*command)
+    assert (replaced.exit_code, "was replaced before its points were made" in replaced.stderr) == (1, True)
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == {
+        file.name: file.read_bytes() for file in steps.iterdir()
+    }
+
     def late(*arguments, **options):
         assert invoke("match", *images, str(out), *search[:2], "9", "--overwrite", "--quiet").exit_code == 0
         return triangulate(*arguments, **options)

@@ -94,7 +94,13 @@ def test_height_raster__says_what_is_missing(tmp_path):
         assert message in str(error.value)
 
 
-@pytest.mark.parametrize(("unit", "is_metre"), [("ft", False), ("US survey foot", False), ("metre", True), ("m", True)])
+@pytest.mark.parametrize(
+    ("unit", "is_metre"),
+    [
+        *(("ft", False), ("US survey foot", False), ("mm", False), ("m/s", False)),
+        *(("metre", True), ("m", True), ("m above ellipsoid", True)),
+    ],
+)
 def test_height_raster__refuses_bands_in_feet(tmp_path, unit, is_metre):
     path = write(tmp_path / "a.tif", np.zeros((5, 7), np.float32))
     with rasterio.open(path, "r+") as dataset:

@@ -764,7 +764,7 @@ def test_output_writer__deletes_no_other_file_where_its_temporary_folder_is_dele
     put_aside = publishing._put_aside
 
     def late(new, *arguments):
-        shutil.rmtree(new.parent)
+        shutil.rmtree(new.parent.resolve())
         put_aside(new, *arguments)
 
     monkeypatch.setattr(publishing, "_put_aside", late)

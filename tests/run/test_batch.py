@@ -174,11 +174,21 @@ def test_match_batch__keeps_a_file_that_takes_the_place_of_its_report(images, tm
         if stage == "tiles":
             report.write_text("a user's")
 
-    with pytest.raises(RunError, match=r"batch\.json was replaced during the batch: move it away"):
+    with pytest.raises(RunError, match=r"batch\.json was written by another process meanwhile: move it away"):
         match_batch(pairs, tmp_path, progress=replace)
     assert report.read_text() == "a user's"
     report.unlink()
     assert {end["state"] for end in match_batch(pairs, tmp_path).values()} <= {"done", "done before"}
+
+
+def test_match_batch__keeps_a_file_that_appears_after_its_check(images, tmp_path, monkeypatch):
+    def and_appears(out):
+        (out / "batch.json").write_text("a user's")
+
+    monkeypatch.setattr(batch, "read_report", and_appears)
+    with pytest.raises(RunError, match=r"batch\.json was written by another process meanwhile: move it away"):
+        match_batch(read_batch(rows(images)), tmp_path)
+    assert (tmp_path / "batch.json").read_text() == "a user's"
 
 
 def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(images, tmp_path):

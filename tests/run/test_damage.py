@@ -20,6 +20,7 @@ from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.results import open_run
+from sat_intervals.run import before
 from sat_intervals.run import pair as run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.batch import match_batch
@@ -442,6 +443,43 @@ def test_match_block__keeps_the_tiles_of_another_run_that_take_the_place_of_its_
     assert contents(there) == before
 
 
+@pytest.mark.parametrize("options", [[], ["--overwrite"]])
+def test_match__starts_in_a_store_beside_what_a_killed_removal_left(scene, tmp_path, options):
+    tiles = tmp_path / "out" / "tiles"
+    begun(scene, tmp_path / "out", sgm={"p1": 9})
+    (tiles / "manifest.json").unlink()  # the first file that is deleted; the mark is the last
+    match(scene, tmp_path / "out", "--store", tmp_path / "store", *options)
+    assert_same(scene, tmp_path / "out")
+
+
+def test_match__overwrites_no_tiles_of_another_run_that_were_moved_into_its_store(scene, tmp_path):
+    store = tmp_path / "store"
+    job = prepare(scene / "left.tif", scene / "right.tif", tmp_path / "out", scene / "settings.yaml")
+    another = begun(scene, tmp_path / "another", sgm={"p1": 9})
+    match_block(another, next(iter(another.store.grid)))
+    store.mkdir()
+    there = (tmp_path / "another" / "tiles").rename(store / job.store.run)
+    before = contents(there)
+    for options in ([], ["--overwrite"]):
+        said = match(scene, tmp_path / "out", "--store", store, *options, status=2)
+        assert f"{there} has the tiles of another run, which were moved there: move them away" in said
+    assert contents(there) == before
+
+
+def test_tidy__of_tiles_that_cannot_be_reached_says_so(scene, tmp_path, monkeypatch, caplog):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, status=1)
+
+    def unreachable(*arguments):
+        raise OSError(5, "the server does not answer")
+
+    monkeypatch.setattr(before, "remove_tiles", unreachable)
+    before.tidy(out, False, None)
+    assert "the tiles of the complete run stay: [Errno 5] the server does not answer" in caplog.text
+
+
 @pytest.mark.parametrize("name", ["records/0_0.json", *SHARDS[:1], "normalization.json", "manifest.json"])
 @pytest.mark.parametrize("options", [[], ["--overwrite"]])
 def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
@@ -472,6 +510,9 @@ def test_match_batch__takes_no_damaged_result_for_done(scene, tmp_path, name, ho
     assert f"{tmp_path}/kept/{name} " in shown["error"]
     assert shown["error"].endswith("it is damaged or was changed: move it away and match again with --overwrite")
     assert (tmp_path / "kept" / name).read_bytes() == before
+    shown = match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)["kept"]
+    assert f"{name} exists and was not made by sat-intervals, or is damaged: move it away" in shown["error"]
+    (tmp_path / "kept" / name).unlink()
     match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)
     assert_same(scene, tmp_path / "kept")
 
@@ -495,8 +536,7 @@ def test_commands__refuse_a_result_of_another_size(scene, tmp_path, command):
         file.write(b"0")  # which GDAL does not see
     words = [str(tmp_path / word) if word.isupper() else word for word in command.split()]
     result = invoke(*words)
-    size = (scene / "kept" / "intervals.tif").stat().st_size
-    assert f"{tmp_path}/OUT/intervals.tif has {size + 1} bytes, by run.json {size}; it is damaged" in result.stderr
+    assert f"{tmp_path}/OUT/intervals.tif is not what the run published; it is damaged" in result.stderr
     assert result.exit_code == 2
 
 

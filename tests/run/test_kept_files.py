@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import zipfile
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.heights import dsm
 from sat_intervals.interop.export import export
+from sat_intervals.products import BANDS
 from sat_intervals.raster import (
     MARK,
     RUN_FILES,
@@ -39,12 +41,16 @@ from sat_intervals.raster import (
     publishing,
     put_back,
     read_layers,
+    read_window,
     remove_scratch,
     replaceable,
     restore,
+    stamps,
     watched_rasters,
     write_layer,
 )
+from sat_intervals.raster import writer as raster_writer
+from sat_intervals.raster.files import File
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import Run, open_results
 from sat_intervals.run import search_range, source, strips
@@ -56,6 +62,7 @@ from sat_intervals.show.canvas import page
 from sat_intervals.show.profile import draw_profile
 from sat_intervals.show.report import write_report
 from sat_intervals.store.folder import LocalFolder
+from sat_intervals.tiling import Window
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -151,6 +158,57 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     match_pair(*images, folder / "out", settings)
     match_pair(*images, folder / "once", settings)
     assert hashes(folder / "out") == hashes(folder / "once")
+
+
+def test_read_window__ends_where_a_mask_cannot_be_found_any_more(pair):
+    """As on a server that is busy: GDAL would read the image without its mask."""
+    folder, _ = pair
+    profile = {"driver": "GTiff", "height": 80, "width": 100, "count": 1, "dtype": "uint8"}
+    with rasterio.open(folder / "left.tif.msk", "w", **profile) as mask:
+        mask.update_tags(INTERNAL_MASK_FLAGS_1=2)  # for all bands
+    image = open_image(folder / "left.tif")
+    assert image.use_mask
+    assert read_window(image, Window(0, 0, 8, 8))[1].all()
+    (folder / "left.tif.msk").unlink()
+    with pytest.raises(InputError, match=r"left.tif.msk was there when .*left.tif was opened, but cannot be found now"):
+        read_window(image, Window(0, 0, 8, 8))
+
+
+@pytest.mark.parametrize("name", ["intervals.tif", "run.json"])
+def test_match__overwrites_no_result_that_was_changed_since(pair, name):
+    folder, settings = pair
+    out = folder / "out"
+    match_pair(folder / "left.tif", folder / "right.tif", out, settings)
+    if name == "run.json":
+        (out / name).write_text((out / name).read_text().replace('"valid"', '"valid "', 1))
+    else:
+        with rasterio.open(out / name, "r+", IGNORE_COG_LAYOUT_BREAK="YES") as file:
+            file.write(np.zeros((4, 80, 100), np.float32))  # the mark of the tool stays
+    before = (out / name).read_bytes()
+    with pytest.raises(SatIntervalsError, match=rf"{name} exists and was not made by sat-intervals, or is damaged"):
+        match_pair(folder / "left.tif", folder / "right.tif", out, settings, overwrite=True)
+    assert (out / name).read_bytes() == before
+
+
+@pytest.mark.parametrize("stage", ["put aside", "appears"])
+def test_match__overwrites_no_file_that_came_after_its_check(pair, monkeypatch, stage):
+    """Put aside by a run that was killed before it put it back, or new since the images were opened."""
+    folder, settings = pair
+    images, out = (folder / "left.tif", folder / "right.tif"), folder / "out"
+    match_pair(*images, out, settings)
+    job = prepare(*images, out, settings, overwrite=True)
+    mine = out / "intervals.tif"
+    if stage == "put aside":
+        mine.unlink()
+        hidden = out / ".unpublished-intervals.tif"
+        (hidden / "files" / "replaced").mkdir(parents=True)
+        (hidden / ".sat-intervals.files").touch()
+        (hidden / "files" / "replaced" / "intervals.tif").write_text("mine")
+    else:
+        mine.write_text("mine")
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif exists and was not made by sat-intervals"):
+        job.begin(overwrite=True)
+    assert mine.read_text() == "mine"
 
 
 @pytest.mark.parametrize("way", ["link", "rename", "folder", "folder that gets a file"])
@@ -651,6 +709,7 @@ def test_scratch__keeps_what_is_put_beside_its_files(tmp_path):
             (used / name).parent.mkdir(exist_ok=True)
             (used / name).write_text("half")
         (used / "2").symlink_to(tmp_path)
+        os.mkfifo(used / "3")
         (used / "notes.txt").write_text("mine")
         (used / "dir").mkdir()
     assert sorted(path.name for path in tmp_path.rglob("*")) == [used.parent.name, "dir", "files", "notes.txt"]
@@ -735,6 +794,66 @@ def test_output_writer__deletes_nothing_in_a_folder_that_took_the_place_of_its_o
         assert (place / names[inner]).read_text() == "mine"
         shutil.rmtree(hidden)
         shutil.rmtree(tmp_path / "moved")
+
+
+def written(output, *rasters):
+    output.write(0, *rasters)
+    output.publish(("run.json", "{}"))
+
+
+def test_output_writer__names_a_file_where_a_folder_of_temporary_ones_must_be(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files" / "replaced"
+    place.parent.mkdir(parents=True)
+    place.write_text("mine")
+    with pytest.raises(OutputError, match=f"{place} is not a folder, but temporary files go there: move it away"):
+        writer(tmp_path).__enter__()
+    assert place.read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["run.json", "rows-0-intervals.tif", "strips-0-validity.tif"])
+def test_output_writer__writes_nothing_behind_a_link_with_a_temporary_name(tmp_path, name):
+    (tmp_path / "mine").write_text("mine")
+    with writer(tmp_path / "out") as output:
+        (tmp_path / "out" / ".unpublished-intervals.tif" / "files" / name).symlink_to(tmp_path / "mine")
+        with pytest.raises(OutputError, match="cannot be written: File exists"):
+            written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+    assert contents(tmp_path) == {str(tmp_path / "mine"): b"mine"}
+
+
+@pytest.mark.parametrize("name", ["strips-disparity.png", "disparity.png"])
+def test_output_writer__draws_nothing_behind_a_link_with_a_temporary_name(tmp_path, name):
+    (tmp_path / "mine").write_text("mine")
+    file = File("disparity.png", "uint8", None, BANDS[:1], driver="PNG")
+    with OutputWriter(tmp_path / "out", [file], 4, 5, Georeferencing(), {}) as output:
+        (tmp_path / "out" / ".unpublished-disparity.png" / "files" / name).symlink_to(tmp_path / "mine")
+        with pytest.raises(OutputError, match="cannot be written: File exists"):
+            written(output, np.zeros((1, 4, 5), np.uint8))
+    assert contents(tmp_path) == {str(tmp_path / "mine"): b"mine"}
+
+
+@pytest.mark.parametrize("when", ["template", "publish"])
+def test_output_writer__publishes_no_files_of_a_folder_that_took_the_place_of_its_own(tmp_path, monkeypatch, when):
+    user, out = tmp_path / "user", tmp_path / "out"
+    user.mkdir()
+    for name in ("intervals.tif", "validity.tif", "run.json"):
+        (user / name).write_text("of another run")
+    before = contents(user)
+    work = getattr(raster_writer, when)
+
+    def exchanged(*arguments, **named):
+        files = out / ".unpublished-intervals.tif" / "files"
+        if not (tmp_path / "moved").exists():
+            files.rename(tmp_path / "moved")
+            files.symlink_to(user)
+        return work(*arguments, **named)
+
+    monkeypatch.setattr(raster_writer, when, exchanged)
+    with writer(out) as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        with suppress(OutputError):
+            output.publish(("run.json", "{}"))
+    assert {name: content for name, content in contents(user).items() if name in before} == before
+    assert b"of another run" not in {path.read_bytes() for path in out.glob("*.*") if path.is_file()}
 
 
 def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
@@ -974,8 +1093,57 @@ def test_write_rows__keeps_a_file_that_appears_while_it_is_written(tmp_path):
         (tmp_path / "ranges.tif").write_text("mine")
 
     with pytest.raises(SatIntervalsError, match=r"ranges\.tif exists and was not made by"):
-        layers.write_rows(tmp_path / "ranges.tif", rows(), (2, 9, 9), PLACE, {})
+        layers.write_rows(tmp_path / "ranges.tif", rows(), (2, 9, 9), PLACE, {}, {})
     assert contents(tmp_path) == {str(tmp_path / "ranges.tif"): b"mine"}
+
+
+def test_whole_file__keeps_what_came_after_its_stamps_and_writes_where_the_file_is_gone(tmp_path):
+    path = tmp_path / "page.html"
+
+    def write(before):
+        with layers.whole_file(path, before) as new:
+            new.write_text("new")
+
+    path.write_text("of another run")
+    with pytest.raises(OutputError, match=r"page\.html was written by another process meanwhile: move it away"):
+        write({})
+    assert path.read_text() == "of another run"
+    before = stamps(tmp_path, ["page.html"])
+    path.unlink()
+    write(before)
+    assert contents(tmp_path) == {str(path): b"new"}
+
+
+@pytest.mark.parametrize("is_folder", [False, True])
+def test_whole_file__writes_nothing_behind_a_link_in_its_temporary_folder(tmp_path, monkeypatch, is_folder):
+    (tmp_path / "user").mkdir()
+    mine = tmp_path / "user" / "page.html"
+    mine.write_text("mine")
+    pinned = layers.pinned
+
+    def and_linked(folder):
+        if not is_folder:
+            (folder / "page.html").symlink_to(mine)
+        return pinned(folder)
+
+    monkeypatch.setattr(layers, "pinned", and_linked)
+
+    def write():
+        with layers.whole_file(tmp_path / "page.html") as new:
+            if is_folder:
+                (files,) = tmp_path.glob(".page.html-*/files")
+                files.rename(tmp_path / "moved")
+                files.symlink_to(mine.parent)
+            new.write_text("new")
+
+    if is_folder:
+        write()
+        assert (tmp_path / "page.html").read_text() == "new"
+    else:
+        with pytest.raises(OutputError, match=r"page\.html was written by another process"):
+            write()
+        assert not (tmp_path / "page.html").exists()
+    assert mine.read_text() == "mine"
 
 
 def test_put_back__leaves_what_is_published(tmp_path):
