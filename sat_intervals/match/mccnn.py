@@ -112,7 +112,7 @@ def network_of(cost: Census | Mccnn, inputs: Mapping[str, Any]) -> Network | Non
     if not isinstance(cost, Mccnn):
         return None
     weights = _Weights.of(weights_file(cost.weights))
-    if weights.sha256 != inputs["weights"]["sha256"]:
+    if weights.sha256 != inputs.get("weights", {}).get("sha256"):
         raise ChangedInputError(
             f"{weights.file} has other weights than the run: restore it, and give all workers the same weights"
         )

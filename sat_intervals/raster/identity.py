@@ -53,12 +53,14 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     ChangedInputError
         The file is being written.
     SatIntervalsError
-        The path is a pipe or a device, or a server does not say which file it sends.
+        The path is a pipe or a device, a server does not say which file it sends, or GDAL hides the URL in a query.
     """
     check_regular(path)
     if file := _local_file(path):
         name = str(file.resolve()) if file == Path(path) else path
         return {"path": name} | _of_file(file, (known or {}).get(name, {}))
+    if path.startswith("/vsicurl?"):
+        raise SatIntervalsError(f"{path}: a change of this file would not be noticed: give its URL alone")
     name = path.removeprefix("/vsicurl/")
     if name.startswith(("http://", "https://")):
         return {"path": path} | _of_url(name)

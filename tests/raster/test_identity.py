@@ -162,6 +162,11 @@ def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(we
     assert [path.name for path in out.iterdir()] == ["tiles"]
 
 
+def test_identity__of_a_url_in_a_query_is_refused():
+    with pytest.raises(SatIntervalsError, match="a change of this file would not be noticed: give its URL alone"):
+        identity("/vsicurl?url=http%3A%2F%2F127.0.0.1%2Fleft.tif")
+
+
 @pytest.mark.parametrize("path", ["http://127.0.0.1:1/image.tif", "/vsimem/image.tif", "nowhere://image.tif"])
 def test_identity__of_what_nobody_tells_more_of_is_its_name(path):
     assert identity(path) == {"path": path}
