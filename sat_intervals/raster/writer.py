@@ -133,12 +133,13 @@ class OutputWriter:
 
     def _check_hidden(self) -> None:
         """Raise if folders of temporary files are links, or have files of their names that no killed process left."""
-        self._check_links()
+        self._check_folders()
         is_ours = (self._hidden / _MADE).exists() or LocalFolder(self._hidden).has_lock()
         if not is_ours and (foreign := next(self._unfinished(), None)):
             raise OutputError(f"{foreign} was not written by sat-intervals: move {self._hidden} away")
 
-    def _check_links(self) -> None:
+    def _check_folders(self) -> None:
+        """Raise if folders of temporary files are none, are links, or are not those that were made."""
         for place in (self._hidden, self._scratch, self._replaced):
             if place.is_symlink():
                 raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
@@ -188,7 +189,7 @@ class OutputWriter:
     def assemble(self, name: str, levels: Sequence[Sequence[Part]], copy_parts: CopyParts) -> None:
         """Make a file of rows of blocks, see `cog.assemble`, under a temporary name."""
         (file,) = (file for file in self._files if file.name == name)
-        self._check_links()
+        self._check_folders()
         with self._failing(self._folder / name):
             made = template(file, self._georeferencing, self._tags)
             # a name of its own: a worker that was lost must not write into the file of a later run
@@ -240,12 +241,12 @@ class OutputWriter:
             Called before, with the `stamps` that the files will have, the report last.
         """
         made = self.build()
-        self._check_links()
+        self._check_folders()
         for name, checksum in made.items():
             with self._failing(self._folder / name):
                 if checksum_of(self._pinned / name) != checksum:
                     raise OSError(errno.EIO, "the content read back differs from that written")
-        self._check_links()
+        self._check_folders()
         names = [file.name for file in self._files]
         if report:
             name, text = report
@@ -258,9 +259,9 @@ class OutputWriter:
         publish(self._pinned, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
         self._is_published = True
 
-    def scratch(self, name: str, names: str) -> AbstractContextManager[Path]:
+    def scratch(self, name: str, pattern: str) -> AbstractContextManager[Path]:
         """Return the context of a folder for temporary files of the caller, see `LocalFolder.scratch`."""
-        return LocalFolder(self._folder).scratch(name, names)
+        return LocalFolder(self._folder).scratch(name, pattern)
 
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:
@@ -296,7 +297,7 @@ class OutputWriter:
     def _remove_scratch(self) -> None:
         """Delete temporary files of this or a killed process, and the replaced ones after publishing; no others."""
         with suppress(OutputError):
-            self._check_links()
+            self._check_folders()
             self._delete()
 
     def _delete(self) -> None:

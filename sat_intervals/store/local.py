@@ -264,23 +264,23 @@ class LocalFolder:
         return False
 
     @contextmanager
-    def scratch(self, name: str, names: str) -> Iterator[Path]:
+    def scratch(self, name: str, pattern: str) -> Iterator[Path]:
         """Yield a hidden folder for temporary files, new in this one; delete it after the block.
 
-        Only files and folders there whose names match the pattern ``names`` are deleted; with any others it stays.
+        Only files and folders there whose whole names match ``pattern`` are deleted; with any others it stays.
         Those of this name that killed processes left are deleted before. They are known by the lock file that is left.
         """
         for left in self.path.glob(f".{escape(name)}-*"):
             with suppress(OSError, SatIntervalsError):  # it is in use, or cannot be deleted
                 if not left.is_symlink() and LocalFolder(left).has_lock():
-                    with LocalFolder(left)._emptied(names):
+                    with LocalFolder(left)._emptied(pattern):
                         pass
-        with LocalFolder(Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)))._emptied(names) as files:
+        with LocalFolder(Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)))._emptied(pattern) as files:
             files.mkdir()
             yield files
 
     @contextmanager
-    def _emptied(self, names: str) -> Iterator[Path]:
+    def _emptied(self, pattern: str) -> Iterator[Path]:
         """Lock the folder for the block; yield the place of its temporary files, which are then deleted.
 
         They are deleted in this folder, even if a link has taken its place.
@@ -291,9 +291,9 @@ class LocalFolder:
                 yield self.path / _FILES
             finally:
                 try:
-                    _empty(folder, names)
+                    _empty(folder, pattern)
                 except BaseException:  # a signal: without the lock file nobody would delete the rest
-                    _empty(folder, names)
+                    _empty(folder, pattern)
                     raise
                 finally:
                     os.close(folder)
@@ -304,12 +304,12 @@ def mark(run: str) -> str:
     return f"{run}{zlib.crc32(run.encode()):08x}"
 
 
-def _empty(folder: int, names: str) -> None:
-    """Delete what has these names in the temporary files of a folder, and their folder if it is then empty."""
+def _empty(folder: int, pattern: str) -> None:
+    """Delete what has names of this pattern in the temporary files of a folder, and their folder if it gets empty."""
     with suppress(OSError):
         files = os.open(_FILES, _FOLDER, dir_fd=folder)
         try:
-            for name in filter(re.compile(names).fullmatch, os.listdir(files)):
+            for name in filter(re.compile(pattern).fullmatch, os.listdir(files)):
                 try:
                     os.unlink(name, dir_fd=files)
                 except OSError:
