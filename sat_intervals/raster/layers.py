@@ -20,7 +20,7 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import OutputError, pinned, rename_new, replace_same, stamps
+from sat_intervals.raster.publishing import OutputError, check_own, pinned, rename_new, replace_same, stamps
 from sat_intervals.raster.seal import check_beside
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
@@ -65,6 +65,7 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
         with scratch as folder, pinned(folder) as own:
             (own / path.name).touch(exist_ok=False)  # the block would follow a link that is there
             yield own / path.name
+            check_own(own / path.name)
             if path.name in before and os.path.lexists(path):
                 replace_same(own / path.name, path, before[path.name])
             else:
@@ -91,9 +92,11 @@ def put_back(files: Sequence[Path], report: Path) -> Iterator[None]:
                 try:
                     os.link(file, _aside(file, report), follow_symlinks=False)
                 except OSError:  # a file system without hard links
+                    if file.is_symlink():
+                        os.symlink(os.readlink(file), _aside(file, report))
+                        continue
                     with whole_file(_aside(file, report)) as new:
-                        new.unlink()
-                        shutil.copy2(file, new, follow_symlinks=False)
+                        shutil.copy2(file, new)
             yield
         finally:
             _settle(files, report)

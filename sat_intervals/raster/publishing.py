@@ -5,6 +5,7 @@ import errno
 import filecmp
 import json
 import os
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
@@ -28,6 +29,14 @@ def pinned(folder: Path) -> Iterator[Path]:
         yield path if path.exists() else folder
     finally:
         os.close(descriptor)
+
+
+def check_own(file: Path) -> os.stat_result:
+    """Return the status of a temporary file; raise if something else took its place."""
+    status = file.lstat()
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.ESTALE, f"its temporary file {file.name} was replaced")
+    return status
 
 
 class OutputError(SatIntervalsError):
@@ -73,7 +82,7 @@ def publish(
     own: dict[str, os.stat_result] = {}
     for name in names:
         with failing(folder / name):
-            own[name] = (finished / name).lstat()
+            own[name] = check_own(finished / name)
     try:
         for name in reversed(names):
             with failing(folder / name):

@@ -5,6 +5,7 @@ import os
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +31,12 @@ class Stream:
         self._file, self._place, self._threads = file, place, threads
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
-        self._buffers = [self._buffer(level) for level in range(len(self._shapes))]
+        with ExitStack() as files:
+            levels = range(len(self._shapes))
+            # open until the end: another file may take the place of one
+            self._strips = [files.enter_context(self._path("strips", level).open("x+b")) for level in levels]
+            self._buffers = [self._buffer(level) for level in levels]
+            self._files = files.pop_all()
         self.parts: list[list[Part]] = [[] for _ in self._shapes]
 
     def _path(self, kind: str, level: int) -> Path:
@@ -38,10 +44,10 @@ class Stream:
 
     def _buffer(self, level: int) -> np.ndarray:
         shape = len(self._file.bands), BLOCK, self._shapes[level][1]
-        self._path("strips", level).touch(exist_ok=False)  # never through a link that is there
-        with open(self._path("rows", level), "xb") as stream:  # a full disk is an error here, not a signal later
+        with self._path("rows", level).open("x+b") as stream:
+            # a full disk is an error here, not a signal later
             os.posix_fallocate(stream.fileno(), 0, int(np.prod(shape)) * np.dtype(self._file.dtype).itemsize)
-        return np.memmap(self._path("rows", level), self._file.dtype, "r+", shape=shape)
+            return np.memmap(stream, self._file.dtype, "r+", shape=shape)
 
     def write(self, row: int, bands: np.ndarray) -> None:
         """Write ``(bands, rows, width)``, which begin at ``row``: the one after the last."""
@@ -63,27 +69,25 @@ class Stream:
         """Compress a row of blocks, and add its reduced rows to the next level."""
         step = max(BLOCK, COLUMNS * _PIXEL // (rows.shape[0] * rows.itemsize) // BLOCK * BLOCK)
         columns = (rows[:, :, first : first + step] for first in range(0, rows.shape[2], step))
-        with (
-            ThreadPoolExecutor(self._threads or usable_cores()) as pool,
-            open(self._path("strips", level), "ab") as out,
-        ):
-            start, sizes, checksum = out.tell(), list[int](), 0
+        out = self._strips[level]
+        start, sizes, checksum = out.tell(), list[int](), 0
+        with ThreadPoolExecutor(self._threads or usable_cores()) as pool:
             for blocks in pool.map(partial(compressed, file=self._file), columns):
                 out.write(blocks.content)
                 checksum = zlib.crc32(blocks.content, checksum)
                 sizes += blocks.sizes
+        out.flush()
         self.parts[level].append(Part(sizes, checksum, (level, start)))
         if level + 1 < len(self._shapes):
             self._add(level + 1, rows[:, ::2, ::2])
 
     def copy_parts(self, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
         """Write the parts into a file; see `CopyParts`."""
-        with open(path, "r+b") as out:
+        with open(os.open(path, os.O_RDWR | os.O_NOFOLLOW), "r+b") as out:
             for offset, part in parts:
                 level, start = part.source
-                with open(self._path("strips", level), "rb") as stream:
-                    stream.seek(start)
-                    content = stream.read(part.length)
+                self._strips[level].seek(start)
+                content = self._strips[level].read(part.length)
                 if zlib.crc32(content) != part.checksum:
                     raise OSError(errno.EIO, "the content read back differs from that written")
                 out.seek(offset)
@@ -94,8 +98,13 @@ class Stream:
         if self._rows[0] != self._shapes[0][0]:
             raise OSError(errno.EIO, f"{self._rows[0]} of {self._shapes[0][0]} rows were written")
 
+    def close(self) -> None:
+        """Close the temporary files."""
+        self._files.close()
+
     def remove(self) -> None:
         """Delete the temporary files."""
+        self.close()
         for level in range(len(self._shapes)):
             for kind in ("rows", "strips"):
                 self._path(kind, level).unlink(missing_ok=True)

@@ -289,6 +289,9 @@ class OutputWriter:
         for strips, _ in self._pictures.values():
             with suppress(*gdal.GDAL_ERRORS):
                 strips.close()
+        for stream in self._streams.values():
+            with suppress(OSError):
+                stream.close()
         self._pictures.clear()
         self._streams.clear()
         self._remove_scratch()

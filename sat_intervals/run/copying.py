@@ -113,7 +113,7 @@ def copy_part(
         if content is None:
             return parts.label(key, kind)
         # not for reading: NFS would write whole pages, over bytes of the neighbours
-        with open(os.open(path, os.O_WRONLY), "wb") as stream:
+        with open(os.open(path, os.O_WRONLY | os.O_NOFOLLOW), "wb") as stream:
             stream.seek(offset)
             stream.write(content)
             stream.flush()

@@ -41,8 +41,8 @@ def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterato
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
-        with whole_file(path, there) as new:
-            figure.savefig(new, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
+        with whole_file(path, there) as new, new.open("r+b") as stream:
+            figure.savefig(stream, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
             check_made_here([path])  # again: a file may have appeared meanwhile
 
 

@@ -21,6 +21,7 @@ import pytest
 import rasterio
 from finished import random_bands, write_run
 from helpers import COMMAND, PLACE, hashes, invoke, write_pair
+from matplotlib.figure import Figure
 
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
@@ -820,6 +821,52 @@ def test_output_writer__writes_nothing_behind_a_link_with_a_temporary_name(tmp_p
     assert contents(tmp_path) == {str(tmp_path / "mine"): b"mine"}
 
 
+def exchanged_for_link(file, mine):
+    """What a hostile process does as soon as it sees a temporary file."""
+    file.rename(mine.with_name("moved"))
+    file.symlink_to(mine)
+
+
+@pytest.mark.parametrize("name", ["strips-0-intervals.tif", "rows-0-validity.tif", "intervals.tif", "run.json"])
+def test_output_writer__writes_nothing_behind_a_link_that_takes_the_place_of_a_temporary_file(
+    tmp_path, monkeypatch, name
+):
+    (tmp_path / "mine").write_text("mine")
+    temporary = tmp_path / "out" / ".unpublished-intervals.tif" / "files" / name
+    with writer(tmp_path / "out") as output:
+        output.write(0, np.zeros((4, 2, 5), np.float32), np.zeros((2, 5), np.uint16))
+        if temporary.exists():
+            exchanged_for_link(temporary, tmp_path / "mine")
+        output.write(2, np.zeros((4, 2, 5), np.float32), np.zeros((2, 5), np.uint16))
+
+        def announce(_):
+            if temporary.exists() and not temporary.is_symlink():
+                exchanged_for_link(temporary, tmp_path / "mine")
+
+        with suppress(OutputError):
+            output.publish(("run.json", "{}"), announce=announce)
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert not any(file.is_symlink() for file in (tmp_path / "out").iterdir())
+
+
+def test_page__draws_nothing_behind_a_link_that_takes_the_place_of_its_temporary_file(tmp_path, monkeypatch):
+    (tmp_path / "mine").write_text("mine")
+    savefig = Figure.savefig
+
+    def late(*arguments, **named):
+        (temporary,) = tmp_path.glob(".overview.png-*/files/overview.png")
+        exchanged_for_link(temporary, tmp_path / "mine")
+        return savefig(*arguments, **named)
+
+    monkeypatch.setattr(Figure, "savefig", late)
+    with (
+        pytest.raises(OutputError, match=r"its temporary file overview\.png was replaced"),
+        page(tmp_path / "overview.png", (1, 1), 50, ""),
+    ):
+        pass
+    assert ((tmp_path / "mine").read_text(), (tmp_path / "overview.png").exists()) == ("mine", False)
+
+
 @pytest.mark.parametrize("name", ["strips-disparity.png", "disparity.png"])
 def test_output_writer__draws_nothing_behind_a_link_with_a_temporary_name(tmp_path, name):
     (tmp_path / "mine").write_text("mine")
@@ -1256,7 +1303,7 @@ def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, m
         fail()
 
     monkeypatch.setattr(Path, "write_text", half)
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, path, **options: half(Path(path), "x" * 200))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, stream, **options: stream.write(b"x" * 100) and fail())
     with pytest.raises(SatIntervalsError, match=rf"{name} cannot be written: Input/output error"):
         write()
     monkeypatch.undo()

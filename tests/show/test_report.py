@@ -23,6 +23,7 @@ from sat_intervals.raster import read_layers
 from sat_intervals.results import open_results
 from sat_intervals.show.legend import classify
 from sat_intervals.show.report import contents, write_report
+from sat_intervals.show.report import page as report_page
 
 ROOT = Path(__file__).parents[2]
 
@@ -73,6 +74,21 @@ def test_write_report__ends_where_an_image_or_its_page_is_replaced_meanwhile(tmp
         write_report(results)
     assert file.read_bytes() == new
     assert name == "report.html" or not (out / "report.html").exists()
+
+
+def test_write_report__ends_where_its_run_is_replaced_meanwhile(tmp_path, monkeypatch):
+    """Else the page has the maps of one run and the accuracy of another."""
+    results = open_results(write_run(tmp_path, *random_bands(40, 50)))
+    judged = report_page.evaluate_run
+
+    def replaced_before(*arguments):
+        write_run(tmp_path, *random_bands(40, 50))
+        return judged(*arguments)
+
+    monkeypatch.setattr(report_page, "evaluate_run", replaced_before)
+    with pytest.raises(SatIntervalsError, match="was replaced while it was read: rerun the command"):
+        write_report(results)
+    assert not (results.out / "report.html").exists()
 
 
 def test_report__says_in_one_line_what_is_wrong(tmp_path):

@@ -32,9 +32,10 @@ def write_report(results: Results) -> Path:
     results.check_kept([path], [results.truth.image.path if results.truth else None])
     there = stamps(path.parent, [path.name])
     check_made_here([path])
-    check_unchanged = watched_images(results.images)
-    contents = _contents(results)
-    check_unchanged()
+    check_images = watched_images(results.images)
+    with results.unchanged():  # over all that is read from the run
+        contents = _contents(results)
+    check_images()
     # A "<" in the contents could end the script element.
     data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
     page = _asset("report.html")
