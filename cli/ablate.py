@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.judging import Judging, judging_options, say_scenes
+from sat_intervals.cli.judging import Judging, judging_options, say_scenes, watched_pairs
 from sat_intervals.cli.options import cost_option
 
 
@@ -28,12 +28,14 @@ def ablate(pairs: tuple[Path, ...], cost: str | None, judging: Judging) -> None:
     from sat_intervals.evaluate.paper import SceneMetrics, table_2
 
     found = find_pairs(pairs)
+    check_unchanged = watched_pairs(found)
     configs = [judging.load(pair, cost) for pair in found]
     scenes = []
     for pair, config in zip(found, configs, strict=True):
         if not judging.quiet:
             click.echo(f"matching {pair.name}", err=True)
         scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, config, tolerance=judging.tolerance)))
+    check_unchanged()
     if judging.as_json:
         say_scenes(scenes)
     else:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.evaluate_dsm import Surface, surface_options
-from sat_intervals.cli.judging import Judging, judging_options, say_scenes
+from sat_intervals.cli.judging import Judging, judging_options, say_scenes, watched_pairs
 from sat_intervals.cli.options import COSTS
 
 if TYPE_CHECKING:
@@ -86,12 +86,14 @@ def evaluate(
     from sat_intervals.evaluate.paper import SceneMetrics
 
     sources = _sources(folders, truth, mask, cost)
+    check_unchanged = watched_pairs(source.pair for source in sources if source.pair)
     configs = _configs(sources, judging, cost)
     judge = partial(evaluate_run, tolerance=judging.tolerance, remove_bias=remove_bias)
     scenes = [
         SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config, judging.quiet))
         for source, config in zip(sources, configs, strict=True)
     ]
+    check_unchanged()
     if not judging.quiet:
         _warn_of_whole_truth(scenes, judging.tolerance)
     if judging.as_json:

@@ -1,6 +1,7 @@
 """Options and output shared by the commands that evaluate pairs with known truth."""
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -90,6 +91,13 @@ def judging_options(command: Command) -> Command:
         click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
     )
+
+
+def watched_pairs(pairs: "Iterable[Pair]") -> Callable[[], None]:
+    """Return a function that raises if an image or a truth was replaced since the pairs were read."""
+    from sat_intervals.raster import watched_rasters
+
+    return watched_rasters(file for pair in pairs for file in (pair.left, pair.right, pair.truth))
 
 
 def say_scenes(scenes: "list[SceneMetrics]") -> None:

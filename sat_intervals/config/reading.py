@@ -47,7 +47,7 @@ def load_config(
         case None:
             pass
         case str() | Path():
-            values, file = _read_yaml(Path(source)), f"{source}: "
+            values, file = read_yaml(Path(source)), f"{source}: "
         case Config():
             values = source.model_dump()
             if overrides.get("preset") not in (None, source.preset):
@@ -91,7 +91,14 @@ def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
     return bool(path)  # an error without a path concerns several sections
 
 
-def _read_yaml(file: Path) -> Mapping[str, Any]:
+def read_yaml(file: Path) -> Mapping[str, Any]:
+    """Read the sections of a file of settings, which `load_config` checks.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or has no sections.
+    """
     try:
         values = read_mapping(file, f"sections {', '.join(Config.model_fields)}")
     except OSError as error:

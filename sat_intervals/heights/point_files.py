@@ -2,6 +2,7 @@
 
 import csv
 from collections.abc import Iterator
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -62,17 +63,19 @@ class PointFile:
 
 
 def files_of_points(path: Path) -> list[Path]:
-    """Return the files, existing or not, that points are read from: a shapefile has several, SQLite writes two beside.
+    """Return the files, existing or not, that points are read from: many vector formats have several, SQLite two more.
 
     Raises
     ------
     SatIntervalsError
         It is a virtual file, whose sources could change unnoticed.
     """
+    if path.suffix.lower() in (".csv", ".las", ".laz"):
+        return [path]
     if path.suffix.lower() == ".vrt":
         raise SatIntervalsError(f"{path} is read from other files, which may change meanwhile: convert it with ogr2ogr")
-    parts = [path.with_suffix(end) for end in (".shx", ".dbf", ".prj", ".cpg")] if path.suffix.lower() == ".shp" else []
-    return [path, *parts, *(path.with_name(path.name + end) for end in ("-wal", "-journal"))]
+    beside = path.parent.glob(f"{escape(path.stem)}.*")
+    return [path, *beside, *(path.with_name(path.name + end) for end in ("-wal", "-journal"))]
 
 
 def _unreadable(path: Path, error: Exception) -> SatIntervalsError:

@@ -14,6 +14,7 @@ from typing import Any
 
 from sat_intervals.config import Config, load_config
 from sat_intervals.config.pairs import REPORT, PairOfBatch
+from sat_intervals.config.reading import read_yaml
 from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
@@ -76,6 +77,7 @@ def match_batch(
     """
     common = load_config(config, overrides)
     read = [config if isinstance(config, (str, Path)) else None, common.disparity.grid]
+    sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
     _check_not_replaced(pairs, read, out, overwrite)
     cluster = common.cluster
     _raise_file_limit()
@@ -91,7 +93,7 @@ def match_batch(
             progress("pairs", number, len(pairs))
             try:
                 own = {**(overrides or {}), **_merged(overrides or {}, pair.settings)}
-                settings = load_config(config, own, preset_wins=True)
+                settings = load_config(sections, own, preset_wins=True)
                 before = None if overwrite else _done_before(pair, out, settings)
                 if before is None:
                     jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find)

@@ -152,9 +152,8 @@ class LocalFolder:
 
     def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
         """See `Folder`."""
-        for _, files in groupby(sorted(names), os.path.dirname):
-            for place in (self._own(next(files)), *map(self.path.joinpath, files)):  # one look for each folder
-                place.unlink(missing_ok=True)
+        for name in names:
+            self.delete(name)
         tops = [self._own(folder) for folder in folders]
         places = [LocalFolder(Path(place)) for top in tops for place, _, _ in os.walk(top) if not top.is_symlink()]
         with ThreadPoolExecutor(_AT_ONCE) as threads:  # one after another takes milliseconds each on some disks

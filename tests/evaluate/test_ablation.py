@@ -25,6 +25,7 @@ from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_ri
 from sat_intervals.match import memory
 from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY, Bands
+from sat_intervals.run import pair as run_pair
 
 some = settings(max_examples=40, derandomize=True, deadline=None)
 X = IMPOSSIBLE_COST
@@ -159,6 +160,27 @@ def test_ablate_pair__ends_where_an_image_is_replaced_meanwhile(folder, tmp_path
     monkeypatch.setattr(ablation, "evaluate", replaced_before)
     with pytest.raises(RunError, match=rf"{name} was replaced or changed while it was read"):
         ablate_pair(*find_pairs([tmp_path / "pair"]))
+
+
+@pytest.mark.parametrize("command", ["evaluate", "ablate"])
+def test_commands__end_where_a_pair_is_replaced_after_they_began(folder, tmp_path, monkeypatch, command):
+    """Else an old match is judged by a new truth, or new images are matched in an old search range."""
+    shutil.copytree(folder, tmp_path / "pair")
+    truth, match, judge = tmp_path / "pair" / "truth.tif", run_pair.match_pair, ablation.ablate_pair
+
+    def and_replaced(work):
+        def call(*arguments, **named):
+            result = work(*arguments, **named)
+            shutil.copy(truth, tmp_path / "new.tif")
+            (tmp_path / "new.tif").replace(truth)
+            return result
+
+        return call
+
+    monkeypatch.setattr(run_pair, "match_pair", and_replaced(match))
+    monkeypatch.setattr(ablation, "ablate_pair", and_replaced(judge))
+    result = invoke(command, tmp_path / "pair", "--quiet")
+    assert (result.exit_code, "truth.tif was replaced or changed while it was read" in result.stderr) == (1, True)
 
 
 def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):

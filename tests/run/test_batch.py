@@ -181,6 +181,19 @@ def test_match_batch__keeps_a_file_that_takes_the_place_of_its_report(images, tm
     assert {end["state"] for end in match_batch(pairs, tmp_path).values()} <= {"done", "done before"}
 
 
+def test_match_batch__reads_the_settings_of_all_pairs_once(images, tmp_path, monkeypatch):
+    file, prepared = tmp_path / "settings.yaml", batch.prepare
+    file.write_text("sgm: {p1: 5}")
+
+    def and_changed(*arguments, **named):
+        file.write_text("sgm: {p1: 6}")
+        return prepared(*arguments, **named)
+
+    monkeypatch.setattr(batch, "prepare", and_changed)
+    match_batch(read_batch(rows(images)), tmp_path / "out", file)
+    assert {open_run(tmp_path / "out" / name).config.sgm.p1 for name in ("pair1", "pair2")} == {5}
+
+
 def test_match_batch__keeps_a_file_that_appears_after_its_check(images, tmp_path, monkeypatch):
     def and_appears(out):
         (out / "batch.json").write_text("a user's")
