@@ -11,6 +11,8 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import GROUND, Frame, Vertical
 
+# Bytes in which GDAL looks for what a file is.
+_HEAD = 4096
 # Points read at a time.
 _PART = 500_000
 # Names of columns, in lower case; the first found counts. Those of ICESat-2 products are among them.
@@ -72,7 +74,7 @@ def files_of_points(path: Path) -> list[Path]:
     """
     if path.suffix.lower() in (".csv", ".las", ".laz"):
         return [path]
-    if path.suffix.lower() == ".vrt":
+    if path.is_file() and b"<OGRVRTDataSource" in path.open("rb").read(_HEAD):
         raise SatIntervalsError(f"{path} is read from other files, which may change meanwhile: convert it with ogr2ogr")
     beside = path.parent.glob(f"{escape(path.stem)}.*")
     return [path, *beside, *(path.with_name(path.name + end) for end in ("-wal", "-journal"))]

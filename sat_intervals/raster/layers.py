@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import shutil
+import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -61,15 +62,15 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
     try:
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        scratch = LocalFolder(path.parent).scratch(path.name, re.escape(path.name) + ".*")
+        scratch = LocalFolder(path.parent).scratch(path.name, f"[0-9a-f]{{32}}-{re.escape(path.name)}.*")
         with scratch as folder, pinned(folder) as own:
-            (own / path.name).touch(exist_ok=False)  # the block would follow a link that is there
-            yield own / path.name
-            check_own(own / path.name)
+            new = own / f"{uuid.uuid4().hex}-{path.name}"  # nobody can put a link there before
+            yield new
+            check_own(new)
             if path.name in before and os.path.lexists(path):
-                replace_same(own / path.name, path, before[path.name])
+                replace_same(new, path, before[path.name])
             else:
-                rename_new(own / path.name, path)
+                rename_new(new, path)
     except FileExistsError as error:
         raise OutputError(f"{path} was written by another process meanwhile: move it away") from error
     except (*gdal.GDAL_ERRORS, OSError) as error:

@@ -32,11 +32,17 @@ def pinned(folder: Path) -> Iterator[Path]:
 
 
 def check_own(file: Path) -> os.stat_result:
-    """Return the status of a temporary file; raise if something else took its place."""
+    """Return the status of a temporary file; raise if a link took its place, of either kind."""
     status = file.lstat()
-    if not stat.S_ISREG(status.st_mode):
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
         raise OSError(errno.ESTALE, f"its temporary file {file.name} was replaced")
     return status
+
+
+def open_own(file: Path, flags: int) -> int:
+    """Open a temporary file that exists, unless a link took its place; return its descriptor."""
+    check_own(file)
+    return os.open(file, flags | os.O_NOFOLLOW)
 
 
 class OutputError(SatIntervalsError):

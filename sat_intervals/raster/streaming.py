@@ -15,6 +15,7 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.raster.blocks import BLOCK, COLUMNS, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import File
+from sat_intervals.raster.publishing import open_own
 
 # Bytes of a pixel of which COLUMNS are compressed at a time, fewer of larger ones: each thread has some copies.
 _PIXEL = 16
@@ -83,7 +84,7 @@ class Stream:
 
     def copy_parts(self, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
         """Write the parts into a file; see `CopyParts`."""
-        with open(os.open(path, os.O_RDWR | os.O_NOFOLLOW), "r+b") as out:
+        with open(open_own(path, os.O_RDWR), "r+b") as out:
             for offset, part in parts:
                 level, start = part.source
                 self._strips[level].seek(start)

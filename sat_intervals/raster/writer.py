@@ -177,8 +177,7 @@ class OutputWriter:
             if file.name not in self._pictures:
                 height, width = self._shape
                 kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
-                path = self._pinned / f"strips-{file.name}"
-                path.touch(exist_ok=False)  # GDAL would follow a link that is there
+                path = self._new(file.name)
                 self._pictures[file.name] = gdal.create(str(path), height=height, width=width, **kind), 0
                 self._pictures[file.name][0].update_tags(**self._tags)
                 file.describe(self._pictures[file.name][0])
@@ -192,10 +191,16 @@ class OutputWriter:
         self._check_folders()
         with self._failing(self._folder / name):
             made = template(file, self._georeferencing, self._tags)
-            # a name of its own: a worker that was lost must not write into the file of a later run
-            path = self._scratch / f"strips-{uuid.uuid4().hex}-{name}"
+            path = self._scratch / self._new(name).name
             self._made[name] = assemble(path, made, self._shape, levels, copy_parts, is_sealed=file.is_sealed)
             os.replace(self._pinned / path.name, self._pinned / name)
+
+    def _new(self, name: str) -> Path:
+        """Return a place for a temporary file, where nobody can put a link before.
+
+        A worker that was lost does not write into the file of a later run either.
+        """
+        return self._pinned / f"strips-{uuid.uuid4().hex}-{name}"
 
     def build(self) -> dict[str, dict[str, int]]:
         """Build the final files under temporary names; return size and CRC-32 by name."""
@@ -208,14 +213,14 @@ class OutputWriter:
         for name, (strips, expected) in self._pictures.items():
             with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
                 strips.close()
-                place = self._pinned / name
-                place.touch(exist_ok=False)
+                place = self._new(name)
                 copy(strips.name, str(place), driver="PNG", **_PNG)
                 _flush(place)
                 with gdal.reading(str(place)) as dataset:
                     if (sum_of_bits(dataset.read()) - expected) % SUM_WRAPS:
                         raise OSError(errno.EIO, "the content read back differs from that written")
                 self._made[name] = checksum_of(place)
+                os.replace(place, self._pinned / name)
             os.unlink(strips.name)
         self._pictures.clear()
         return dict(self._made)

@@ -128,7 +128,7 @@ class _Report:
         try:
             with whole_file(self._file, self._there) as new:
                 new.write_text(text)
-                there = stamps(new.parent, [REPORT])
+                there = {REPORT: stamps(new.parent, [new.name])[new.name]}
         except OutputError as error:
             raise RunError(f"{error}, and rerun the batch: it resumes") from error
         self._there = there

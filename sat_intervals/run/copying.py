@@ -9,6 +9,7 @@ from typing import Any
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Part, run_files
+from sat_intervals.raster.publishing import open_own
 from sat_intervals.run.job import Job
 from sat_intervals.run.parts import codecs_of, rows_of_levels
 from sat_intervals.run.strips import on_worker
@@ -113,7 +114,7 @@ def copy_part(
         if content is None:
             return parts.label(key, kind)
         # not for reading: NFS would write whole pages, over bytes of the neighbours
-        with open(os.open(path, os.O_WRONLY | os.O_NOFOLLOW), "wb") as stream:
+        with open(open_own(path, os.O_WRONLY), "wb") as stream:
             stream.seek(offset)
             stream.write(content)
             stream.flush()

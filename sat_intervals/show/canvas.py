@@ -41,7 +41,7 @@ def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterato
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
-        with whole_file(path, there) as new, new.open("r+b") as stream:
+        with whole_file(path, there) as new, new.open("xb") as stream:
             figure.savefig(stream, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
             check_made_here([path])  # again: a file may have appeared meanwhile
 

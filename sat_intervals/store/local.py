@@ -145,7 +145,7 @@ class LocalFolder:
             if folder.is_symlink():
                 raise OSError(errno.ELOOP, f"{folder} has become a symbolic link", str(place))
         top = (self.path, *self.path.parents)[self.depth]
-        made_by = LocalFolder(top).read(MADE) if self.run and name != MADE else None
+        made_by = LocalFolder(top).read(MADE) if self.run else None
         if made_by and made_by != mark(self.run) and made_by == mark(made_by[:-8]):  # otherwise it is damaged
             raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
         return place

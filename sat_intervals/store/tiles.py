@@ -160,7 +160,7 @@ class Store:
             if overwrite or (text is None and not self.elsewhere):
                 drop(self._place)
             self._place.make("")
-            folder.write(MADE, mark(self.run))
+            self._place.write(MADE, mark(self.run))
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
             for name in FOLDERS:

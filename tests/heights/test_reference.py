@@ -443,11 +443,12 @@ def test_make_truth__ends_where_its_temporary_points_are_damaged(relief, tmp_pat
     assert not path.exists()
 
 
-def test_make_truth__refuses_virtual_points(relief, tmp_path):
+@pytest.mark.parametrize("name", ["p.vrt", "p.xml"])
+def test_make_truth__refuses_virtual_points(relief, tmp_path, name):
     out, files, _ = relief
-    (tmp_path / "p.vrt").write_text("<OGRVRTDataSource/>")
-    with pytest.raises(SatIntervalsError, match=r"p.vrt is read from other files, .*: convert it with ogr2ogr"):
-        make_truth(out, SensorFiles(*files), Reference(tmp_path / "p.vrt", True, Vertical(True, None)))
+    (tmp_path / name).write_text("<OGRVRTDataSource></OGRVRTDataSource>")
+    with pytest.raises(SatIntervalsError, match=rf"{name} is read from other files, .*: convert it with ogr2ogr"):
+        make_truth(out, SensorFiles(*files), Reference(tmp_path / name, True, Vertical(True, None)))
 
 
 def test_make_truth__keeps_a_file_that_appears_after_the_check(relief, tmp_path, monkeypatch):

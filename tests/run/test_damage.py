@@ -440,6 +440,8 @@ def test_match_block__keeps_the_tiles_of_another_run_that_take_the_place_of_its_
             write()
     job.store.write_failure(first.name, "a reason")
     job.store.remove()
+    with pytest.raises(OSError, match="has become the folder of another run"):
+        job.store.folder.delete(MARK)  # the last file that a removal deletes
     assert contents(there) == before
 
 

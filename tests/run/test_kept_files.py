@@ -821,32 +821,31 @@ def test_output_writer__writes_nothing_behind_a_link_with_a_temporary_name(tmp_p
     assert contents(tmp_path) == {str(tmp_path / "mine"): b"mine"}
 
 
-def exchanged_for_link(file, mine):
+def exchanged_for_link(file, mine, way="symlink_to"):
     """What a hostile process does as soon as it sees a temporary file."""
     file.rename(mine.with_name("moved"))
-    file.symlink_to(mine)
+    getattr(file, way)(mine)
 
 
+@pytest.mark.parametrize("way", ["symlink_to", "hardlink_to"])
 @pytest.mark.parametrize("name", ["strips-0-intervals.tif", "rows-0-validity.tif", "intervals.tif", "run.json"])
-def test_output_writer__writes_nothing_behind_a_link_that_takes_the_place_of_a_temporary_file(
-    tmp_path, monkeypatch, name
-):
+def test_output_writer__writes_nothing_behind_a_link_that_takes_the_place_of_a_temporary_file(tmp_path, name, way):
     (tmp_path / "mine").write_text("mine")
     temporary = tmp_path / "out" / ".unpublished-intervals.tif" / "files" / name
     with writer(tmp_path / "out") as output:
         output.write(0, np.zeros((4, 2, 5), np.float32), np.zeros((2, 5), np.uint16))
         if temporary.exists():
-            exchanged_for_link(temporary, tmp_path / "mine")
+            exchanged_for_link(temporary, tmp_path / "mine", way)
         output.write(2, np.zeros((4, 2, 5), np.float32), np.zeros((2, 5), np.uint16))
 
         def announce(_):
             if temporary.exists() and not temporary.is_symlink():
-                exchanged_for_link(temporary, tmp_path / "mine")
+                exchanged_for_link(temporary, tmp_path / "mine", way)
 
         with suppress(OutputError):
             output.publish(("run.json", "{}"), announce=announce)
     assert (tmp_path / "mine").read_text() == "mine"
-    assert not any(file.is_symlink() for file in (tmp_path / "out").iterdir())
+    assert not any(file.is_symlink() or file.stat().st_nlink > 1 for file in (tmp_path / "out").glob("*.*"))
 
 
 def test_page__draws_nothing_behind_a_link_that_takes_the_place_of_its_temporary_file(tmp_path, monkeypatch):
@@ -854,28 +853,26 @@ def test_page__draws_nothing_behind_a_link_that_takes_the_place_of_its_temporary
     savefig = Figure.savefig
 
     def late(*arguments, **named):
-        (temporary,) = tmp_path.glob(".overview.png-*/files/overview.png")
+        (temporary,) = tmp_path.glob(".overview.png-*/files/*-overview.png")
         exchanged_for_link(temporary, tmp_path / "mine")
         return savefig(*arguments, **named)
 
     monkeypatch.setattr(Figure, "savefig", late)
     with (
-        pytest.raises(OutputError, match=r"its temporary file overview\.png was replaced"),
+        pytest.raises(OutputError, match=r"its temporary file .*-overview\.png was replaced"),
         page(tmp_path / "overview.png", (1, 1), 50, ""),
     ):
         pass
     assert ((tmp_path / "mine").read_text(), (tmp_path / "overview.png").exists()) == ("mine", False)
 
 
-@pytest.mark.parametrize("name", ["strips-disparity.png", "disparity.png"])
-def test_output_writer__draws_nothing_behind_a_link_with_a_temporary_name(tmp_path, name):
+def test_output_writer__draws_nothing_behind_a_link_with_the_name_of_its_picture(tmp_path):
     (tmp_path / "mine").write_text("mine")
     file = File("disparity.png", "uint8", None, BANDS[:1], driver="PNG")
     with OutputWriter(tmp_path / "out", [file], 4, 5, Georeferencing(), {}) as output:
-        (tmp_path / "out" / ".unpublished-disparity.png" / "files" / name).symlink_to(tmp_path / "mine")
-        with pytest.raises(OutputError, match="cannot be written: File exists"):
-            written(output, np.zeros((1, 4, 5), np.uint8))
-    assert contents(tmp_path) == {str(tmp_path / "mine"): b"mine"}
+        (tmp_path / "out" / ".unpublished-disparity.png" / "files" / "disparity.png").symlink_to(tmp_path / "mine")
+        written(output, np.zeros((1, 4, 5), np.uint8))
+    assert ((tmp_path / "mine").read_text(), (tmp_path / "out" / "disparity.png").is_symlink()) == ("mine", False)
 
 
 @pytest.mark.parametrize("when", ["template", "publish"])
@@ -1161,36 +1158,32 @@ def test_whole_file__keeps_what_came_after_its_stamps_and_writes_where_the_file_
     assert contents(tmp_path) == {str(path): b"new"}
 
 
-@pytest.mark.parametrize("is_folder", [False, True])
-def test_whole_file__writes_nothing_behind_a_link_in_its_temporary_folder(tmp_path, monkeypatch, is_folder):
-    (tmp_path / "user").mkdir()
-    mine = tmp_path / "user" / "page.html"
+@pytest.mark.parametrize("way", ["symlink_to", "hardlink_to"])
+def test_whole_file__publishes_no_link_that_takes_the_place_of_its_temporary_file(tmp_path, way):
+    mine = tmp_path / "mine"
     mine.write_text("mine")
-    pinned = layers.pinned
-
-    def and_linked(folder):
-        if not is_folder:
-            (folder / "page.html").symlink_to(mine)
-        return pinned(folder)
-
-    monkeypatch.setattr(layers, "pinned", and_linked)
 
     def write():
         with layers.whole_file(tmp_path / "page.html") as new:
-            if is_folder:
-                (files,) = tmp_path.glob(".page.html-*/files")
-                files.rename(tmp_path / "moved")
-                files.symlink_to(mine.parent)
             new.write_text("new")
+            new.rename(tmp_path / "moved")
+            getattr(new, way)(mine)
 
-    if is_folder:
+    with pytest.raises(OutputError, match=r"its temporary file .*page.html was replaced"):
         write()
-        assert (tmp_path / "page.html").read_text() == "new"
-    else:
-        with pytest.raises(OutputError, match=r"page\.html was written by another process"):
-            write()
-        assert not (tmp_path / "page.html").exists()
-    assert mine.read_text() == "mine"
+    assert (mine.read_text(), (tmp_path / "page.html").exists()) == ("mine", False)
+
+
+def test_whole_file__is_written_where_a_link_takes_the_place_of_its_temporary_folder(tmp_path):
+    (tmp_path / "user").mkdir()
+    mine = tmp_path / "user" / "page.html"
+    mine.write_text("mine")
+    with layers.whole_file(tmp_path / "page.html") as new:
+        (files,) = tmp_path.glob(".page.html-*/files")
+        files.rename(tmp_path / "moved")
+        files.symlink_to(mine.parent)
+        new.write_text("new")
+    assert ((tmp_path / "page.html").read_text(), mine.read_text()) == ("new", "mine")
 
 
 def test_put_back__leaves_what_is_published(tmp_path):
