@@ -74,8 +74,13 @@ def files_of_points(path: Path) -> list[Path]:
     """
     if path.suffix.lower() in (".csv", ".las", ".laz"):
         return [path]
-    if path.is_file() and b"<OGRVRTDataSource" in path.open("rb").read(_HEAD):
-        raise SatIntervalsError(f"{path} is read from other files, which may change meanwhile: convert it with ogr2ogr")
+    if path.is_file():
+        with path.open("rb") as stream:
+            is_virtual = b"<OGRVRTDataSource" in stream.read(_HEAD)
+        if is_virtual:
+            raise SatIntervalsError(
+                f"{path} is read from other files, which may change meanwhile: convert it with ogr2ogr"
+            )
     beside = path.parent.glob(f"{escape(path.stem)}.*")
     return [path, *beside, *(path.with_name(path.name + end) for end in ("-wal", "-journal"))]
 
