@@ -896,7 +896,7 @@ def test_write_rows__leaves_no_damaged_file_on_a_full_disk(disk):
     place = disk(8 << 10)
     (place / "other").write_bytes(bytes(8 << 10))
     with pytest.raises(OutputError, match=r"ranges.tif cannot be written"):
-        write_rows(place / "ranges.tif", [np.ones((2, 9, 9), np.int16)], (2, 9, 9), Georeferencing(), {})
+        write_rows(place / "ranges.tif", [np.ones((2, 9, 9), np.int16)], (2, 9, 9), Georeferencing(), {}, {})
     assert left_behind(place) == ["other"]
 
 
