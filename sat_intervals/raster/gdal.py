@@ -34,6 +34,7 @@ _STRICT = {
     "GDAL_PAM_ENABLED": "YES",  # otherwise no-data values in .aux.xml are not seen
     "CPL_VSIL_CURL_NON_CACHED": ":".join(f"/{name}" for name in _REMOTE),  # a later run may find another file there
     "GDAL_HTTP_MAX_RETRY": os.environ.get("GDAL_HTTP_MAX_RETRY", "3"),  # a busy server seems to have no mask
+    "GDAL_HTTP_RETRY_DELAY": os.environ.get("GDAL_HTTP_RETRY_DELAY", "1"),  # seconds; doubles each time
     "GDAL_NUM_THREADS": "1",  # a failure in another thread has no message in this one
     "VRT_NUM_THREADS": "1",
     "GTIFF_DIRECT_IO": "NO",

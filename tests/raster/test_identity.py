@@ -1,6 +1,7 @@
 """Identity of input files; inputs on a web server, read by windows and identified by size and ETag."""
 
 import hashlib
+import itertools
 import json
 import os
 import subprocess
@@ -266,13 +267,25 @@ from sat_intervals.tiling import Window
 print(read_window(open_image(sys.argv[1]), Window(0, 0, 9, 9))[1].any())"""
 
 
-def test_read_window__sees_a_mask_on_a_server_whatever_the_users_options(web_server):
+def masked_image(server: ThreadingHTTPServer) -> str:
+    """Return the URL of an image that has a mask beside it."""
     options = {"height": 9, "width": 9, "count": 1, "dtype": "uint16", "transform": rasterio.Affine.scale(2)}
-    with rasterio.open(web_server.folder / "left.tif", "w", "GTiff", **options) as dataset:
+    with rasterio.open(server.folder / "left.tif", "w", "GTiff", **options) as dataset:
         dataset.write(np.full((1, 9, 9), 7, np.uint16))
         with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False):
             dataset.write_mask(np.eye(9, dtype=bool))
-    name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
-    setting = {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".tif"}
+    return f"http://127.0.0.1:{server.server_address[1]}/left.tif"
+
+
+def test_read_window__sees_a_mask_on_a_server_whatever_the_users_options(web_server):
+    name, setting = masked_image(web_server), {"CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".tif"}
     done = subprocess.run([sys.executable, "-c", STATE, name], env=os.environ | setting, capture_output=True, text=True)
     assert done.stdout == "True\n"
+
+
+def test_read_window__sees_the_mask_of_a_server_that_is_busy_every_other_time(web_server):
+    name, asked = masked_image(web_server), itertools.count()
+    web_server.is_busy = lambda path: path.endswith(".msk") and next(asked) % 2 == 0
+    # GDAL waits 30 seconds if it is not told otherwise
+    done = subprocess.run([sys.executable, "-c", STATE, name], capture_output=True, text=True, timeout=100)
+    assert (done.stdout, next(asked) > 2) == ("True\n", True)

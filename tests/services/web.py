@@ -18,6 +18,11 @@ class Handler(BaseHTTPRequestHandler):
         self.do_GET()
 
     def do_GET(self) -> None:
+        if self.server.is_busy(self.path):
+            self.send_response(503)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
         file = self.server.folder / self.path[1:]
         content = file.read_bytes() if file.is_file() else b""
         asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
@@ -44,6 +49,7 @@ def web_server(tmp_path) -> Iterator[ThreadingHTTPServer]:
     """A web server on loopback of the folder ``server.folder``; what it sent of which file is in ``server.sent``."""
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         server.folder, server.sent, server.has_tags = tmp_path / "web", [], True
+        server.is_busy = lambda path: False
         server.folder.mkdir()
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
