@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import rasterio
 from finished import random_bands, write_run
-from helpers import COMMAND, PLACE, hashes, invoke, write_pair
+from helpers import COMMAND, OUTPUTS, PLACE, hashes, invoke, write_pair
 from matplotlib.figure import Figure
 
 from sat_intervals.config.pairs import PairOfBatch
@@ -30,6 +30,7 @@ from sat_intervals.heights import dsm
 from sat_intervals.interop.export import export
 from sat_intervals.products import BANDS
 from sat_intervals.raster import (
+    BLOCK,
     MARK,
     RUN_FILES,
     Georeferencing,
@@ -828,15 +829,16 @@ def exchanged_for_link(file, mine, way="symlink_to"):
 
 
 @pytest.mark.parametrize("way", ["symlink_to", "hardlink_to"])
-@pytest.mark.parametrize("name", ["strips-0-intervals.tif", "rows-0-validity.tif", "intervals.tif", "run.json"])
+@pytest.mark.parametrize("name", ["strips-0-intervals.tif", "intervals.tif", "run.json"])
 def test_output_writer__writes_nothing_behind_a_link_that_takes_the_place_of_a_temporary_file(tmp_path, name, way):
     (tmp_path / "mine").write_text("mine")
     temporary = tmp_path / "out" / ".unpublished-intervals.tif" / "files" / name
-    with writer(tmp_path / "out") as output:
-        output.write(0, np.zeros((4, 2, 5), np.float32), np.zeros((2, 5), np.uint16))
+    with OutputWriter(tmp_path / "out", RUN_FILES, 2 * BLOCK, 5, Georeferencing(), {}) as output:
+        rows = np.zeros((4, BLOCK, 5), np.float32), np.zeros((BLOCK, 5), np.uint16)
+        output.write(0, *rows)
         if temporary.exists():
             exchanged_for_link(temporary, tmp_path / "mine", way)
-        output.write(2, np.zeros((4, 2, 5), np.float32), np.zeros((2, 5), np.uint16))
+        output.write(BLOCK, *rows)
 
         def announce(_):
             if temporary.exists() and not temporary.is_symlink():
@@ -875,29 +877,47 @@ def test_output_writer__draws_nothing_behind_a_link_with_the_name_of_its_picture
     assert ((tmp_path / "mine").read_text(), (tmp_path / "out" / "disparity.png").is_symlink()) == ("mine", False)
 
 
-@pytest.mark.parametrize("when", ["template", "publish"])
-def test_output_writer__publishes_no_files_of_a_folder_that_took_the_place_of_its_own(tmp_path, monkeypatch, when):
-    user, out = tmp_path / "user", tmp_path / "out"
-    user.mkdir()
-    for name in ("intervals.tif", "validity.tif", "run.json"):
-        (user / name).write_text("of another run")
-    before = contents(user)
-    work = getattr(raster_writer, when)
+def exchanged_for_run(monkeypatch, step, out, user):
+    """Before a step of the writer, put a link to the folder of another run into the place of its finished files."""
+    work = getattr(raster_writer, step)
 
     def exchanged(*arguments, **named):
         files = out / ".unpublished-intervals.tif" / "files"
-        if not (tmp_path / "moved").exists():
-            files.rename(tmp_path / "moved")
+        if not files.is_symlink():
+            files.rename(out.with_name("moved"))
             files.symlink_to(user)
         return work(*arguments, **named)
 
-    monkeypatch.setattr(raster_writer, when, exchanged)
+    monkeypatch.setattr(raster_writer, step, exchanged)
+
+
+def test_output_writer__publishes_no_files_of_a_folder_that_took_the_place_of_its_own(tmp_path, monkeypatch):
+    user, out = tmp_path / "user", tmp_path / "out"
+    user.mkdir()
+    for name in OUTPUTS:
+        (user / name).write_text("of another run")
+    before = contents(user)
+    exchanged_for_run(monkeypatch, "publish", out, user)
     with writer(out) as output:
         output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
         with suppress(OutputError):
             output.publish(("run.json", "{}"))
-    assert {name: content for name, content in contents(user).items() if name in before} == before
+    assert contents(user) == before
     assert b"of another run" not in {path.read_bytes() for path in out.glob("*.*") if path.is_file()}
+
+
+def test_match_pair__writes_no_files_of_a_folder_that_took_the_place_of_its_own(pair, monkeypatch):
+    folder, settings = pair
+    user, out, images = folder / "user", folder / "out", (folder / "left.tif", folder / "right.tif")
+    match_pair(folder / "other.tif", folder / "right.tif", user, settings)
+    before = contents(user)
+    exchanged_for_run(monkeypatch, "template", out, user)
+    with suppress(SatIntervalsError):
+        match_pair(*images, out, settings)
+    assert {name: content for name, content in contents(user).items() if name in before} == before
+    assert not {content for path, content in contents(out).items() if path.endswith(tuple(OUTPUTS))} & {
+        *before.values()
+    }
 
 
 def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
