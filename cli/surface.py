@@ -53,8 +53,6 @@ def surface(
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
-        from sat_intervals.heights.dsm import make_surface
-        from sat_intervals.heights.triangulate import triangulate
         from sat_intervals.run.before import report_before, tidy
 
         _check_kept(out, cells, sensor_files, settings.file)
@@ -66,12 +64,7 @@ def surface(
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
         else:
             tidy(out, run.keep_tiles, config.cluster.store)
-        check_unchanged()
-        _check_run(out, report["finished"])
-        points = triangulate(out, *sensor_files, progress=console.progress)
-        made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
-        check_unchanged()
-        _check_of_run(out, report["finished"], points["file"])
+        points, made = _made(out, report["finished"], sensor_files, cells, check_unchanged, console)
     if as_json:
         say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
@@ -99,6 +92,27 @@ def _watched(sensor_files: Sequence[str | Path], cells: dict[str, Any]) -> Calla
 
     like = cells["resolution"] if isinstance(cells["resolution"], Path) else None
     return watched_rasters([*sensor_files, cells["geoid"], like])
+
+
+def _made(
+    out: Path,
+    finished: str,
+    sensor_files: tuple[Any, Any, Any, Any],
+    cells: dict[str, Any],
+    check_unchanged: Callable[[], None],
+    console: "Console",
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Make points and surface of the run that ended at ``finished``, and of no other; return their reports."""
+    from sat_intervals.heights.dsm import make_surface
+    from sat_intervals.heights.triangulate import triangulate
+
+    check_unchanged()
+    _check_run(out, finished)
+    points = triangulate(out, *sensor_files, console.progress)
+    made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
+    check_unchanged()
+    _check_of_run(out, finished, points["file"])
+    return points, made
 
 
 def _check_run(out: Path, finished: str) -> None:
@@ -141,7 +155,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
 
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
     errors: dict[str, SatIntervalsError] = {}
-    checks: dict[str, Callable[[], None]] = {}
+    checked: dict[str, tuple[dict[str, Any], Callable[[], None]]] = {}
     if any(pair.sensors for pair in pairs):
         import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
     for pair in pairs:
@@ -150,27 +164,18 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
         folder, of_pair = out / pair.name, {"resolution": pair.resolution, **cells}
         _check_kept(folder, of_pair, pair.sensors)
         try:
-            checks[pair.name] = _watched(pair.sensors, of_pair)
+            checked[pair.name] = of_pair, _watched(pair.sensors, of_pair)
             _check(folder, of_pair, pair.sensors, None)
         except SatIntervalsError as error:
             errors[pair.name] = error
             click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
 
     def surface_of(pair: "PairOfBatch", finished: str) -> dict[str, Any]:
-        from sat_intervals.heights.dsm import make_surface
-        from sat_intervals.heights.triangulate import triangulate
-
-        folder = out / pair.name
-        if not pair.sensors or not pair.resolution:
+        if not pair.sensors:
             return {}
         if pair.name in errors:
             raise errors[pair.name]
-        checks[pair.name]()
-        _check_run(folder, finished)
-        points = triangulate(folder, *pair.sensors, console.progress)
-        made = make_surface([folder], folder / "dsm.tif", resolution=pair.resolution, progress=console.progress)
-        checks[pair.name]()
-        _check_of_run(folder, finished, points["file"])
+        points, made = _made(out / pair.name, finished, pair.sensors, *checked[pair.name], console)
         return {"points": points, "surface": made}
 
     return surface_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from helpers import invoke
+from helpers import invoke, late_file
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
@@ -270,3 +270,11 @@ def test_calibrate_dsm_command__keeps_a_file_that_appears_meanwhile(tmp_path, mo
     assert done.exit_code == 2
     assert f"{output} exists and was not made by sat-intervals calibrate, or holds something else" in done.stderr
     assert output.read_text() == "mine"
+
+
+def test_calibrate_dsm_command__keeps_a_file_that_appears_after_its_last_check(tmp_path, monkeypatch):
+    model, reference = scene(tmp_path)
+    output = tmp_path / "heights.yaml"
+    monkeypatch.setattr("sat_intervals.raster.whole_file", late_file(output))
+    done = invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
+    assert (done.exit_code, output.read_text()) == (2, "mine")

@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 import rasterio
-from helpers import invoke
+from helpers import invoke, late_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
@@ -264,6 +264,19 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
     result = invoke(*words, "--pictures", tmp_path)
     assert result.stderr == f"sat-intervals: {written[-1]} is a named pipe: move it away or choose another output\n"
     assert result.stdout == ""
+
+
+@pytest.mark.peer("matplotlib")
+@pytest.mark.parametrize("name", ["dsm-accuracy.json", "dsm-accuracy.md"])
+def test_evaluate_command__keeps_a_file_that_appears_after_its_check(tmp_path, monkeypatch, name):
+    row, column = np.indices((60, 70)).astype(np.float64)
+    truth = relief(row, column)
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
+    reference = write_raster(tmp_path / "reference.tif", [truth])
+    monkeypatch.setattr("sat_intervals.raster.whole_file", late_file(tmp_path / name))
+    done = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register", "--pictures", tmp_path)
+    assert (done.exit_code, (tmp_path / name).read_text()) == (2, "mine")
+    assert f"{name} exists and was not made by sat-intervals" in done.stderr
 
 
 def test_evaluate_surface__ends_where_a_file_is_replaced_meanwhile(tmp_path, monkeypatch):

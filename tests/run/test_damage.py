@@ -26,6 +26,7 @@ from sat_intervals.run.assemble import assemble
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_block
+from sat_intervals.store.local import MADE, LocalFolder, mark
 from sat_intervals.store.tiles import DamagedTilesError, Store
 
 SHARDS = ["arrays.zarr/int16/c/0/1/0", "arrays.zarr/uint32/c/0/1/0", "arrays.zarr/right/c/1/0"]
@@ -443,6 +444,23 @@ def test_match_block__keeps_the_tiles_of_another_run_that_take_the_place_of_its_
     with pytest.raises(OSError, match="has become the folder of another run"):
         job.store.folder.delete(MARK)  # the last file that a removal deletes
     assert contents(there) == before
+
+
+def test_delete_all__looks_before_each_file_whose_folder_it_is_in(tmp_path):
+    for name in ("ours", "theirs"):
+        with_files(tmp_path / name, ["a", "b"])
+        (tmp_path / name / MADE).write_text(mark(name))
+    before = {file.name: content for file, content in contents(tmp_path / "theirs").items()}
+
+    def names():
+        yield "a"
+        (tmp_path / "ours").rename(tmp_path / "moved")
+        (tmp_path / "theirs").rename(tmp_path / "ours")
+        yield "b"
+
+    with pytest.raises(OSError, match="ours has become the folder of another run"):
+        LocalFolder(tmp_path / "ours").of_run("ours").delete_all(names())
+    assert {file.name: content for file, content in contents(tmp_path / "ours").items()} == before
 
 
 @pytest.mark.parametrize("options", [[], ["--overwrite"]])

@@ -55,7 +55,7 @@ from sat_intervals.raster import writer as raster_writer
 from sat_intervals.raster.files import File
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import Run, open_results
-from sat_intervals.run import search_range, source, strips
+from sat_intervals.run import copying, search_range, source, strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
@@ -918,6 +918,22 @@ def test_match_pair__writes_no_files_of_a_folder_that_took_the_place_of_its_own(
     assert not {content for path, content in contents(out).items() if path.endswith(tuple(OUTPUTS))} & {
         *before.values()
     }
+
+
+@pytest.mark.parametrize("way", ["symlink_to", "hardlink_to"])
+def test_match_pair__copies_no_part_behind_a_link_that_takes_the_place_of_a_temporary_file(pair, monkeypatch, way):
+    folder, settings = pair
+    (folder / "mine").write_text("mine")
+    tasks = copying._tasks
+
+    def exchanged(job, path, parts):
+        exchanged_for_link(path, folder / "mine", way)
+        return tasks(job, path, parts)
+
+    monkeypatch.setattr(copying, "_tasks", exchanged)
+    with pytest.raises(SatIntervalsError, match=r"its temporary file .*intervals\.tif was replaced"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert ((folder / "mine").read_text(), (folder / "out" / "intervals.tif").exists()) == ("mine", False)
 
 
 def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
