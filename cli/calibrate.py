@@ -1,5 +1,6 @@
 """``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,7 @@ import click
 
 from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
 from sat_intervals.cli.calibration_files import checked_folder, write
-from sat_intervals.cli.judging import tolerance_option
+from sat_intervals.cli.judging import named_by, tolerance_option, watched_arguments
 from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     SurfaceAndReference,
@@ -112,16 +113,17 @@ def calibrate(
     from sat_intervals.run.calibrate import calibration_from, check_subjects
     from sat_intervals.run.measure import measure_subjects
 
+    check_arguments = watched_arguments(pairs, settings.file)
     subjects = _subjects(pairs, truth, _Judging(settings, **judging))
-    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
-    check_not_replaced([*_inputs(subjects), *described, *truth, settings.file], [output])
+    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file, *named_by(settings.file)], [output])
     folder = checked_folder(output, _SETTINGS if tune else _CALIBRATION)
     check_subjects(subjects)
     with Console(quiet or as_json) as console:
         if tune:
-            _tune(subjects, output, folder, name, console, as_json)
+            _tune(subjects, output, folder, name, check_arguments, console, as_json)
             return
         parts, key = measure_subjects(subjects, folder, console.progress)
+    check_arguments()
     calibration, expected = calibration_from(parts, subjects, name or output.stem, key)
     write_calibration(output, calibration)
     if as_json:
@@ -166,11 +168,11 @@ def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judgi
     return subjects
 
 
-def _inputs(subjects: "list[Subject]") -> list[str]:
-    """Return images and truths, and calibrations that the settings name."""
-    named = [one.config.interval.calibration for one in subjects if one.config.interval]
+def _inputs(subjects: "list[Subject]", pairs: tuple[Path, ...]) -> list[str | Path]:
+    """Return images and truths, and files that describe pairs."""
+    described = [file for one in pairs for file in (one, one / "meta.json", one / "run.json") if file.is_file()]
     files = [file for one in subjects for file in (one.left.path, one.right.path, one.truth.image.path)]
-    return files + [name for name in named if isinstance(name, str)]
+    return [*files, *described]
 
 
 def _of_pair(pair: "Pair", truth: Path | None, judging: _Judging) -> "Subject":
@@ -220,7 +222,13 @@ def write_calibration(output: Path, calibration: "Calibration") -> None:
 
 
 def _tune(
-    subjects: "list[Subject]", output: Path, folder: Path, name: str | None, console: "Console", as_json: bool
+    subjects: "list[Subject]",
+    output: Path,
+    folder: Path,
+    name: str | None,
+    check_arguments: Callable[[], None],
+    console: "Console",
+    as_json: bool,
 ) -> None:
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
@@ -239,6 +247,7 @@ def _tune(
             raise
         except SatIntervalsError as error:
             console.say(f"{label} is left out: {error}")
+    check_arguments()
     best = best_of(found)
     if as_json:
         say_json([{"name": one.name, "kept": one.kept, "good": one.good, **one.figures} for one in found])

@@ -93,11 +93,35 @@ def judging_options(command: Command) -> Command:
     )
 
 
-def watched_pairs(pairs: "Iterable[Pair]") -> Callable[[], None]:
-    """Return a function that raises if an image or a truth was replaced since the pairs were read."""
+def watched_arguments(pairs: Iterable[Path], settings: Path | None) -> Callable[[], None]:
+    """Return a function that raises if pairs, settings or files that these name are not those of now.
+
+    Call this before they are read. Of a pair, its CSV file or meta.json is meant, not its images.
+    """
+    from sat_intervals.raster.identity import watched
+
+    check_files = watched([settings, *(pair / "meta.json" if pair.is_dir() else pair for pair in pairs)])
+    check_named = watched(named_by(settings))
+
+    def check() -> None:
+        check_files()
+        check_named()
+
+    return check
+
+
+def named_by(settings: Path | None) -> list[str]:
+    """Return the files that a file of settings names, which are read with it or later."""
+    from sat_intervals.config import named_files, read_yaml
+
+    return named_files(read_yaml(settings)) if settings and settings.is_file() else []
+
+
+def watched_pairs(pairs: "Iterable[Pair]", *others: Path | None) -> Callable[[], None]:
+    """Return a function that raises if an image, a truth or another raster was replaced since."""
     from sat_intervals.raster import watched_rasters
 
-    return watched_rasters(file for pair in pairs for file in (pair.left, pair.right, pair.truth))
+    return watched_rasters([*(file for pair in pairs for file in (pair.left, pair.right, pair.truth)), *others])
 
 
 def say_scenes(scenes: "list[SceneMetrics]") -> None:

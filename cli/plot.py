@@ -71,7 +71,7 @@ def plot(
     is_judged = None not in (results.truth, results.config.interval)
     if beside and not is_judged:
         raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
-    results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, out / "dsm.tif"])
+    results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
     if is_judged:
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)

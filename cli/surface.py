@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from sat_intervals.config.pairs import PairOfBatch
     from sat_intervals.run.batch import Finish
 
+# What follows a run, in its folder.
+_MADE = "points.tif", "points.json", "dsm.tif"
+
 
 @click.command(short_help="Match a pair, triangulate it and make a surface model.")
 @search_options
@@ -81,9 +84,20 @@ def _check_kept(
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS
 
-    results = [out / name for name in (*OUTPUTS, "points.tif", "points.json", "dsm.tif")]
+    results = [out / name for name in (*OUTPUTS, *_MADE)]
     like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
     check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
+
+
+def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
+    """Raise if points or surface of a pair would replace an input of another one."""
+    from sat_intervals.raster.identity import check_not_replaced
+
+    images = [file for pair in pairs for file in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
+    sensors = [file for pair in pairs for file in pair.sensors or ()]
+    check_not_replaced(
+        [*images, *sensors], [out / pair.name / name for pair in pairs if pair.sensors for name in _MADE]
+    )
 
 
 def _watched(sensor_files: Sequence[str | Path], cells: dict[str, Any]) -> Callable[[], None]:
@@ -158,6 +172,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
     checked: dict[str, tuple[dict[str, Any], Callable[[], None]]] = {}
     if any(pair.sensors for pair in pairs):
         import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
+    _check_kept_by_all(pairs, out)
     for pair in pairs:
         if not pair.sensors:
             continue

@@ -190,7 +190,8 @@ class Results(Run):
     @property
     def images(self) -> list[Image]:
         """Return all images that were opened: left, right and, if known, the truth."""
-        return [self.left, self.right, *(layer.image for layer in [self.truth] if layer)]
+        images = [self.left, self.right]
+        return [*images, self.truth.image] if self.truth else images
 
     def read(self, window: Window) -> Bands:
         """Read bands, left image and truth of a window of the results."""

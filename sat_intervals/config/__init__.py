@@ -10,7 +10,7 @@ from sat_intervals.config.height_calibration import (
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
-from sat_intervals.config.reading import load_config
+from sat_intervals.config.reading import load_config, named_files, read_yaml
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -48,7 +48,9 @@ __all__ = [
     "load_calibration",
     "load_config",
     "load_height_calibration",
+    "named_files",
     "preset_text",
+    "read_yaml",
     "resolved",
     "surface_key",
     "unreached",

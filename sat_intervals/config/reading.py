@@ -15,6 +15,8 @@ from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import explained, shown
 
 _LOG = logging.getLogger(__name__)
+# Settings that name a file.
+_FILES = ("cost", "weights"), ("interval", "calibration"), ("disparity", "grid")
 
 
 def load_config(
@@ -22,6 +24,7 @@ def load_config(
     overrides: Mapping[str, Any] | None = None,
     *,
     preset_wins: bool = False,
+    file: Path | None = None,
 ) -> Config:
     """Check settings and complete them with the defaults.
 
@@ -34,6 +37,8 @@ def load_config(
         Sections and keys that win over ``source``, such as those of the command line.
     preset_wins
         Whether the overrides' ``preset`` wins too; otherwise two different presets are refused.
+    file
+        Named by errors, of a mapping that was read from it.
 
     Raises
     ------
@@ -42,12 +47,12 @@ def load_config(
     """
     overrides = overrides or {}
     values: Mapping[str, Any] = {}
-    file = ""
+    place = f"{file}: " if file else ""
     match source:
         case None:
             pass
         case str() | Path():
-            values, file = read_yaml(Path(source)), f"{source}: "
+            values, place = read_yaml(Path(source)), f"{source}: "
         case Config():
             values = source.model_dump()
             if overrides.get("preset") not in (None, source.preset):
@@ -61,21 +66,28 @@ def load_config(
             raise ConfigError(f"settings are {shown(source)}, allowed: a YAML file, a mapping or a Config")
     names = [settings["preset"] for settings in (values, overrides) if settings.get("preset") is not None]
     if len(set(map(str, names))) > 1 and not preset_wins:
-        raise ConfigError(f"{file}preset is {shown(names[0])}, and {shown(names[1])} is asked for: leave one out")
+        raise ConfigError(f"{place}preset is {shown(names[0])}, and {shown(names[1])} is asked for: leave one out")
     settings = merged(without_other_interval(without_other_cost(values, overrides), overrides), overrides)
     try:
         config = Config.model_validate(settings)
     except ValidationError as error:
         problems = error.errors(include_url=False)
         if all(_given(overrides, problem["loc"]) for problem in problems):
-            file = ""  # the errors are in the overrides
-        raise ConfigError(file + "; ".join(dict.fromkeys(map(explained, problems)))) from error
+            place = ""  # the errors are in the overrides
+        raise ConfigError(place + "; ".join(dict.fromkeys(map(explained, problems)))) from error
     if "sgm" not in settings and (better := f"{config.preset}-{config.cost.method}") in PRESETS:
         _warn(
             f"preset {config.preset} has no penalties for cost.method {config.cost.method}, so defaults are used: "
             f"--preset {better} has penalties for such images"
         )
     return config
+
+
+def named_files(settings: Mapping[str, Any] | Config | None) -> list[str]:
+    """Return the files that sections name, which are read with them or later; a built-in name has no file."""
+    sections = settings.model_dump() if isinstance(settings, Config) else settings or {}
+    named = [sections[name].get(key) for name, key in _FILES if isinstance(sections.get(name), Mapping)]
+    return [file for file in named if isinstance(file, str)]
 
 
 @lru_cache  # once per batch

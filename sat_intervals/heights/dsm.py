@@ -20,6 +20,7 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     OutputWriter,
     Projection,
+    check_as_made,
     geoid_grid,
     is_surface,
     north_up,
@@ -146,6 +147,7 @@ def checked_cells(
     """
     if path.exists() and not is_surface(path):
         raise SatIntervalsError(f"{path} exists and is not a surface model: move it away")
+    check_as_made(path)
     grid = None
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)

@@ -1,18 +1,21 @@
 """Read points with heights in parts: CSV, GeoPackage and other vector files (pyogrio), LAS and LAZ (laspy)."""
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from glob import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import GROUND, Frame, Vertical
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.raster import GROUND, Frame, Vertical, stamps
+from sat_intervals.raster.identity import watched
 
 # Bytes in which GDAL looks for what a file is.
 _HEAD = 4096
+# Endings of files that are read with others: of Shapefiles, MapInfo.
+_WITH = ".dbf", ".shx", ".prj", ".cpg", ".dat", ".map", ".id", ".mid"
 # Points read at a time.
 _PART = 500_000
 # Names of columns, in lower case; the first found counts. Those of ICESat-2 products are among them.
@@ -64,8 +67,8 @@ class PointFile:
             raise _unreadable(self._path, error) from error
 
 
-def files_of_points(path: Path) -> list[Path]:
-    """Return the files, existing or not, that points are read from: many vector formats have several, SQLite two more.
+def watched_points(path: Path) -> Callable[[], None]:
+    """Return a function that raises if a file of points, or one that is read with it, was replaced or changed since.
 
     Raises
     ------
@@ -73,7 +76,7 @@ def files_of_points(path: Path) -> list[Path]:
         It is a virtual file, whose sources could change unnoticed.
     """
     if path.suffix.lower() in (".csv", ".las", ".laz"):
-        return [path]
+        return watched([path])
     if path.is_file():
         with path.open("rb") as stream:
             is_virtual = b"<OGRVRTDataSource" in stream.read(_HEAD)
@@ -81,8 +84,17 @@ def files_of_points(path: Path) -> list[Path]:
             raise SatIntervalsError(
                 f"{path} is read from other files, which may change meanwhile: convert it with ogr2ogr"
             )
-    beside = path.parent.glob(f"{escape(path.stem)}.*")
-    return [path, *beside, *(path.with_name(path.name + end) for end in ("-wal", "-journal"))]
+    beside = [file for file in path.parent.glob(f"{escape(path.stem)}.*") if file.suffix.lower() in _WITH]
+    check_files = watched([path, *beside, *(path.with_suffix(ending) for ending in _WITH)])
+    journals = [path.name + ending for ending in ("-wal", "-journal")]
+    before = stamps(path.parent, journals)  # root's reading changes their other times
+
+    def check() -> None:
+        check_files()
+        if stamps(path.parent, journals) != before:
+            raise ChangedInputError(f"{path} was changed while it was read: rerun the command")
+
+    return check
 
 
 def _unreadable(path: Path, error: Exception) -> SatIntervalsError:

@@ -1,12 +1,10 @@
 """Disparities of points with heights: the visible one of each pixel, strip by strip."""
 
-import zlib
 from collections.abc import Iterator
-from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from sat_intervals.errors import RunError
 from sat_intervals.tiling import Window
 
 # Rows of a strip.
@@ -20,29 +18,26 @@ _STEEPEST, _CLEAR = np.tan(np.radians(60.0)), 1.0
 
 
 class PointSight:
-    """Points in the pixels of a region, gathered in a file for each strip of rows.
+    """Points in the pixels of a region, gathered in a file by strips of rows.
 
     Parameters
     ----------
-    folder
-        An empty folder for these files.
+    file
+        An empty file, open for writing and reading.
     region
         The pixels.
     rise
         Change of disparity for a height of one pixel's size on the ground; signed.
     """
 
-    NAMES = r"strip\d+"
-    """Pattern of the files' names."""
-
-    def __init__(self, folder: Path, region: Window, rise: float) -> None:
-        self._folder, self._region, self._rise = folder, region, rise
-        self._checksums: dict[int, int] = {}  # of the strips' files
+    def __init__(self, file: BinaryIO, region: Window, rise: float) -> None:
+        self._file, self._region, self._rise = file, region, rise
+        self._parts: dict[int, list[tuple[int, int]]] = {}  # of each strip: places in the file, bytes
         self.points = 0
         """Points in the region."""
 
     def add(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> None:
-        """Add points at epipolar positions of the left image; those outside the region are left out."""
+        """Add points at epipolar positions of the left image, ``(n,)`` each in pixels; only those in the region."""
         known = np.isfinite(row) & np.isfinite(column) & np.isfinite(disparity)
         records = np.empty(int(known.sum()), _RECORD)
         records["row"] = np.rint(row[known]) - self._region.row
@@ -55,10 +50,8 @@ class PointSight:
         records = records[np.argsort(records["row"] // _ROWS, kind="stable")]
         strips, begins = np.unique(records["row"] // _ROWS, return_index=True)
         for strip, part in zip(strips.tolist(), np.split(records, begins[1:]) if strips.size else (), strict=True):
-            content = part.tobytes()
-            with self._file(strip).open("ab") as stream:
-                stream.write(content)
-            self._checksums[strip] = zlib.crc32(content, self._checksums.get(strip, 0))
+            self._parts.setdefault(strip, []).append((self._file.tell(), part.nbytes))
+            self._file.write(part.tobytes())
 
     @property
     def reach(self) -> int:
@@ -76,8 +69,7 @@ class PointSight:
         reach, sign = self.reach, np.sign(self._rise)
         nearest = np.full((rows + 2 * reach, self._region.width + 2 * reach), -np.inf)
         for strip in range(row // _ROWS - 1, row // _ROWS + 2):
-            if strip in self._checksums:
-                records = self._records(strip)
+            for records in self._records(strip):
                 place = records["row"] - (row - reach)
                 near = (place >= 0) & (place < nearest.shape[0])
                 np.maximum.at(
@@ -89,19 +81,10 @@ class PointSight:
             seen = np.where(seen >= _largest_around(nearest, reach) - explained, seen, -np.inf)
         return np.where(np.isfinite(seen), sign * seen, np.nan)
 
-    def _records(self, strip: int) -> np.ndarray:
-        try:
-            content = self._file(strip).read_bytes()
-        except FileNotFoundError:
-            content = b""
-        if zlib.crc32(content) != self._checksums[strip]:
-            raise RunError(
-                f"{self._file(strip)}, a temporary file, was damaged or deleted meanwhile: rerun the command"
-            )
-        return np.frombuffer(content, _RECORD)
-
-    def _file(self, strip: int) -> Path:
-        return self._folder / f"strip{strip}"
+    def _records(self, strip: int) -> Iterator[np.ndarray]:
+        for place, size in self._parts.get(strip, []):
+            self._file.seek(place)
+            yield np.frombuffer(self._file.read(size), _RECORD)
 
 
 def _largest_around(values: np.ndarray, reach: int) -> np.ndarray:

@@ -7,13 +7,14 @@ registered to the points of the run first.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from tempfile import TemporaryFile
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.location import GroundLattice, Location
-from sat_intervals.heights.point_files import PointFile, files_of_points
+from sat_intervals.heights.point_files import PointFile, watched_points
 from sat_intervals.heights.point_sight import PointSight
 from sat_intervals.heights.points import point_near_the_middle, triangulated
 from sat_intervals.heights.raster_sight import RasterSight, Scene, Shift
@@ -27,13 +28,13 @@ from sat_intervals.raster import (
     OutputWriter,
     Projection,
     Vertical,
+    check_as_made,
     check_made_by,
     replaceable,
     truth_file,
     utm_of,
     watched_rasters,
 )
-from sat_intervals.raster.identity import watched
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -121,9 +122,10 @@ def make_truth(
     path = run.out / "truth.tif" if path is None else path
     there = replaceable(path.parent, [truth_file(path.name)])
     check_made_by(path, "reference", "REFERENCE")
+    check_as_made(path)
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     check_rasters = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])
-    check_points = watched(files_of_points(reference.path) if reference.is_points else [])
+    check_points = watched_points(reference.path) if reference.is_points else lambda: None
     if registers:
         triangulated([run.out])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
@@ -134,9 +136,9 @@ def make_truth(
     tally = _Tally(run)
     with (
         OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer,
-        writer.scratch("reference", PointSight.NAMES) as scratch,
+        TemporaryFile(dir=path.parent) as file,  # without a name, so that nobody can exchange it
     ):
-        for row, strip in work.strips(shift, scratch, progress):
+        for row, strip in work.strips(shift, file, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))
             tally.add(row, strip)
         check_rasters()
@@ -234,15 +236,15 @@ class _Work:
                 kept, keys = kept[least], keys[least]
         return kept
 
-    def strips(self, shift: Shift, scratch: Path, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the first row and the true disparities of strips from the top; points are kept in an empty folder."""
+    def strips(self, shift: Shift, file: BinaryIO, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the first row and the true disparities of strips from the top; points are kept in an empty file."""
         height = self.run.shape[0]
         if isinstance(self._heights, HeightRaster):
             for row, strip in RasterSight(self._scene, self._heights, shift, self._search).strips(self._pixel):
                 progress("truth", row + len(strip), height)
                 yield row, strip
             return
-        sight = PointSight(scratch, self.run.region, self._rise)
+        sight = PointSight(file, self.run.region, self._rise)
         lattice = self._lattice(shift, progress)
         if lattice is not None:
             for part in self._near(progress):

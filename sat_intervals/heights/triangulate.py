@@ -15,6 +15,7 @@ import numpy as np
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import POINT_FILES, OutputWriter, read_tags
+from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.published import POINTS_FILE, POINTS_REPORT, published_points
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -102,16 +103,18 @@ def _beyond(grid: Any, run: Run) -> dict[str, float]:
 
 
 def _check_own(out: Path) -> None:
-    """Raise if ``points.tif`` or ``points.json`` exists and was not made by this tool."""
+    """Raise if ``points.tif`` or ``points.json`` exists and was not made by this tool, or was changed since."""
     path = out / POINTS_FILE
-    published_points(out)  # raises for a points.json of others
+    published = published_points(out)  # raises for a points.json of others
     if os.path.lexists(path):
         try:
-            is_own = "LEFT_MODEL" in read_tags(path)
+            is_own = "LEFT_MODEL" in read_tags(path) and published in (None, checksum_of(path))
         except SatIntervalsError:
             is_own = False
         if not is_own:
-            raise SatIntervalsError(f"{path} exists and was not made by triangulate, or is damaged: move it away")
+            raise SatIntervalsError(
+                f"{path} exists and was not made by triangulate, or was changed since: move it away"
+            )
 
 
 class _Tally:

@@ -20,6 +20,7 @@ from sat_intervals.raster.images import (
 from sat_intervals.raster.layers import (
     MARK,
     check_alone,
+    check_as_made,
     check_made_by,
     check_marked,
     is_marked,
@@ -69,6 +70,7 @@ __all__ = [
     "Projection",
     "Vertical",
     "check_alone",
+    "check_as_made",
     "check_made_by",
     "check_marked",
     "check_pair",

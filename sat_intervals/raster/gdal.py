@@ -24,6 +24,12 @@ GDAL_ERRORS = (RasterioError, CPLE_BaseError, SystemError)
 _QUIET = ("ignore", None, NotGeoreferencedWarning, re.compile(re.escape(__name__)), 0)
 _LOCK = threading.Lock()
 
+# Formats of which GDAL takes missing data for zeros, does not list the files, or reads on after their end forever.
+UNCHECKED = {
+    *("AAIGrid", "DAAS", "EEDAI", "ENVI", "ESRIC", "GPKG", "GRASSASCIIGrid", "GTI", "ILWIS", "ISG", "KMLSUPEROVERLAY"),
+    *("MBTiles", "MRF", "PCIDSK", "PCRaster", "PLMOSAIC", "Rasterlite", "SQLite", "STACIT", "STACTA", "WCS", "WMS"),
+    *("WMTS", "netCDF"),
+}
 # GDAL's prefixes of files on servers, with and without a URL in the form of a query.
 _REMOTE = "vsicurl/", "vsicurl?", "vsis3/", "vsigs/", "vsiaz/", "vsiadls/", "vsioss/", "vsiswift/", "vsiwebhdfs/"
 # With these, all files of an image are read as they are now, whatever the environment of a worker, and damage is an

@@ -13,7 +13,7 @@ import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
-from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_regular
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import stamp_of, watched
@@ -22,8 +22,6 @@ from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# Formats of which GDAL takes missing data for zeros, does not list the files, or reads on after their end forever.
-_UNCHECKED = {"AAIGrid", "ENVI", "GRASSASCIIGrid", "GTI", "ISG", "MRF", "netCDF", "PCIDSK", "PCRaster"}
 # Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
 _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
 # Elements of a virtual raster that name a file, and the metadata that do so: positions of a warped one.
@@ -86,14 +84,14 @@ class Image:
 
         Raises
         ------
-        InputError
+        RunError
             Names the first one.
         """
         files = dataset.files if self.beside else ()
         if missing := [file for file in self.beside if file not in files]:
-            raise InputError(
-                f"{missing[0]} was there when {self.path} was opened, but cannot be found now: rerun the same command "
-                "when its server answers: it resumes"
+            raise RunError(
+                f"{missing[0]} was there when {self.path} was opened, but cannot be found now: restore it, or wait for "
+                "its server, and rerun the command"
             )
 
 
@@ -265,10 +263,10 @@ def _check_watched(name: str, dataset: DatasetReader) -> None:
             f"{name} is read from files that GDAL does not list, which may change during a run: convert it with "
             "gdal_translate"
         )
-    if dataset.driver in _UNCHECKED:
+    if dataset.driver in gdal.UNCHECKED:
         raise InputError(
-            f"{name} has the format {dataset.driver}, in which GDAL does not report missing data: convert it with "
-            "gdal_translate"
+            f"{name} has the format {dataset.driver}, in which GDAL does not report missing data or changed files: "
+            "convert it with gdal_translate"
         )
 
 

@@ -22,7 +22,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.publishing import OutputError, check_own, pinned, rename_new, replace_same, stamps
-from sat_intervals.raster.seal import check_beside
+from sat_intervals.raster.seal import check_beside, is_as_made
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
 
@@ -46,9 +46,9 @@ def north_up(crs: str | int, x: float, y: float, pixel: float) -> Georeferencing
 def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = None) -> Iterator[Path]:
     """Give the block a temporary file to write; rename it to ``path`` at the end, or delete it on failure.
 
-    A file that appears at ``path`` meanwhile is kept, also if another has the `stamps` ``before``, which a command
-    takes before its work. A symbolic link there is replaced, not followed. What a killed process left is deleted, see
-    `LocalFolder.scratch`.
+    A file at ``path`` is replaced only if it has its stamp in ``before``, the `stamps` that a command takes before its
+    work, by default now; any other is kept. A symbolic link there is replaced, not followed. What a killed process left
+    is deleted, see `LocalFolder.scratch`.
 
     Raises
     ------
@@ -62,9 +62,9 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
     try:
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        scratch = LocalFolder(path.parent).scratch(path.name, f"[0-9a-f]{{32}}-{re.escape(path.name)}.*")
+        scratch = LocalFolder(path.parent).scratch(path.name, "[0-9a-f]{32}.*")
         with scratch as folder, pinned(folder) as own:
-            new = own / f"{uuid.uuid4().hex}-{path.name}"  # nobody can put a link there before
+            new = own / f"{uuid.uuid4().hex}{path.suffix}"  # nobody can put a link there before
             yield new
             check_own(new)
             if path.name in before and os.path.lexists(path):
@@ -238,6 +238,15 @@ def check_marked(path: Path) -> None:
         raise SatIntervalsError(
             f"{path} exists and was not made by sat-intervals, or by a version that left no mark in it: move it away"
         )
+
+
+def check_as_made(path: Path) -> None:
+    """Raise if a raster with a CRC-32 in it, such as a surface model, was changed since; links pass, as above.
+
+    Other programs that make another file of one copy its `MARK`, but not the CRC-32.
+    """
+    if path.is_file() and not path.is_symlink() and not is_as_made(path):
+        raise SatIntervalsError(f"{path} was changed since sat-intervals made it, or is damaged: move it away")
 
 
 def check_made_by(path: Path, command: str, tag: str, value: str | None = None) -> None:

@@ -24,7 +24,8 @@ def check_points(out: Path) -> None:
     published = published_points(out)
     if published and published != checksum_of(out / POINTS_FILE):
         raise SatIntervalsError(
-            f"{out / POINTS_FILE} is not what triangulate published; it is damaged or was changed: triangulate again"
+            f"{out / POINTS_FILE} is not what triangulate published; it is damaged or was changed: move it away and "
+            "triangulate again"
         )
 
 

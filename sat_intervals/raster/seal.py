@@ -38,6 +38,12 @@ def sealed(head: bytes, checksum: int) -> bytes:
     return head.replace(_LINE + _ZEROS, _LINE + b"%08x" % checksum, 1)
 
 
+def is_as_made(path: Path) -> bool:
+    """Return whether a local file has a CRC-32 in it, and its bytes agree."""
+    written, there = _checksums(path) or (0, None)
+    return written == there
+
+
 def check_seal(path: str | Path, files: Iterable[str]) -> None:
     """Raise if the bytes of a file differ from the CRC-32 in it; one without a CRC-32, or not local, passes.
 
@@ -48,21 +54,27 @@ def check_seal(path: str | Path, files: Iterable[str]) -> None:
     SatIntervalsError
         Names the file and both checksums, or a file beside it.
     """
-    if not os.path.isfile(path):
+    if not os.path.isfile(path) or (checksums := _checksums(path)) is None:
         return
+    written, there = checksums
+    if there != written:
+        raise SatIntervalsError(
+            f"{path} is damaged or was changed: its CRC-32 is {there:08x}, but {written:08x} was written: move it away "
+            "and make it again, or copy it with gdal_translate if you changed it"
+        )
+    check_beside(path, files)
+
+
+def _checksums(path: str | Path) -> tuple[int, int] | None:
+    """Return the CRC-32 in a file, and that of its bytes; None without one in it."""
     with open(path, "rb") as stream:
         beginning = stream.read(_BEGINNING)
         if not (seal := _SEAL.search(beginning)):
-            return
+            return None
         checksum = zlib.crc32(beginning[: seal.start(1)] + _ZEROS + beginning[seal.end(1) :])
         while block := stream.read(1 << 20):
             checksum = zlib.crc32(block, checksum)
-    if checksum != int(seal[1], 16):
-        raise SatIntervalsError(
-            f"{path} is damaged or was changed: its CRC-32 is {checksum:08x}, but {seal[1].decode()} was written: make "
-            "it again, or copy it with gdal_translate if you changed it"
-        )
-    check_beside(path, files)
+    return int(seal[1], 16), checksum
 
 
 def check_beside(path: str | Path, files: Iterable[str]) -> None:

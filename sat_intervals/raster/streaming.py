@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import numpy as np
 
@@ -27,25 +28,20 @@ class Stream:
     Rows that wait for a full row of blocks are in a file too, so that memory does not grow with the width.
     """
 
-    def __init__(self, file: File, place: Path, shape: tuple[int, int], threads: int | None) -> None:
-        """``place``: the final file; temporary ones are beside it, ``strips-0-<name>`` and so on."""
-        self._file, self._place, self._threads = file, place, threads
+    def __init__(self, file: File, folder: Path, shape: tuple[int, int], threads: int | None) -> None:
+        """``folder``: where temporary files are made. They have no names, so that nobody can exchange them."""
+        self._file, self._folder, self._threads = file, folder, threads
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
         with ExitStack() as files:
-            levels = range(len(self._shapes))
-            # open until the end: another file may take the place of one
-            self._strips = [files.enter_context(self._path("strips", level).open("x+b")) for level in levels]
-            self._buffers = [self._buffer(level) for level in levels]
+            self._strips = [files.enter_context(TemporaryFile(dir=folder)) for _ in self._shapes]
+            self._buffers = [self._buffer(width) for _, width in self._shapes]
             self._files = files.pop_all()
         self.parts: list[list[Part]] = [[] for _ in self._shapes]
 
-    def _path(self, kind: str, level: int) -> Path:
-        return self._place.with_name(f"{kind}-{level}-{self._place.name}")
-
-    def _buffer(self, level: int) -> np.ndarray:
-        shape = len(self._file.bands), BLOCK, self._shapes[level][1]
-        with self._path("rows", level).open("x+b") as stream:
+    def _buffer(self, width: int) -> np.ndarray:
+        shape = len(self._file.bands), BLOCK, width
+        with TemporaryFile(dir=self._folder) as stream:
             # a full disk is an error here, not a signal later
             os.posix_fallocate(stream.fileno(), 0, int(np.prod(shape)) * np.dtype(self._file.dtype).itemsize)
             return np.memmap(stream, self._file.dtype, "r+", shape=shape)
@@ -100,12 +96,5 @@ class Stream:
             raise OSError(errno.EIO, f"{self._rows[0]} of {self._shapes[0][0]} rows were written")
 
     def close(self) -> None:
-        """Close the temporary files."""
+        """Close the temporary files, which are then gone."""
         self._files.close()
-
-    def remove(self) -> None:
-        """Delete the temporary files."""
-        self.close()
-        for level in range(len(self._shapes)):
-            for kind in ("rows", "strips"):
-                self._path(kind, level).unlink(missing_ok=True)

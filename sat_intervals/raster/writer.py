@@ -6,7 +6,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -31,8 +31,8 @@ from sat_intervals.store.folder import LocalFolder
 # Locked folder of unfinished files, named after the first of them, and the mark that a process made these files. Those
 # of a killed process are replaced, others stay.
 _SCRATCH, _MADE = ".unpublished-{}", ".sat-intervals.files"
-# Names there: a final one, those of its strips and their levels, and those of GDAL beside both.
-_UNFINISHED = r"(?:(?:strips|rows)-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
+# Names there: a final one, an unfinished one, and those of GDAL beside both.
+_UNFINISHED = r"(?:strips-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
 # Tags in the file itself, not in another beside it.
 _PNG = {"WRITE_METADATA_AS_TEXT": "YES"}
 # GDAL's block cache in bytes; the default is a twentieth of the memory.
@@ -139,14 +139,16 @@ class OutputWriter:
             raise OutputError(f"{foreign} was not written by sat-intervals: move {self._hidden} away")
 
     def _check_folders(self) -> None:
-        """Raise if folders of temporary files are none, are links, or are not those that were made."""
+        """Raise if folders of temporary files are not folders, are links, or are not those that were made."""
         for place in (self._hidden, self._scratch, self._replaced):
             if place.is_symlink():
                 raise OutputError(f"{place} is a symbolic link, but temporary files go there: remove it")
             if place.exists() and not place.is_dir():
                 raise OutputError(f"{place} is not a folder, but temporary files go there: move it away")
         for place, made in self._folders.items():
-            if place.exists() and not os.path.samestat(made, place.lstat()):
+            if not place.exists():
+                raise OutputError(f"{place}, a folder of temporary files, is gone: rerun the command")
+            if not os.path.samestat(made, place.lstat()):
                 raise OutputError(f"{place}, a folder of temporary files, was replaced: move it away and rerun")
 
     def _unfinished(self) -> Iterator[Path]:
@@ -165,8 +167,7 @@ class OutputWriter:
             with self._failing(self._folder / file.name):
                 if file.driver == "COG":
                     if file.name not in self._streams:
-                        place = self._pinned / file.name
-                        self._streams[file.name] = Stream(file, place, self._shape, self._threads)
+                        self._streams[file.name] = Stream(file, self._pinned, self._shape, self._threads)
                     self._streams[file.name].write(row, bands)
                 else:
                     self._draw(file, row, bands)
@@ -208,7 +209,7 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 stream.check_complete()
             self.assemble(name, stream.parts, stream.copy_parts)
-            stream.remove()
+            stream.close()
         self._streams.clear()
         for name, (strips, expected) in self._pictures.items():
             with self._failing(self._folder / name), Env(GDAL_CACHEMAX=_CACHE):
@@ -246,7 +247,6 @@ class OutputWriter:
             Called before, with the `stamps` that the files will have, the report last.
         """
         made = self.build()
-        self._check_folders()
         for name, checksum in made.items():
             with self._failing(self._folder / name):
                 if checksum_of(self._pinned / name) != checksum:
@@ -263,10 +263,6 @@ class OutputWriter:
         announce(list(stamps(self._pinned, names).values()))
         publish(self._pinned, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
         self._is_published = True
-
-    def scratch(self, name: str, pattern: str) -> AbstractContextManager[Path]:
-        """Return the context of a folder for temporary files of the caller, see `LocalFolder.scratch`."""
-        return LocalFolder(self._folder).scratch(name, pattern)
 
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:

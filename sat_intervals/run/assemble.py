@@ -126,12 +126,20 @@ def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_til
 
     there = replaceable_files(job.store.home)
     writer.publish(("run.json", sealed(report) + "\n"), replaceable=there, announce=announce)
-    job.store.mark_replaced()
-    if keep_tiles:  # otherwise the parts are removed with them
-        try:
+    try:
+        job.store.mark_replaced()
+        if keep_tiles:  # otherwise the parts are removed with them
             job.parts().drop()
-        except OSError as error:  # the run is complete
-            _LOG.warning("parts of the files stay in %s: %s", job.store.folder, reason(error))
+    except OSError as error:  # the run is complete
+        _LOG.warning("parts of the files stay in %s: %s", job.store.folder, reason(error))
+
+
+def remove_tiles(job: Job) -> None:
+    """Remove the tiles of a complete run, if they can be reached."""
+    try:
+        job.store.remove()
+    except OSError as error:
+        _LOG.warning("the tiles of the complete run stay: %s", reason(error))
 
 
 def _add_seconds(seconds: dict[str, float], records: Records) -> None:

@@ -12,14 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, load_config
+from sat_intervals.config import Config, load_config, named_files, read_yaml
 from sat_intervals.config.pairs import REPORT, PairOfBatch
-from sat_intervals.config.reading import read_yaml
 from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, whole_file
-from sat_intervals.raster.identity import check_not_replaced
+from sat_intervals.raster.identity import check_not_replaced, watched
+from sat_intervals.run.assemble import remove_tiles
 from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
 from sat_intervals.run.output import OUTPUTS, is_complete
@@ -75,10 +75,12 @@ def match_batch(
     RunError
         An error that stops all pairs, such as a full disk.
     """
-    common = load_config(config, overrides)
-    read = [config if isinstance(config, (str, Path)) else None, common.disparity.grid]
+    file = Path(config) if isinstance(config, (str, Path)) else None
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
-    _check_not_replaced(pairs, read, out, overwrite)
+    common = load_config(sections, overrides, file=file)
+    own = {pair.name: {**(overrides or {}), **_merged(overrides or {}, pair.settings)} for pair in pairs}
+    check_named = watched(file for settings in (sections, *own.values()) for file in named_files(settings))
+    _check_not_replaced(pairs, [file, common.disparity.grid], out, overwrite)
     cluster = common.cluster
     _raise_file_limit()
     with ExitStack() as stack:
@@ -92,11 +94,10 @@ def match_batch(
         for number, pair in enumerate(pairs):
             progress("pairs", number, len(pairs))
             try:
-                own = {**(overrides or {}), **_merged(overrides or {}, pair.settings)}
-                settings = load_config(sections, own, preset_wins=True)
+                settings = load_config(sections, own[pair.name], preset_wins=True, file=file)
                 before = None if overwrite else _done_before(pair, out, settings)
                 if before is None:
-                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find)
+                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find, check_named)
                 else:
                     tidy(out / pair.name, keep_tiles, cluster.store)
                     note({pair.name: {"state": "done before", **before}})
@@ -139,7 +140,8 @@ def _check_not_replaced(
 ) -> None:
     """Raise if an input of any pair, or another file that is read, is an output of any pair."""
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
-    names = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
+    images = [(pair.left, pair.right, pair.left_mask, pair.right_mask) for pair in pairs]
+    names = [name for pair, files in zip(pairs, images, strict=True) for name in (*files, *(pair.sensors or ()))]
     files = [name for name in names if name and os.path.isfile(name)]
     check_not_replaced(
         [*others, *(file for name in files for file in (name, *other_files(name)))],
@@ -166,11 +168,20 @@ def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, An
     return report and {name: report[name] for name in _KEPT if name in report}
 
 
-def _begun(pair: PairOfBatch, out: Path, settings: Config, overwrite: bool, stack: ExitStack, find: Search) -> Job:
+def _begun(
+    pair: PairOfBatch,
+    out: Path,
+    settings: Config,
+    overwrite: bool,
+    stack: ExitStack,
+    find: Search,
+    check_named: Callable[[], None],
+) -> Job:
     """Prepare the job of a pair, lock its folder and open its store."""
     job = prepare(
         *_images(pair), out / pair.name, settings, window=_window(pair), overwrite=overwrite, pair=pair.name, find=find
     )
+    check_named()  # all pairs have the same calibration and the same ranges
     stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin(overwrite=overwrite)
     return job
@@ -275,7 +286,7 @@ def _assembled(client: Workers, matched: Matched, keep_tiles: bool, progress: Pr
             check_failures(job, failures)
             report = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
-            job.store.remove()
+            remove_tiles(job)
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
     return {"state": "done", **{name: report[name] for name in _KEPT}}

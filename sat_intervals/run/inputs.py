@@ -6,11 +6,15 @@ from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
 from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
+from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.raster import Image, is_replaced, other_files
 from sat_intervals.raster.identity import identity
+from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
 
@@ -125,4 +129,16 @@ def changes_since(
     }
     for one in (before, now):
         one["inputs"].get("weights", {}).pop("onnxruntime", None)
-    return list(differences(before, json.loads(json.dumps(now))))
+    return [*differences(before, json.loads(json.dumps(now))), *_other_ranges(report, left, config)]
+
+
+def _other_ranges(report: Mapping[str, Any], left: Image, config: Config) -> list[str]:
+    """Say whether the raster of ranges has others than a run; settings have its name only."""
+    search, there = config.disparity, report.get("local_ranges")
+    if not search.grid or not there:
+        return []
+    now, before = read_ranges(search.grid, left), LocalRanges.of_report(there)
+    if not isinstance(report.get("requested", {}).get("disparity", {}).get("minimum"), str):  # "auto" takes all of them
+        now = now.clipped(search.minimum, search.maximum)
+    is_same = np.array_equal(now.minimum, before.minimum) and np.array_equal(now.maximum, before.maximum)
+    return [] if is_same else [f"{search.grid} has other ranges"]

@@ -41,7 +41,7 @@ def check_output(out: Path, overwrite: bool) -> None:
 def replaceable(out: Path, *, overwrite: bool) -> dict[str, str]:
     """Return the `stamps` of a run's files, after those that a killed process put aside are restored.
 
-    With ``overwrite`` it raises as `check_replaceable`, of which files may have appeared or been restored since.
+    With ``overwrite`` it does what `check_replaceable` does: files may have appeared or been restored since.
     """
     restore(out, RUN_FILES)
     there = stamps(out, OUTPUTS)
@@ -62,7 +62,8 @@ def check_replaceable(out: Path) -> None:
         check_regular(file, "move it away or choose another folder")
         if file.exists() and not _is_of_run(file, published):
             raise SatIntervalsError(
-                f"{file} exists and was not made by sat-intervals, or is damaged: move it away or choose another folder"
+                f"{file} exists and was not made by sat-intervals, or was changed since: move it away or choose "
+                "another folder"
             )
 
 

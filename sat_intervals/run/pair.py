@@ -14,7 +14,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.results import open_run
-from sat_intervals.run.assemble import assemble
+from sat_intervals.run.assemble import assemble, remove_tiles
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
@@ -111,7 +111,7 @@ def _match_pair(
         if not overwrite and job.is_finished():
             check_as_published(job.out)
             run = open_run(job.out)
-            job.store.remove()
+            remove_tiles(job)
             remove_scratch(job.out, RUN_FILES)
             _LOG.warning("the run in %s was already complete; its remaining tiles were removed", job.out)
             return run.report
@@ -124,7 +124,7 @@ def _match_pair(
             match()
             report = assemble_repaired(job, connection.client, match, seconds, progress, keep_tiles=keep_tiles)
         if not keep_tiles:
-            job.store.remove()
+            remove_tiles(job)
     return report
 
 

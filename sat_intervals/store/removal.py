@@ -56,7 +56,7 @@ def check_not_foreign(folder: Folder) -> None:
             "choose another folder"
         )
     # unfinished files of a killed run have names that no run writes again
-    names = {name for name, size in _names(folder).items() if size and name == final_name(name)}
+    names = {name for name in _names(folder) if name == final_name(name)}
     if not names or is_of_run(folder):
         return
     if there := sorted(names & folder.sizes().keys()):  # otherwise another run has just removed its tiles

@@ -1,5 +1,6 @@
 """Products of a whole volume against the slow twins; the ablation against runs, the paper and Pandora."""
 
+import itertools
 import json
 import shutil
 
@@ -12,12 +13,12 @@ from helpers import invoke, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals import match_arrays
+from sat_intervals import match_arrays, match_pair
 from sat_intervals.config import load_config
 from sat_intervals.config.pairs import Pair, find_pairs
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.evaluate import ablation
+from sat_intervals.evaluate import ablation, disparity
 from sat_intervals.evaluate.ablation import ablate_pair
 from sat_intervals.evaluate.disparity import criteria_of, evaluate
 from sat_intervals.evaluate.paper import METHODS, SceneMetrics, table_2
@@ -180,6 +181,47 @@ def test_commands__end_where_a_pair_is_replaced_after_they_began(folder, tmp_pat
     monkeypatch.setattr(run_pair, "match_pair", and_replaced(match))
     monkeypatch.setattr(ablation, "ablate_pair", and_replaced(judge))
     result = invoke(command, tmp_path / "pair", "--quiet")
+    assert (result.exit_code, "truth.tif was replaced or changed while it was read" in result.stderr) == (1, True)
+
+
+def written_again(file, work):
+    """A function that does the same, but writes a file anew before it."""
+
+    def call(*arguments, **named):
+        new = file.with_name("new")
+        shutil.copy(file, new)
+        new.replace(file)
+        return work(*arguments, **named)
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [*itertools.product(["evaluate", "ablate"], ["pair/meta.json", "settings.yaml"]), ("evaluate", "given.tif")],
+)
+def test_commands__end_where_what_they_were_given_is_replaced_after_they_began(
+    folder, tmp_path, monkeypatch, command, name
+):
+    """Else pairs are matched in an old search range, or each with other settings, or judged by two truths."""
+    shutil.copytree(folder, tmp_path / "pair")
+    shutil.copy(folder / "truth.tif", tmp_path / "given.tif")
+    (tmp_path / "settings.yaml").write_text("sgm: {p1: 5}")
+    for module, work in ((run_pair, "match_pair"), (ablation, "ablate_pair")):
+        monkeypatch.setattr(module, work, written_again(tmp_path / name, getattr(module, work)))
+    options = ["--truth", tmp_path / "given.tif"] if command == "evaluate" else []
+    result = invoke(command, tmp_path / "pair", "--quiet", "--config", tmp_path / "settings.yaml", *options)
+    assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
+
+
+def test_evaluate_command__ends_where_a_truth_of_several_runs_is_replaced_between_them(folder, tmp_path, monkeypatch):
+    (pair,) = find_pairs([shutil.copytree(folder, tmp_path / "pair")])
+    search = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
+    runs = [tmp_path / "one", tmp_path / "other"]
+    for out in runs:
+        match_pair(pair.left, pair.right, out, search)
+    monkeypatch.setattr(disparity, "evaluate_run", written_again(pair.truth, disparity.evaluate_run))
+    result = invoke("evaluate", *runs, "--quiet")
     assert (result.exit_code, "truth.tif was replaced or changed while it was read" in result.stderr) == (1, True)
 
 

@@ -162,6 +162,19 @@ def test_make_surface__ends_where_points_are_replaced_meanwhile(tmp_path, monkey
     assert not (tmp_path / "dsm.tif").exists()
 
 
+def test_make_surface__replaces_no_surface_that_was_changed_since(tmp_path):
+    x, y = np.meshgrid(np.arange(20.0), -np.arange(20.0))
+    out = write_points(tmp_path / "a", x, y, 10 + 0 * x)
+    surface_of([out], tmp_path)
+    surface_of([out], tmp_path)
+    with rasterio.open(tmp_path / "dsm.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as dataset:
+        dataset.write(dataset.read() + 1)
+    before = (tmp_path / "dsm.tif").read_bytes()
+    with pytest.raises(SatIntervalsError, match=r"dsm.tif was changed since sat-intervals made it, or is damaged"):
+        surface_of([out], tmp_path)
+    assert (tmp_path / "dsm.tif").read_bytes() == before
+
+
 @pytest.mark.parametrize("name", ["points.tif", "geoid.tif"])
 def test_make_surface__ends_where_points_or_geoid_are_replaced_after_their_check(tmp_path, monkeypatch, name):
     out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])

@@ -420,27 +420,23 @@ def test_make_truth__ends_where_another_file_of_the_points_is_replaced_meanwhile
             (tmp_path / name).write_text("after")
 
     given = Reference(points, True, Vertical(True, None))
-    with pytest.raises(RunError, match=rf"{name} was replaced or changed while it was read: rerun the command"):
+    with pytest.raises(RunError, match=r"p\.\S+ was (replaced or )?changed while it was read: rerun the command"):
         make_truth(out, SensorFiles(*files), given, path=tmp_path / "truth.tif", registers=False, progress=replace)
     assert not (tmp_path / "truth.tif").exists()
 
 
-@pytest.mark.parametrize("content", [None, b"", b"0" * 12])
-def test_make_truth__ends_where_its_temporary_points_are_damaged(relief, tmp_path, monkeypatch, content):
+def test_make_truth__keeps_its_points_where_nobody_can_exchange_them(relief, tmp_path, monkeypatch):
     out, files, _ = relief
     points = Reference(write_csv(tmp_path / "p.csv", places(hills, 1500)), True, Vertical(True, None))
-    strips = point_sight.PointSight.strips
+    strips, there = point_sight.PointSight.strips, []
 
-    def damaged(sight):
-        (file,) = tmp_path.glob(".reference-*/files/strip0")
-        file.unlink() if content is None else file.write_bytes(content)
+    def looked_at(sight):
+        there.extend(file.name for file in tmp_path.rglob("*") if file.is_file())
         return strips(sight)
 
-    monkeypatch.setattr(point_sight.PointSight, "strips", damaged)
-    path = tmp_path / "truth.tif"
-    with pytest.raises(RunError, match=r"strip0, a temporary file, was damaged or deleted meanwhile: rerun"):
-        make_truth(out, SensorFiles(*files), points, path=path, registers=False)
-    assert not path.exists()
+    monkeypatch.setattr(point_sight.PointSight, "strips", looked_at)
+    make_truth(out, SensorFiles(*files), points, path=tmp_path / "truth.tif", registers=False)
+    assert sorted(there) == [".sat-intervals.files", ".sat-intervals.lock", "p.csv"]
 
 
 @pytest.mark.parametrize("name", ["p.vrt", "p.xml"])
@@ -467,24 +463,39 @@ def test_make_truth__keeps_a_file_that_appears_after_the_check(relief, tmp_path,
     assert truth.read_text() == "mine"
 
 
-def test_make_truth__deletes_the_points_that_a_killed_one_left(relief, tmp_path):
-    out, files, _ = relief
-    points, left = write_csv(tmp_path / "p.csv", places(hills, 1500)), tmp_path / "out" / ".reference-left"
+def test_watched_points__are_not_changed_by_reading_them(tmp_path):
+    path, journal = tmp_path / "p.gpkg", tmp_path / "p.gpkg-wal"
+    path.write_text("points")
+    journal.write_text("more points")
+    check = point_files.watched_points(path)
+    journal.chmod(0o600)  # root's SQLite changes its owner
+    (tmp_path / "p.gpkg-shm").touch()
+    (tmp_path / "p.log").touch()
+    check()
+    journal.write_text("other points")
+    with pytest.raises(RunError, match=r"p\.gpkg was changed while it was read: rerun the command"):
+        check()
 
-    def keep(stage, done, total):
-        if stage == "truth" and not left.exists():
-            (used,) = left.parent.glob(".reference-*")
-            shutil.copytree(used, left)
 
-    def make(progress):
-        given = Reference(points, True, Vertical(True, None))
-        path = tmp_path / "out" / "truth.tif"
-        make_truth(out, SensorFiles(*files), given, path=path, registers=False, progress=progress)
-
-    make(keep)
-    assert len(list(left.rglob("*"))) > 1
-    make(lambda stage, done, total: None)
-    assert [path.name for path in left.parent.iterdir()] == ["truth.tif"]
+@pytest.mark.parametrize("how", ["in place", "copied"])
+def test_make_truth__replaces_no_truth_that_was_changed_since(relief, tmp_path, how):
+    out, files, reference = relief
+    path, given = tmp_path / "truth.tif", Reference(reference, False, Vertical(True, None))
+    make_truth(out, SensorFiles(*files), given, path=path, registers=False)
+    make_truth(out, SensorFiles(*files), given, path=path, registers=False)
+    if how == "copied":  # with its tags, as gdal_translate does
+        with rasterio.open(path) as dataset:
+            pixels, kind, tags = dataset.read(), dataset.profile, dataset.tags()
+        with rasterio.open(path, "w", **kind) as dataset:
+            dataset.update_tags(**tags)
+            dataset.write(pixels)
+    else:
+        with rasterio.open(path, "r+", IGNORE_COG_LAYOUT_BREAK="YES") as dataset:
+            dataset.write(dataset.read() + 1)
+    before = path.read_bytes()
+    with pytest.raises(SatIntervalsError, match=r"truth.tif was changed since sat-intervals made it, or is damaged"):
+        make_truth(out, SensorFiles(*files), given, path=path, registers=False)
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ["intervals.tif", "truth.tif"])

@@ -531,6 +531,36 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert (out / "b" / "dsm.tif").exists()
 
 
+def test_triangulate_command__replaces_no_points_that_were_changed_since(tmp_path):
+    out = write_run(tmp_path, np.full((4, 60, 80), 5, np.float32), np.zeros((60, 80), np.uint16))
+    command = "triangulate", out, *sensor_words(cameras(tmp_path, 60, 80))
+    assert [invoke(*command).exit_code for _ in range(2)] == [0, 0]
+    with rasterio.open(out / "points.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as dataset:
+        dataset.write(dataset.read() + 1)
+    before = (out / "points.tif").read_bytes()
+    result = invoke(*command)
+    assert (result.exit_code, "or was changed since" in result.stderr) == (
+        2,
+        True,
+    )
+    assert (out / "points.tif").read_bytes() == before
+
+
+def test_batch_command__refuses_an_input_that_the_surface_of_another_pair_would_replace(tmp_path):
+    scene = make_scene(60, 80, seed=4)
+    write_pair(tmp_path, scene)
+    sensors = ",".join(file.name for file in cameras(tmp_path, 60, 80))
+    columns = "name,left,right,minimum,maximum,left_model,right_model,left_grid,right_grid,resolution"
+    (tmp_path / "out" / "a").mkdir(parents=True)
+    points = shutil.copy(tmp_path / "left.tif", tmp_path / "out" / "a" / "points.tif")
+    rows = f"a,left.tif,right.tif,0,9,{sensors},1", "b,out/a/points.tif,right.tif,0,9,,,,,"
+    (tmp_path / "pairs.csv").write_text("\n".join([columns, *rows]) + "\n")
+    before = points.read_bytes()
+    result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out")
+    assert (result.exit_code, "points.tif would be written" in result.stderr) == (2, True)
+    assert points.read_bytes() == before
+
+
 def test_surface_command__ends_where_a_grid_is_replaced_while_it_matches(tmp_path, monkeypatch):
     scene = make_scene(60, 80, seed=4)
     write_pair(tmp_path, scene)

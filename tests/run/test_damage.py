@@ -7,6 +7,7 @@ import shutil
 from contextlib import suppress
 from functools import reduce
 from operator import getitem
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -531,7 +532,7 @@ def test_match_batch__takes_no_damaged_result_for_done(scene, tmp_path, name, ho
     assert shown["error"].endswith("it is damaged or was changed: move it away and match again with --overwrite")
     assert (tmp_path / "kept" / name).read_bytes() == before
     shown = match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)["kept"]
-    assert f"{name} exists and was not made by sat-intervals, or is damaged: move it away" in shown["error"]
+    assert f"{name} exists and was not made by sat-intervals, or was changed since: move it away" in shown["error"]
     (tmp_path / "kept" / name).unlink()
     match_batch(pairs, tmp_path, scene / "settings.yaml", overwrite=True)
     assert_same(scene, tmp_path / "kept")
@@ -584,14 +585,16 @@ def test_open_run__of_a_report_without_sizes_opens(scene, tmp_path):
     open_run(tmp_path / "out")
 
 
-def test_match__keeps_empty_files_in_a_folder_without_signs_of_a_run(scene, tmp_path):
-    mine = [tmp_path / "out" / "tiles" / name for name in ("records/9_9.json", "arrays.zarr/int16/c/0/9/9")]
-    for file in mine:
-        file.parent.mkdir(parents=True)
-        file.touch()
-    match(scene, tmp_path / "out")
-    assert_same(scene, tmp_path / "out")
-    assert [file.stat().st_size for file in mine] == [0, 0]
+@pytest.mark.parametrize("make", [Path.touch, os.mkfifo])
+@pytest.mark.parametrize("name", ["records/0_0.json", "arrays.zarr/int16/c/0/0/0"])
+def test_match__keeps_empty_files_and_pipes_in_a_folder_without_signs_of_a_run(scene, tmp_path, name, make):
+    mine = tmp_path / "out" / "tiles" / name
+    mine.parent.mkdir(parents=True)
+    make(mine)
+    before = mine.lstat()
+    said = match(scene, tmp_path / "out", status=2)
+    assert f"tiles has files that no run made, such as {name}: move them away" in said
+    assert os.path.samestat(mine.lstat(), before)
 
 
 def test_match__goes_on_after_a_kill_at_the_first_file_of_its_tiles(scene, tmp_path):

@@ -30,7 +30,6 @@ from sat_intervals.heights import dsm
 from sat_intervals.interop.export import export
 from sat_intervals.products import BANDS
 from sat_intervals.raster import (
-    BLOCK,
     MARK,
     RUN_FILES,
     Georeferencing,
@@ -54,7 +53,7 @@ from sat_intervals.raster import (
 from sat_intervals.raster import writer as raster_writer
 from sat_intervals.raster.files import File
 from sat_intervals.raster.identity import identity
-from sat_intervals.results import Run, open_results
+from sat_intervals.results import Run, open_results, open_run
 from sat_intervals.run import copying, search_range, source, strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
@@ -172,7 +171,7 @@ def test_read_window__ends_where_a_mask_cannot_be_found_any_more(pair):
     assert image.use_mask
     assert read_window(image, Window(0, 0, 8, 8))[1].all()
     (folder / "left.tif.msk").unlink()
-    with pytest.raises(InputError, match=r"left.tif.msk was there when .*left.tif was opened, but cannot be found now"):
+    with pytest.raises(RunError, match=r"left.tif.msk was there when .*left.tif was opened, but cannot be found now"):
         read_window(image, Window(0, 0, 8, 8))
 
 
@@ -187,7 +186,9 @@ def test_match__overwrites_no_result_that_was_changed_since(pair, name):
         with rasterio.open(out / name, "r+", IGNORE_COG_LAYOUT_BREAK="YES") as file:
             file.write(np.zeros((4, 80, 100), np.float32))  # the mark of the tool stays
     before = (out / name).read_bytes()
-    with pytest.raises(SatIntervalsError, match=rf"{name} exists and was not made by sat-intervals, or is damaged"):
+    with pytest.raises(
+        SatIntervalsError, match=rf"{name} exists and was not made by sat-intervals, or was changed since"
+    ):
         match_pair(folder / "left.tif", folder / "right.tif", out, settings, overwrite=True)
     assert (out / name).read_bytes() == before
 
@@ -327,13 +328,13 @@ def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
         open_image(folder / "left.zarr")
 
 
-@pytest.mark.parametrize("driver", ["AAIGrid", "ENVI", "PCIDSK", "MRF"])
-def test_open_image__refuses_formats_of_which_gdal_does_not_notice_missing_data(tmp_path, driver):
-    path = tmp_path / "image"
+@pytest.mark.parametrize("driver", ["AAIGrid", "ENVI", "PCIDSK", "MRF", "ILWIS", "GPKG"])
+def test_open_image__refuses_formats_of_which_gdal_does_not_notice_missing_data_or_lists_no_files(tmp_path, driver):
+    path = tmp_path / "image.mpr"
     kind = {"width": 30, "height": 20, "count": 1, "dtype": "uint8", "crs": "EPSG:32631", "transform": PLACE.transform}
     with rasterio.open(path, "w", driver=driver, **kind) as file:
         file.write(np.ones((1, 20, 30), np.uint8))
-    with pytest.raises(InputError, match=rf"image has the format {driver}, .*: convert it with gdal_translate"):
+    with pytest.raises(InputError, match=rf"image.mpr has the format {driver}, .*: convert it with gdal_translate"):
         open_image(path)
 
 
@@ -812,11 +813,10 @@ def test_output_writer__names_a_file_where_a_folder_of_temporary_ones_must_be(tm
     assert place.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["run.json", "rows-0-intervals.tif", "strips-0-validity.tif"])
-def test_output_writer__writes_nothing_behind_a_link_with_a_temporary_name(tmp_path, name):
+def test_output_writer__writes_nothing_behind_a_link_with_a_temporary_name(tmp_path):
     (tmp_path / "mine").write_text("mine")
     with writer(tmp_path / "out") as output:
-        (tmp_path / "out" / ".unpublished-intervals.tif" / "files" / name).symlink_to(tmp_path / "mine")
+        (tmp_path / "out" / ".unpublished-intervals.tif" / "files" / "run.json").symlink_to(tmp_path / "mine")
         with pytest.raises(OutputError, match="cannot be written: File exists"):
             written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
     assert contents(tmp_path) == {str(tmp_path / "mine"): b"mine"}
@@ -829,16 +829,13 @@ def exchanged_for_link(file, mine, way="symlink_to"):
 
 
 @pytest.mark.parametrize("way", ["symlink_to", "hardlink_to"])
-@pytest.mark.parametrize("name", ["strips-0-intervals.tif", "intervals.tif", "run.json"])
+@pytest.mark.parametrize("name", ["intervals.tif", "run.json"])
 def test_output_writer__writes_nothing_behind_a_link_that_takes_the_place_of_a_temporary_file(tmp_path, name, way):
     (tmp_path / "mine").write_text("mine")
     temporary = tmp_path / "out" / ".unpublished-intervals.tif" / "files" / name
-    with OutputWriter(tmp_path / "out", RUN_FILES, 2 * BLOCK, 5, Georeferencing(), {}) as output:
-        rows = np.zeros((4, BLOCK, 5), np.float32), np.zeros((BLOCK, 5), np.uint16)
-        output.write(0, *rows)
-        if temporary.exists():
-            exchanged_for_link(temporary, tmp_path / "mine", way)
-        output.write(BLOCK, *rows)
+    with writer(tmp_path / "out") as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        assert not any(file.is_file() for file in temporary.parent.rglob("*"))  # those of rows have no names
 
         def announce(_):
             if temporary.exists() and not temporary.is_symlink():
@@ -855,13 +852,13 @@ def test_page__draws_nothing_behind_a_link_that_takes_the_place_of_its_temporary
     savefig = Figure.savefig
 
     def late(*arguments, **named):
-        (temporary,) = tmp_path.glob(".overview.png-*/files/*-overview.png")
+        (temporary,) = tmp_path.glob(".overview.png-*/files/*.png")
         exchanged_for_link(temporary, tmp_path / "mine")
         return savefig(*arguments, **named)
 
     monkeypatch.setattr(Figure, "savefig", late)
     with (
-        pytest.raises(OutputError, match=r"its temporary file .*-overview\.png was replaced"),
+        pytest.raises(OutputError, match=r"its temporary file .*\.png was replaced"),
         page(tmp_path / "overview.png", (1, 1), 50, ""),
     ):
         pass
@@ -934,6 +931,48 @@ def test_match_pair__copies_no_part_behind_a_link_that_takes_the_place_of_a_temp
     with pytest.raises(SatIntervalsError, match=r"its temporary file .*intervals\.tif was replaced"):
         match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     assert ((folder / "mine").read_text(), (folder / "out" / "intervals.tif").exists()) == ("mine", False)
+
+
+def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its_own(tmp_path):
+    out, other = tmp_path / "out", tmp_path / "other"
+    other.mkdir()
+    for name in OUTPUTS:
+        (other / name).write_text("of another run")
+    before = {file.name: file.read_bytes() for file in other.iterdir()}
+
+    def publish():
+        with writer(out) as output:
+            output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+            output.build()
+            out.rename(tmp_path / "away")
+            other.rename(out)
+            output.publish(("run.json", "{}"), replaceable=stamps(out, OUTPUTS))
+
+    with pytest.raises(OutputError, match=r"\.unpublished-intervals\.tif, a folder of temporary files, is gone: rerun"):
+        publish()
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+def test_match_pair__is_complete_where_its_tiles_cannot_be_removed(pair, monkeypatch, caplog):
+    folder, settings = pair
+    tiles, publish = folder / "out" / "tiles", OutputWriter.publish
+
+    def and_exchanged(*arguments, **named):
+        publish(*arguments, **named)
+        tiles.rename(folder / "away")
+        tiles.symlink_to(folder / "away")
+
+    monkeypatch.setattr(OutputWriter, "publish", and_exchanged)
+    report = match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert open_run(folder / "out").report == report
+    assert "tiles has become a symbolic link" in caplog.text
+    assert (folder / "away" / "manifest.json").exists()
+
+
+def test_whole_file__may_have_a_name_as_long_as_the_system_allows(tmp_path):
+    with layers.whole_file(tmp_path / f"{240 * 'a'}.txt") as new:
+        new.write_text("content")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["content"]
 
 
 def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
@@ -1205,7 +1244,7 @@ def test_whole_file__publishes_no_link_that_takes_the_place_of_its_temporary_fil
             new.rename(tmp_path / "moved")
             getattr(new, way)(mine)
 
-    with pytest.raises(OutputError, match=r"its temporary file .*page.html was replaced"):
+    with pytest.raises(OutputError, match=r"its temporary file .*\.html was replaced"):
         write()
     assert (mine.read_text(), (tmp_path / "page.html").exists()) == ("mine", False)
 
