@@ -35,6 +35,11 @@ class PairArguments:
     options: Mapping[str, Any]
     window: "Window | None"
 
+    @property
+    def files(self) -> list[str]:
+        """Return images and masks."""
+        return [self.left, self.right, *filter(None, (self.options["left_mask"], self.options["right_mask"]))]
+
     def open(self) -> "tuple[Image, Image]":
         """Open both images; options of one side win over those of both."""
         return self._opened(self.left, "left"), self._opened(self.right, "right")

@@ -58,7 +58,7 @@ def surface(
         from sat_intervals.config import resolved
         from sat_intervals.run.before import report_before, tidy
 
-        _check_kept(out, cells, sensor_files, settings.file)
+        _check_kept(out, cells, [*sensor_files, *pair.files], settings.file)
         check_unchanged = _watched(sensor_files, cells)
         _check(out, cells, sensor_files, resolved(config).interval)
         left, right = pair.open()

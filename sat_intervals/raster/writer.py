@@ -146,9 +146,7 @@ class OutputWriter:
             if place.exists() and not place.is_dir():
                 raise OutputError(f"{place} is not a folder, but temporary files go there: move it away")
         for place, made in self._folders.items():
-            if not place.exists():
-                raise OutputError(f"{place}, a folder of temporary files, is gone: rerun the command")
-            if not os.path.samestat(made, place.lstat()):
+            if place.exists() and not os.path.samestat(made, place.lstat()):
                 raise OutputError(f"{place}, a folder of temporary files, was replaced: move it away and rerun")
 
     def _unfinished(self) -> Iterator[Path]:
@@ -252,6 +250,8 @@ class OutputWriter:
                 if checksum_of(self._pinned / name) != checksum:
                     raise OSError(errno.EIO, "the content read back differs from that written")
         self._check_folders()
+        if not self._scratch.exists():  # perhaps another folder took the place of the whole one
+            raise OutputError(f"{self._scratch}, a folder of temporary files, is gone: rerun the command")
         names = [file.name for file in self._files]
         if report:
             name, text = report

@@ -546,6 +546,17 @@ def test_triangulate_command__replaces_no_points_that_were_changed_since(tmp_pat
     assert (out / "points.tif").read_bytes() == before
 
 
+def test_surface_command__refuses_an_image_that_its_points_would_replace(tmp_path):
+    write_pair(tmp_path, make_scene(60, 80, seed=4))
+    files, points = cameras(tmp_path, 60, 80), tmp_path / "out" / "points.tif"
+    points.parent.mkdir()
+    shutil.copy(tmp_path / "left.tif", points)
+    images = points, tmp_path / "right.tif"
+    result = invoke("surface", *images, tmp_path / "out", *sensor_words(files), "--disparity", 0, 9, "--resolution", 1)
+    assert (result.exit_code, "points.tif would be written" in result.stderr) == (2, True)
+    assert [file.name for file in points.parent.iterdir()] == ["points.tif"]
+
+
 def test_batch_command__refuses_an_input_that_the_surface_of_another_pair_would_replace(tmp_path):
     scene = make_scene(60, 80, seed=4)
     write_pair(tmp_path, scene)

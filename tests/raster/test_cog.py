@@ -134,7 +134,7 @@ def test_assemble__has_the_tags_of_gdals_own_driver(tmp_path):
 @pytest.mark.parametrize("rows", [100, 512, 1100])
 def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
     bands = noise(INTERVALS, 1100, 300)
-    stream = Stream(INTERVALS, tmp_path / "a.tif", bands.shape[1:], 2)
+    stream = Stream(INTERVALS, tmp_path, bands.shape[1:], 2)
     for row in range(0, 1100, rows):
         stream.write(row, bands[:, row : row + rows])
     for found, expected in zip(stream.parts, parts_of(bands, INTERVALS), strict=True):
@@ -143,7 +143,7 @@ def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
     assemble(tmp_path / "a.tif", made, bands.shape[1:], stream.parts, stream.copy_parts)
     write(tmp_path / "b.tif", bands, INTERVALS)
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
-    stream.remove()
+    stream.close()
     assert {path.name for path in tmp_path.iterdir()} == {"a.tif", "b.tif"}
 
 

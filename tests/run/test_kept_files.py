@@ -948,7 +948,9 @@ def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its
             other.rename(out)
             output.publish(("run.json", "{}"), replaceable=stamps(out, OUTPUTS))
 
-    with pytest.raises(OutputError, match=r"\.unpublished-intervals\.tif, a folder of temporary files, is gone: rerun"):
+    with pytest.raises(
+        OutputError, match=r"\.unpublished-intervals\.tif/files, a folder of temporary files, is gone: rerun"
+    ):
         publish()
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
