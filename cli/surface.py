@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from sat_intervals.config.pairs import PairOfBatch
     from sat_intervals.run.batch import Finish
 
-# What follows a run, in its folder.
-_MADE = "points.tif", "points.json", "dsm.tif"
+# What is made of a run, in its folder.
+_FILES = "points.tif", "points.json", "dsm.tif"
 
 
 @click.command(short_help="Match a pair, triangulate it and make a surface model.")
@@ -67,7 +67,7 @@ def surface(
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
         else:
             tidy(out, run.keep_tiles, config.cluster.store)
-        points, made = _made(out, report["finished"], sensor_files, cells, check_unchanged, console)
+        points, made = _points_and_surface(out, report["finished"], sensor_files, cells, check_unchanged, console)
     if as_json:
         say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
@@ -84,7 +84,7 @@ def _check_kept(
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS
 
-    results = [out / name for name in (*OUTPUTS, *_MADE)]
+    results = [out / name for name in (*OUTPUTS, *_FILES)]
     like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
     check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
 
@@ -96,7 +96,7 @@ def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
     images = [file for pair in pairs for file in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     sensors = [file for pair in pairs for file in pair.sensors or ()]
     check_not_replaced(
-        [*images, *sensors], [out / pair.name / name for pair in pairs if pair.sensors for name in _MADE]
+        [*images, *sensors], [out / pair.name / name for pair in pairs if pair.sensors for name in _FILES]
     )
 
 
@@ -108,7 +108,7 @@ def _watched(sensor_files: Sequence[str | Path], cells: dict[str, Any]) -> Calla
     return watched_rasters([*sensor_files, cells["geoid"], like])
 
 
-def _made(
+def _points_and_surface(
     out: Path,
     finished: str,
     sensor_files: tuple[Any, Any, Any, Any],
@@ -190,7 +190,7 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
             return {}
         if pair.name in errors:
             raise errors[pair.name]
-        points, made = _made(out / pair.name, finished, pair.sensors, *checked[pair.name], console)
+        points, made = _points_and_surface(out / pair.name, finished, pair.sensors, *checked[pair.name], console)
         return {"points": points, "surface": made}
 
     return surface_of

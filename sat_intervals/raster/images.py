@@ -61,7 +61,7 @@ class Image:
     georeferencing
         Georeferencing of the file.
     beside
-        Files with its mask or no-data value.
+        Files with its mask or no-data value that have names of their own: ``.msk`` and ``.aux.xml``.
     stamps
         `stamps_of` its files before it was opened.
     """

@@ -246,7 +246,9 @@ def check_as_made(path: Path) -> None:
     Other programs that make another file of one copy its `MARK`, but not the CRC-32.
     """
     if path.is_file() and not path.is_symlink() and not is_as_made(path):
-        raise SatIntervalsError(f"{path} was changed since sat-intervals made it, or is damaged: move it away")
+        raise SatIntervalsError(
+            f"{path} was changed since sat-intervals made it, or is of a version without checksums: move it away"
+        )
 
 
 def check_made_by(path: Path, command: str, tag: str, value: str | None = None) -> None:

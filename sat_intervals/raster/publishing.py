@@ -22,7 +22,15 @@ REPLACED = "replaced"
 
 @contextmanager
 def pinned(folder: Path) -> Iterator[Path]:
-    """Yield a path of a folder that stays its own, even if a link or another folder takes its place."""
+    """Yield a path of a folder that stays its own, even if a link or another folder takes its place.
+
+    The path is one of this process only. Without ``/proc`` it is the plain one, which protects against nothing.
+
+    Raises
+    ------
+    OSError
+        It is not a folder, or a link.
+    """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         path = Path(f"/proc/self/fd/{descriptor}")
@@ -32,7 +40,13 @@ def pinned(folder: Path) -> Iterator[Path]:
 
 
 def check_own(file: Path) -> os.stat_result:
-    """Return the status of a temporary file; raise if a link took its place, of either kind."""
+    """Return the status of a temporary file.
+
+    Raises
+    ------
+    OSError
+        A link took its place, of either kind.
+    """
     status = file.lstat()
     if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
         raise OSError(errno.ESTALE, f"its temporary file {file.name} was replaced")
@@ -40,7 +54,13 @@ def check_own(file: Path) -> os.stat_result:
 
 
 def open_own(file: Path, flags: int) -> int:
-    """Open a temporary file that exists, unless a link took its place; return its descriptor."""
+    """Open a temporary file that exists; return its descriptor.
+
+    Raises
+    ------
+    OSError
+        A link took its place, of either kind.
+    """
     check_own(file)
     return os.open(file, flags | os.O_NOFOLLOW)
 

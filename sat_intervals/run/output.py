@@ -51,9 +51,12 @@ def replaceable(out: Path, *, overwrite: bool) -> dict[str, str]:
 
 
 def check_replaceable(out: Path) -> None:
-    """Raise if a folder has a file with the name of a run's file that no run made, or that was changed since.
+    """Check a folder before its files are overwritten.
 
-    Call it before overwriting.
+    Raises
+    ------
+    SatIntervalsError
+        A file with the name of a run's file was not made by a run, or was changed since.
     """
     published = _published(out / "run.json")
     if published and is_replacing(out / "tiles"):  # a killed run has perhaps replaced some of the files

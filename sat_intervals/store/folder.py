@@ -53,7 +53,10 @@ class Folder(Protocol):
         """Return a subfolder."""
 
     def of_run(self, run: str) -> "Folder":
-        """Return the folder, in which nothing is written or deleted once MADE has the mark of another run."""
+        """Return the folder, in which nothing is written or deleted once MADE has the mark of another run.
+
+        Writing and deleting then raise OSError (ESTALE).
+        """
 
     def make(self, folder: str) -> None:
         """Create a folder if the file system needs that."""

@@ -170,7 +170,7 @@ def test_make_surface__replaces_no_surface_that_was_changed_since(tmp_path):
     with rasterio.open(tmp_path / "dsm.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as dataset:
         dataset.write(dataset.read() + 1)
     before = (tmp_path / "dsm.tif").read_bytes()
-    with pytest.raises(SatIntervalsError, match=r"dsm.tif was changed since sat-intervals made it, or is damaged"):
+    with pytest.raises(SatIntervalsError, match=r"dsm.tif was changed since sat-intervals made it"):
         surface_of([out], tmp_path)
     assert (tmp_path / "dsm.tif").read_bytes() == before
 
