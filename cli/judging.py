@@ -98,10 +98,11 @@ def watched_arguments(pairs: Iterable[Path], settings: Path | None) -> Callable[
 
     Call this before they are read. Of a pair, its CSV file or meta.json is meant, not its images.
     """
+    from sat_intervals.raster import watched_rasters
     from sat_intervals.raster.identity import watched
 
     check_files = watched([settings, *(pair / "meta.json" if pair.is_dir() else pair for pair in pairs)])
-    check_named = watched(named_by(settings))
+    check_named = watched_rasters(named_by(settings))  # one of ranges may be virtual
 
     def check() -> None:
         check_files()

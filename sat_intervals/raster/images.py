@@ -284,9 +284,10 @@ def _sources(path: str) -> list[str]:
         raise InputError(f"{path} is not well-formed XML: {error}: write it with gdalbuildvrt") from error
     found = []
     for element in elements:
-        if element.get("subClass") == "VRTRawRasterBand":
+        if (kind := element.get("subClass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
             raise InputError(
-                f"{path} has a raw band, in which GDAL does not report missing data: convert it with gdal_translate"
+                f"{path} has a {kind}, of which GDAL does not report missing data or changed files: convert it with "
+                "gdal_translate"
             )
         is_named = element.tag in _SOURCE_TAGS or element.get("key") in _GEOLOCATION_KEYS
         if is_named and (name := element.text):

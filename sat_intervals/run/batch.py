@@ -17,8 +17,8 @@ from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
-from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, whole_file
-from sat_intervals.raster.identity import check_not_replaced, watched
+from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, watched_rasters, whole_file
+from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.run.assemble import remove_tiles
 from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
@@ -79,7 +79,7 @@ def match_batch(
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
     common = load_config(sections, overrides, file=file)
     own = {pair.name: {**(overrides or {}), **_merged(overrides or {}, pair.settings)} for pair in pairs}
-    check_named = watched(file for settings in (sections, *own.values()) for file in named_files(settings))
+    check_named = watched_rasters(file for settings in (sections, *own.values()) for file in named_files(settings))
     _check_not_replaced(pairs, [file, common.disparity.grid], out, overwrite)
     cluster = common.cluster
     _raise_file_limit()

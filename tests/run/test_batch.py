@@ -18,6 +18,7 @@ import pytest
 import rasterio
 import yaml
 from helpers import OUTPUTS, PLACE, hashes, invoke
+from rasterio.shutil import copy
 
 from sat_intervals.config import Cluster, ConfigError, calibration_of, load_config
 from sat_intervals.config.pairs import PairOfBatch, read_batch
@@ -195,34 +196,44 @@ def test_match_batch__reads_the_settings_of_all_pairs_once(images, tmp_path, mon
     assert {open_run(tmp_path / "out" / name).config.sgm.p1 for name in ("pair1", "pair2")} == {5}
 
 
-def test_match_batch__ends_pairs_whose_calibration_was_replaced_since_the_first_one(images, tmp_path, monkeypatch):
-    file, config, prepared = tmp_path / "own.yaml", load_config({"interval": {"coverage": 0.9}}), batch.prepare
-    file.write_text(yaml.safe_dump(calibration_of(config).model_dump(mode="json")))
+def write_ranges(file, like, minimum):
+    """Write the same range for all pixels of an image."""
+    with rasterio.open(like) as left:
+        shape = left.shape
+    kind = {"height": shape[0], "width": shape[1], "count": 2, "dtype": "int16", "transform": PLACE.transform}
+    with rasterio.open(file, "w", "GTiff", **kind) as dataset:
+        dataset.write(np.stack([np.full(shape, minimum, np.int16), np.full(shape, 9, np.int16)]))
+
+
+@pytest.mark.parametrize("name", ["own.yaml", "ranges.tif"])
+def test_match_batch__ends_pairs_whose_files_were_replaced_since_the_first_one(images, tmp_path, monkeypatch, name):
+    file, config, prepared = tmp_path / name, load_config({"interval": {"coverage": 0.9}}), batch.prepare
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(calibration_of(config).model_dump(mode="json")))
+    write_ranges(tmp_path / "ranges.tif", images / "left1.tif", -9)
+    copy(tmp_path / "ranges.tif", tmp_path / "ranges.vrt", driver="VRT")
     calls = itertools.count()
 
     def and_changed(*arguments, **named):
         if next(calls):
-            file.write_text(file.read_text() + "# another")
+            shutil.copy(file, tmp_path / "new")
+            (tmp_path / "new").replace(file)
         return prepared(*arguments, **named)
 
     monkeypatch.setattr(batch, "prepare", and_changed)
-    settings = {"interval": {"coverage": 0.9, "calibration": str(file)}, "disparity": {"minimum": -18, "maximum": 40}}
+    search = {"minimum": -18, "maximum": 40, "grid": str(tmp_path / "ranges.vrt")}
+    settings = {"interval": {"coverage": 0.9, "calibration": str(tmp_path / "own.yaml")}, "disparity": search}
     files = [(f"pair{seed}", *(str(images / f"{side}{seed}.tif") for side in ("left", "right"))) for seed in (1, 2)]
     states = match_batch([PairOfBatch(*pair) for pair in files], tmp_path / "out", settings)
     assert [states[name]["state"] for name in ("pair1", "pair2")] == ["done", "failed"]
-    assert "own.yaml was replaced or changed while it was read: rerun the command" in states["pair2"]["error"]
+    assert f"{name} was replaced or changed while it was read: rerun the command" in states["pair2"]["error"]
 
 
 def test_match_batch__does_not_take_a_result_for_that_of_other_ranges(images, tmp_path):
     pairs = [PairOfBatch("pair1", str(images / "left1.tif"), str(images / "right1.tif"))]
     file = tmp_path / "ranges.tif"
-    with rasterio.open(images / "left1.tif") as left:
-        shape = left.shape
 
     def states(minimum):
-        kind = {"height": shape[0], "width": shape[1], "count": 2, "dtype": "int16", "transform": PLACE.transform}
-        with rasterio.open(file, "w", "GTiff", **kind) as dataset:
-            dataset.write(np.stack([np.full(shape, minimum, np.int16), np.full(shape, 9, np.int16)]))
+        write_ranges(file, images / "left1.tif", minimum)
         return match_batch(pairs, tmp_path / "out", {"disparity": {"grid": str(file)}})["pair1"]
 
     assert [states(minimum)["state"] for minimum in (-4, -4, -6)] == ["done", "done before", "failed"]

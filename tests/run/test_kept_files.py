@@ -315,9 +315,15 @@ def test_other_files__are_those_of_warping_too(pair):
     assert other_files(str(folder / "warped.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
     raw = text.replace('band="1"', 'band="1" subClass="VRTRawRasterBand"')
     raw = re.sub("<SimpleSource>(.*)</SimpleSource>", r"\1", raw, flags=re.DOTALL)
-    (folder / "raw.vrt").write_text(raw)
-    with pytest.raises(InputError, match=r"raw\.vrt"):
-        other_files(str(folder / "raw.vrt"))
+    processed = (
+        '<VRTDataset subClass="VRTProcessedDataset"><Input><SourceFilename relativeToVRT="1">mask.tif</SourceFilename>'
+        "</Input><ProcessingSteps><Step><Algorithm>BandAffineCombination</Algorithm><Argument "
+        'name="coefficients_1">0,1</Argument></Step></ProcessingSteps></VRTDataset>'
+    )
+    for name, content in (("raw", raw), ("processed", processed)):
+        (folder / f"{name}.vrt").write_text(content)
+        with pytest.raises(InputError, match=rf"{name}\.vrt has a VRT"):
+            other_files(str(folder / f"{name}.vrt"))
 
 
 def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
