@@ -14,7 +14,7 @@ from typing import Any
 
 from sat_intervals.config import Config, load_config, named_files, read_yaml
 from sat_intervals.config.pairs import REPORT, PairOfBatch
-from sat_intervals.errors import RunError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, watched_rasters, whole_file
@@ -138,13 +138,16 @@ class _Report:
 def _check_not_replaced(
     pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path, overwrite: bool
 ) -> None:
-    """Raise if an input of any pair, or another file that is read, is an output of any pair."""
+    """Raise if an input of any pair, or another file that is read, is an output of any pair, or two pairs share one."""
+    names = {(out / pair.name).resolve(): pair.name for pair in pairs}
+    if shared := [pair.name for pair in pairs if names[(out / pair.name).resolve()] != pair.name]:
+        raise SatIntervalsError(f"{out / shared[0]} is the folder of another pair, too: remove the link")
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
-    images = [(pair.left, pair.right, pair.left_mask, pair.right_mask) for pair in pairs]
-    names = [name for pair, files in zip(pairs, images, strict=True) for name in (*files, *(pair.sensors or ()))]
-    files = [name for name in names if name and os.path.isfile(name)]
+    images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
+    files = [name for name in images if name and os.path.isfile(name)]
+    sensors = [name for pair in pairs for name in pair.sensors or ()]
     check_not_replaced(
-        [*others, *(file for name in files for file in (name, *other_files(name)))],
+        [*others, *sensors, *(file for name in files for file in (name, *other_files(name)))],
         [out / REPORT, *(folder / name for folder in written for name in OUTPUTS)],
         [folder / "tiles" for folder in written],
     )

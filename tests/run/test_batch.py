@@ -228,6 +228,14 @@ def test_match_batch__ends_pairs_whose_files_were_replaced_since_the_first_one(i
     assert f"{name} was replaced or changed while it was read: rerun the command" in states["pair2"]["error"]
 
 
+def test_match_batch__refuses_a_folder_that_is_a_link_to_that_of_another_pair(images, tmp_path):
+    (tmp_path / "pair1").mkdir()
+    (tmp_path / "pair2").symlink_to("pair1")
+    with pytest.raises(SatIntervalsError, match=r"pair1 is the folder of another pair, too: remove the link"):
+        match_batch(read_batch(rows(images)), tmp_path)
+    assert not any((tmp_path / "pair1").iterdir())
+
+
 def test_match_batch__does_not_take_a_result_for_that_of_other_ranges(images, tmp_path):
     pairs = [PairOfBatch("pair1", str(images / "left1.tif"), str(images / "right1.tif"))]
     file = tmp_path / "ranges.tif"
