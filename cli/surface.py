@@ -81,12 +81,14 @@ def _check_kept(
     out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path], config: Path | None = None
 ) -> None:
     """Raise if a step would write over a file that is read."""
+    from sat_intervals.raster import other_files
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS
 
     results = [out / name for name in (*OUTPUTS, *_FILES)]
-    like = [cells["resolution"]] if isinstance(cells["resolution"], Path) else []
-    check_not_replaced([config, *sensor_files, cells["geoid"], *like], results, [out / "tiles"])
+    rasters = [str(name) for name in (cells["geoid"], cells["resolution"]) if isinstance(name, (str, Path))]
+    read = [file for name in rasters for file in (name, *other_files(name))]
+    check_not_replaced([config, *sensor_files, *read], results, [out / "tiles"])
 
 
 def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:

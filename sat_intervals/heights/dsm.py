@@ -24,6 +24,7 @@ from sat_intervals.raster import (
     geoid_grid,
     is_surface,
     north_up,
+    other_files,
     read_place,
     replaceable,
     surface_file,
@@ -130,8 +131,9 @@ def _counts(cells: Cells, clouds: Sequence[PointCloud]) -> dict[str, int]:
 
 def _runs(outs: Sequence[str | Path], path: Path, inputs: Sequence[Path | None]) -> list[Run]:
     runs = triangulated([Path(out) for out in outs])
+    read = [*inputs, *(file for name in inputs if name for file in other_files(str(name)))]
     for run in runs:
-        run.check_kept([path], inputs)
+        run.check_kept([path], read)
     return runs
 
 

@@ -124,7 +124,7 @@ def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_til
         if not keep_tiles:
             job.store.mark_finished(job.name, stamps)
 
-    there = replaceable_files(job.store.home)
+    there = replaceable_files(job.store.home, job.store.run) or {}
     writer.publish(("run.json", sealed(report) + "\n"), replaceable=there, announce=announce)
     try:
         job.store.mark_replaced()

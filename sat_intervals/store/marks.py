@@ -5,8 +5,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from sat_intervals.store.folder import folder_at
+from sat_intervals.store.manifest import StoreError
 
-# Present while a run replaces an earlier one, with the stamps of the files that it may replace.
+# Present while a run replaces an earlier one, with its digest and the stamps of the files that it may replace.
 REPLACING = ".sat-intervals.replacing"
 # Name of a run and stamps of its files, from their publication to the removal of its tiles.
 FINISHED = ".sat-intervals.finished"
@@ -23,8 +24,26 @@ def is_replacing(home: Path) -> bool:
     return folder_at(home).read(REPLACING) is not None
 
 
-def replaceable_files(home: Path) -> dict[str, str]:
-    """Return the stamps of the files that an unfinished run is to replace, by name."""
-    with suppress(ValueError, TypeError, RecursionError):
-        return dict(json.loads(folder_at(home).read(REPLACING) or "{}"))
-    return {}
+def replaceable_files(home: Path, run: str) -> dict[str, str] | None:
+    """Return the stamps of the files that the run of a digest is to replace, by name; None if it is another run."""
+    mark = folder_at(home).read(REPLACING)
+    if mark is None:
+        return {}
+    with suppress(ValueError, LookupError, TypeError, RecursionError):
+        there = json.loads(mark)
+        return dict(there["files"]) if there["run"] == run else None
+    return None
+
+
+def check_replacing(home: Path, run: str) -> None:
+    """Raise if another run was killed before it replaced the files of an earlier one.
+
+    Raises
+    ------
+    StoreError
+        Says to overwrite them.
+    """
+    if replaceable_files(home, run) is None:
+        raise StoreError(
+            f"{home.parent} has the results of an earlier run, which another run was to replace: give --overwrite"
+        )

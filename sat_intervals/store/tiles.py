@@ -22,7 +22,7 @@ import numpy as np
 from sat_intervals.errors import RemovedTilesError, RunError
 from sat_intervals.store.folder import MADE, Folder, folder_at, mark
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
-from sat_intervals.store.marks import FINISHED, REPLACING
+from sat_intervals.store.marks import FINISHED, REPLACING, check_replacing
 from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
@@ -132,7 +132,7 @@ class Store:
             Whether to delete existing tiles and replace the files of an earlier run. Tiles in a store that the user
             does not name are kept.
         replaceable
-            What `replaceable_files` returns afterwards, with ``overwrite``.
+            What `replaceable_files` of this run returns afterwards, with ``overwrite``.
 
         Raises
         ------
@@ -151,6 +151,8 @@ class Store:
                         f"the tiles of the run in {self.home.parent} are in {before}, not in {folder}: give the same "
                         "--store as before (or none) to resume, or --overwrite to start again"
                     )
+            if not overwrite:
+                check_replacing(self.home, self.run)
             if self.elsewhere and (there := unsealed(folder.read(MANIFEST))) and digest(there) != self.run:
                 raise StoreError(f"{folder} has the tiles of another run, which were moved there: move them away")
             self._place.make("")  # fails before anything is deleted
@@ -168,7 +170,7 @@ class Store:
             home.make("")
             home.delete(FINISHED)
             if overwrite:
-                home.write(REPLACING, json.dumps(dict(replaceable or {})))
+                home.write(REPLACING, json.dumps({"run": self.run, "files": dict(replaceable or {})}))
             if self.elsewhere:
                 home.write(PLACE, json.dumps(str(folder)))
             else:

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from pyproj import Transformer
+from rasterio.shutil import copy
 from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
@@ -248,6 +249,9 @@ def test_make_surface__keeps_the_surface_whose_grid_it_takes(tmp_path):
     surface_of([out], tmp_path)
     with pytest.raises(SatIntervalsError, match=r"dsm.tif is an input, and .*dsm.tif would be written"):
         surface_of([out], tmp_path, resolution=tmp_path / "dsm.tif", crs=None)
+    copy(tmp_path / "dsm.tif", tmp_path / "like.vrt", driver="VRT")
+    with pytest.raises(SatIntervalsError, match=r"dsm.tif is an input, and .*dsm.tif would be written"):
+        surface_of([out], tmp_path, resolution=tmp_path / "like.vrt", crs=None)
 
 
 def test_make_surface__of_several_runs_is_their_mean_where_they_meet(tmp_path):

@@ -54,6 +54,7 @@ from sat_intervals.raster import writer as raster_writer
 from sat_intervals.raster.files import File
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import Run, open_results, open_run
+from sat_intervals.run import assemble as run_assemble
 from sat_intervals.run import copying, search_range, source, strips
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
@@ -959,6 +960,55 @@ def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its
     ):
         publish()
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+def killed_overwrite(pair, out, monkeypatch):
+    """A finished run, over which another one was killed before it published."""
+    folder, settings = pair
+    images = folder / "left.tif", folder / "right.tif"
+    match_pair(*images, out, settings)
+    with monkeypatch.context() as patch:
+        patch.setattr(OutputWriter, "publish", dies)
+        with pytest.raises(KeyboardInterrupt):
+            match_pair(*images, out, settings | {"sgm": {"p2": 48}}, overwrite=True)
+    return {name: (out / name).read_bytes() for name in OUTPUTS}
+
+
+def dies(*arguments, **named):
+    raise KeyboardInterrupt
+
+
+def test_match_pair__replaces_no_results_that_come_with_the_mark_of_a_killed_overwrite(pair, monkeypatch):
+    folder, settings = pair
+    out = folder / "out"
+    before = killed_overwrite(pair, folder / "other", monkeypatch)
+    assemble = run_assemble._publish
+
+    def late(*arguments, **named):
+        for name in (*OUTPUTS, "tiles/.sat-intervals.replacing"):
+            shutil.copy2(folder / "other" / name, out / name)
+        return assemble(*arguments, **named)
+
+    monkeypatch.setattr(run_assemble, "_publish", late)
+    with pytest.raises(SatIntervalsError, match="is not of this run, or was changed since it started: move it away"):
+        match_pair(folder / "left.tif", folder / "other.tif", out, settings)
+    assert {name: (out / name).read_bytes() for name in OUTPUTS} == before
+
+
+def test_match_pair__takes_no_mark_of_another_killed_overwrite_for_its_own(pair, monkeypatch):
+    folder, settings = pair
+    out, images = folder / "out", (folder / "left.tif", folder / "right.tif")
+    before = killed_overwrite(pair, out, monkeypatch)
+    for name in os.listdir(out / "tiles"):  # a user empties the folder, but for hidden files
+        if not name.startswith("."):
+            place = out / "tiles" / name
+            shutil.rmtree(place) if place.is_dir() else place.unlink()
+    other = settings | {"sgm": {"p2": 50}}
+    with pytest.raises(SatIntervalsError, match="which another run was to replace: give --overwrite"):
+        match_pair(*images, out, other)
+    assert {name: (out / name).read_bytes() for name in OUTPUTS} == before
+    match_pair(*images, out, other, overwrite=True)
+    assert open_run(out).config.sgm.p2 == 50
 
 
 def test_match_pair__is_complete_where_its_tiles_cannot_be_removed(pair, monkeypatch, caplog):
