@@ -149,10 +149,11 @@ def _sources(
 
 
 def _truths(sources: list[_Source]) -> list[Path | None]:
-    """Return truths and masks that are given, and those beside the left images of runs."""
+    """Return truths and masks that are given, and what is read beside the left images of runs."""
     from sat_intervals.results import open_run
 
-    beside = [open_run(source.name).truth_beside for source in sources if not (source.pair or source.truth)]
+    truths = [open_run(source.name).truth_beside for source in sources if not source.pair]
+    beside = [file for truth in truths for file in (truth, truth.with_name("meta.json"))]
     return [*beside, *(file for source in sources for file in (source.truth, source.mask))]
 
 

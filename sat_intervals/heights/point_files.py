@@ -16,6 +16,11 @@ from sat_intervals.raster.identity import watched
 _HEAD = 4096
 # Endings of files that are read with others: of Shapefiles, MapInfo.
 _WITH = ".dbf", ".shx", ".prj", ".cpg", ".dat", ".map", ".id", ".mid"
+# Formats of vectors in one file, or in those with `_WITH`.
+_DRIVERS = {
+    *("CSV", "ESRI Shapefile", "FlatGeobuf", "GML", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "KML", "LIBKML"),
+    *("MapInfo File", "ODS", "Parquet", "SQLite", "TopoJSON", "XLSX"),
+}
 # Points read at a time.
 _PART = 500_000
 # Names of columns, in lower case; the first found counts. Those of ICESat-2 products are among them.
@@ -197,9 +202,14 @@ def _vector_library() -> tuple[Any, Any]:
 def _crs_of_vectors(path: Path) -> str | None:
     pyogrio, _ = _vector_library()
     try:
-        crs = pyogrio.read_info(path)["crs"]
+        info = pyogrio.read_info(path)
     except Exception as error:
         raise _unreadable(path, error) from error
+    if info["driver"] not in _DRIVERS:
+        raise SatIntervalsError(
+            f"{path} has the format {info['driver']}, which may be read from other files: convert it with ogr2ogr"
+        )
+    crs = info["crs"]
     return None if crs is None else str(crs)
 
 

@@ -25,7 +25,7 @@ _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, M
 # Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
 _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
 # Elements of a virtual raster that name a file, and the metadata that do so: positions of a warped one.
-_SOURCE_TAGS, _GEOLOCATION_KEYS = {"SourceFilename", "SourceDataset", "DEMPath"}, {"X_DATASET", "Y_DATASET"}
+_SOURCE_TAGS, _GEOLOCATION_KEYS = {"sourcefilename", "sourcedataset", "dempath"}, {"X_DATASET", "Y_DATASET"}
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
 
@@ -273,7 +273,7 @@ def _check_watched(name: str, dataset: DatasetReader) -> None:
 def _sources(path: str) -> list[str]:
     """Return all sources of a virtual raster, given as a file or as text.
 
-    GDAL lists only plain files, and not those of masks.
+    GDAL lists only plain files, and not those of masks. It ignores case and namespaces.
     """
     text = Path(path).read_bytes() if os.path.isfile(path) else path.encode()
     if b"<VRTDataset" not in text:
@@ -284,14 +284,15 @@ def _sources(path: str) -> list[str]:
         raise InputError(f"{path} is not well-formed XML: {error}: write it with gdalbuildvrt") from error
     found = []
     for element in elements:
-        if (kind := element.get("subClass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
+        tag, named = element.tag.rpartition("}")[2].lower(), {key.lower(): text for key, text in element.items()}
+        if (kind := named.get("subclass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
             raise InputError(
                 f"{path} has a {kind}, of which GDAL does not report missing data or changed files: convert it with "
                 "gdal_translate"
             )
-        is_named = element.tag in _SOURCE_TAGS or element.get("key") in _GEOLOCATION_KEYS
+        is_named = tag in _SOURCE_TAGS or named.get("key") in _GEOLOCATION_KEYS
         if is_named and (name := element.text):
-            is_relative = element.get("relativeToVRT") == "1" and not _IN_ANOTHER.match(name)
+            is_relative = named.get("relativetovrt") == "1" and not _IN_ANOTHER.match(name)
             found.append(os.path.join(os.path.dirname(path), name) if is_relative else name)
     return found
 

@@ -18,6 +18,8 @@ _LINE, _ZEROS = b"SAT_INTERVALS_CRC_32=", b"00000000"
 _SEAL = re.compile(_LINE + rb"([0-9a-f]{8})\n")
 # Bytes of a file among which the line is.
 _BEGINNING = 1024
+# Endings of files that GDAL reads with a raster.
+_BESIDE = ".aux.xml", ".msk", ".ovr"
 # Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes. Names of bands are repeated.
 _STATISTICS = {
     *("PAMDataset", "PAMRasterBand", "Description", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax"),
@@ -90,6 +92,11 @@ def check_beside(path: str | Path, files: Iterable[str]) -> None:
     for file in files:
         if Path(file) != Path(path) and not (file.endswith(".aux.xml") and has_statistics_only(Path(file))):
             raise SatIntervalsError(f"{file} changes what is read from {path}: move it away")
+
+
+def check_place(path: Path) -> None:
+    """Raise if files next to the place of a raster would change what GDAL reads from it, see `check_beside`."""
+    check_beside(path, [file for ending in _BESIDE if os.path.lexists(file := f"{path}{ending}")])
 
 
 def has_statistics_only(file: Path) -> bool:

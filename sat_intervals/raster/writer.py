@@ -24,6 +24,7 @@ from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
 from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, pinned, publish, put_back, stamps
+from sat_intervals.raster.seal import check_place
 from sat_intervals.raster.space import WAY_OUT, check_space, file_bytes
 from sat_intervals.raster.streaming import Stream
 from sat_intervals.store.folder import LocalFolder
@@ -107,6 +108,8 @@ class OutputWriter:
             place = self._folder / file.name
             if place.exists() and not place.is_file():
                 raise OutputError(f"{place} cannot be written: it is not a regular file: choose another name or folder")
+            if file.driver == "COG":
+                check_place(place)
         with self._failing(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
         self._check_hidden()

@@ -95,7 +95,7 @@ def match_batch(
             progress("pairs", number, len(pairs))
             try:
                 settings = load_config(sections, own[pair.name], preset_wins=True, file=file)
-                before = None if overwrite else _done_before(pair, out, settings)
+                before = None if overwrite else _done_before(pair, out, settings, check_named)
                 if before is None:
                     jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find, check_named)
                 else:
@@ -165,9 +165,12 @@ def _window(pair: PairOfBatch) -> Window | None:
     return Window(*pair.window) if pair.window else None
 
 
-def _done_before(pair: PairOfBatch, out: Path, settings: Config) -> dict[str, Any] | None:
+def _done_before(
+    pair: PairOfBatch, out: Path, settings: Config, check_named: Callable[[], None]
+) -> dict[str, Any] | None:
     """Return counts and seconds of a pair's complete run, None without one; raise if settings or images differ."""
     report = report_before(*_images(pair), out / pair.name, settings, _window(pair))
+    check_named()
     return report and {name: report[name] for name in _KEPT if name in report}
 
 

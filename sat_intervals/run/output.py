@@ -10,6 +10,7 @@ from typing import Any
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import RUN_FILES, is_marked, restore, stamps
 from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.seal import check_place
 from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.store.marks import finished_run, is_replacing
 from sat_intervals.store.tiles import has_begun
@@ -32,6 +33,8 @@ def check_output(out: Path, overwrite: bool) -> None:
             raise holds_run(out, there)
         if home.is_symlink():
             raise SatIntervalsError(f"{home} is a symbolic link: give the folder of the tiles with --store")
+        for file in RUN_FILES:
+            check_place(out / file.name)
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:

@@ -314,6 +314,9 @@ def test_other_files__are_those_of_warping_too(pair):
     positions = f'<Metadata domain="GEOLOCATION"><MDI key="X_DATASET">{folder / "left.tif"}</MDI></Metadata>'
     (folder / "warped.vrt").write_text(text.replace("</VRTDataset>", f"{positions}</VRTDataset>"))
     assert other_files(str(folder / "warped.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
+    for other in (text.replace("<VRTDataset", '<VRTDataset xmlns="urn:x"'), text.replace("Filename", "FILENAME")):
+        (folder / "other.vrt").write_text(other)
+        assert other_files(str(folder / "other.vrt")) == [str(folder / "mask.tif")]
     raw = text.replace('band="1"', 'band="1" subClass="VRTRawRasterBand"')
     raw = re.sub("<SimpleSource>(.*)</SimpleSource>", r"\1", raw, flags=re.DOTALL)
     processed = (
@@ -960,6 +963,26 @@ def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its
     ):
         publish()
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+@pytest.mark.parametrize("ending", [".aux.xml", ".msk", ".ovr"])
+def test_match_pair__refuses_a_file_that_would_change_what_is_read_from_its_results(pair, ending):
+    folder, settings = pair
+    mine = folder / "out" / f"intervals.tif{ending}"
+    mine.parent.mkdir()
+    mine.write_text(NODATA)
+    with pytest.raises(SatIntervalsError, match=rf"{ending} changes what is read from .*intervals.tif: move it away"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert [file.name for file in mine.parent.iterdir()] == [mine.name]
+
+
+def test_output_writer__leaves_statistics_beside_its_place(tmp_path):
+    (tmp_path / "intervals.tif.aux.xml").write_text(STATISTICS)
+    with writer(tmp_path):
+        pass
+    (tmp_path / "intervals.tif.ovr").write_text("of an earlier one")
+    with pytest.raises(SatIntervalsError, match=r"\.ovr changes what is read from"), writer(tmp_path):
+        pass
 
 
 def killed_overwrite(pair, out, monkeypatch):
