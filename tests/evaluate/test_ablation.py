@@ -214,15 +214,19 @@ def test_commands__end_where_what_they_were_given_is_replaced_after_they_began(
     assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
 
 
-def test_evaluate_command__ends_where_a_truth_of_several_runs_is_replaced_between_them(folder, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["truth.tif", "meta.json"])
+def test_evaluate_command__ends_where_a_file_of_several_runs_is_replaced_between_them(
+    folder, tmp_path, monkeypatch, name
+):
     (pair,) = find_pairs([shutil.copytree(folder, tmp_path / "pair")])
     search = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
     runs = [tmp_path / "one", tmp_path / "other"]
     for out in runs:
         match_pair(pair.left, pair.right, out, search)
-    monkeypatch.setattr(disparity, "evaluate_run", written_again(pair.truth, disparity.evaluate_run))
+    file = pair.truth.with_name(name)
+    monkeypatch.setattr(disparity, "evaluate_run", written_again(file, disparity.evaluate_run))
     result = invoke("evaluate", *runs, "--quiet")
-    assert (result.exit_code, "truth.tif was replaced or changed while it was read" in result.stderr) == (1, True)
+    assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
 
 
 def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):

@@ -463,6 +463,17 @@ def test_make_truth__keeps_a_file_that_appears_after_the_check(relief, tmp_path,
     assert truth.read_text() == "mine"
 
 
+@pytest.mark.peer("pyogrio", "shapely")
+def test_point_file__refuses_a_format_that_may_be_read_from_other_files(tmp_path):
+    import pyogrio
+    import shapely
+
+    path, point = tmp_path / "p.dxf", shapely.to_wkb(shapely.points([[5.0, 43.0, 100.0]]))
+    pyogrio.raw.write(path, point, [], [], geometry_type="Point Z", crs="EPSG:4326", driver="DXF")
+    with pytest.raises(SatIntervalsError, match=r"p\.dxf has the format DXF, .*: convert it with ogr2ogr"):
+        point_files.PointFile(path, "EPSG:4326", Vertical(True, None))
+
+
 def test_watched_points__are_not_changed_by_reading_them(tmp_path):
     path, journal = tmp_path / "p.gpkg", tmp_path / "p.gpkg-wal"
     path.write_text("points")
