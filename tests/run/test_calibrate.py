@@ -147,6 +147,10 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     assert "existing folder" in one_line(invoke("calibrate", scene, "--output", tmp_path / "no" / "new.yaml"))
     assert "truth.tif" in one_line(invoke("calibrate", scene, "--output", scene / "truth.tif"))
     assert "is an input" in one_line(invoke("calibrate", scene, "--output", scene / "meta.json"))
+    own, given = tmp_path / "own.yaml", tmp_path / "given.yaml"
+    own.write_text(yaml.safe_dump(calibration_of(load_config({"interval": {"coverage": 0.9}})).model_dump(mode="json")))
+    given.write_text(yaml.safe_dump({"interval": {"coverage": 0.9, "calibration": str(own)}}))
+    assert "own.yaml is an input" in one_line(invoke("calibrate", scene, "--output", own, "--config", given))
     for text in ("tiles: {size: 512}\n", "# Settings with tiles of my own\n"):
         (tmp_path / "other.yaml").write_text(text)
         assert "was not made by" in one_line(invoke("calibrate", scene, "--output", tmp_path / "other.yaml"))

@@ -361,6 +361,16 @@ def test_plot__ends_where_an_image_is_replaced_meanwhile(tmp_path, monkeypatch, 
     assert (done.exit_code, f"{name} was replaced or changed" in done.stderr) == (1, True), done.stderr
 
 
+@pytest.mark.parametrize("name", ["overview.png", "coverage.png"])
+def test_plot__keeps_the_mask_that_it_is_given(run, name):
+    mask = run / name
+    assert invoke("plot", run, "--dpi", "40").exit_code == 0
+    before = mask.read_bytes()
+    done = invoke("plot", run, "--dpi", "40", "--mask", mask)
+    assert (done.exit_code, f"{name} is an input" in done.stderr) == (2, True)
+    assert mask.read_bytes() == before
+
+
 def test_plot__ends_where_a_surface_is_replaced_meanwhile(tmp_path, monkeypatch, unrendered):
     """Else dsm.png is of another run than the other pictures, or its caption of another surface than its maps."""
     out = write_run(tmp_path, *random_bands(40, 50)[:2])
