@@ -26,35 +26,10 @@ _LOCK = threading.Lock()
 
 # Formats of which GDAL takes missing data for zeros, does not list the files, or reads on after their end forever.
 UNCHECKED = {
-    *(
-        "AAIGrid",
-        "BAG",
-        "DAAS",
-        "EEDAI",
-        "ENVI",
-        "ESRIC",
-        "GPKG",
-        "GRASSASCIIGrid",
-        "GTI",
-        "HDF5",
-        "HDF5Image",
-        "ILWIS",
-    ),
-    *(
-        "ISG",
-        "KMLSUPEROVERLAY",
-        "MBTiles",
-        "MRF",
-        "PCIDSK",
-        "PCRaster",
-        "PLMOSAIC",
-        "Rasterlite",
-        "S102",
-        "S104",
-        "S111",
-    ),
-    *("SQLite", "STACIT", "STACTA", "WCS", "WMS", "WMTS", "netCDF"),
-}
+    "AAIGrid", "BAG", "DAAS", "EEDAI", "ENVI", "ESRIC", "GPKG", "GRASSASCIIGrid", "GTI", "HDF5", "HDF5Image", "ILWIS",
+    "ISG", "KMLSUPEROVERLAY", "MBTiles", "MRF", "PCIDSK", "PCRaster", "PLMOSAIC", "Rasterlite", "S102", "S104", "S111",
+    "SQLite", "STACIT", "STACTA", "WCS", "WMS", "WMTS", "netCDF",
+}  # fmt: skip
 # GDAL's prefixes of files on servers, with and without a URL in the form of a query.
 _REMOTE = "vsicurl/", "vsicurl?", "vsis3/", "vsigs/", "vsiaz/", "vsiadls/", "vsioss/", "vsiswift/", "vsiwebhdfs/"
 # With these, all files of an image are read as they are now, whatever the environment of a worker, and damage is an

@@ -93,7 +93,7 @@ class LocalFolder:
     def sizes(self) -> dict[str, int]:
         """See `Folder`."""
         found = {}
-        for place, folders, files in os.walk(self.path):
+        for place, folders, files in os.walk(self.path, onerror=_raise_unless_missing):
             for name in (*files, *(folder for folder in folders if os.path.islink(f"{place}/{folder}"))):
                 with suppress(FileNotFoundError):  # deleted by another process
                     found[os.path.relpath(f"{place}/{name}", self.path)] = os.lstat(f"{place}/{name}").st_size
@@ -296,6 +296,12 @@ class LocalFolder:
                     raise
                 finally:
                     os.close(folder)
+
+
+def _raise_unless_missing(error: OSError) -> None:
+    """Raise, since files of a folder that cannot be listed are not missing; it may have been deleted meanwhile."""
+    if not isinstance(error, (FileNotFoundError, NotADirectoryError)):
+        raise error
 
 
 def mark(run: str) -> str:

@@ -37,7 +37,7 @@ def drop(folder: Folder) -> None:
     if is_of_run(folder):
         # The manifest first, since the rest is invalid without it. The mark last, to recognise an unfinished removal.
         folder.delete(MANIFEST)
-        folder.delete_all(names.keys() - {MANIFEST, MADE}, [*FOLDERS, ARRAYS])
+        folder.delete_all(names - {MANIFEST, MADE}, [*FOLDERS, ARRAYS])
         folder.delete(MADE)
     folder.delete_if_empty()
 
@@ -66,8 +66,8 @@ def check_not_foreign(folder: Folder) -> None:
         )
 
 
-def _names(folder: Folder) -> dict[str, int]:
-    """Return the sizes of files named like those of a run, by name; with a manifest, only those of its tiles."""
+def _names(folder: Folder) -> set[str]:
+    """Return the names of files named like those of a run; with a manifest, only those of its tiles."""
     grid = None
     with suppress(StoreError):
         grid = grid_of(parsed(folder.read(MANIFEST) or "", folder), folder)
@@ -80,7 +80,7 @@ def _names(folder: Folder) -> dict[str, int]:
         row, column = (int(number) for number in found.groups() if number is not None)
         return grid is None or (row < grid.rows and column < grid.columns)
 
-    return {name: size for name, size in folder.sizes().items() if is_named(name)}
+    return {name for name in folder.sizes() if is_named(name)}
 
 
 def is_of_tile(name: str) -> bool:
