@@ -98,8 +98,8 @@ class Schedule:
         return self._last if step.wavefront == LAST else self._traces
 
     def __len__(self) -> int:
-        """Number of steps that have not ended."""
-        return len(self._open)
+        """Number of steps that have not ended; also those under way whose block has given the same meanwhile."""
+        return len(self._open) + sum(step not in self._open for step in self._under_way)
 
     def next(self) -> Step | None:
         """A step to start, None while all others wait for those under way."""

@@ -24,6 +24,7 @@ from sat_intervals.config import Cluster, ConfigError, calibration_of, load_conf
 from sat_intervals.config.pairs import PairOfBatch, read_batch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.kernels.sgm import LAST
 from sat_intervals.match.memory import fitted, tile_bytes
 from sat_intervals.raster import stamps, write_layer
 from sat_intervals.results import open_run
@@ -33,7 +34,7 @@ from sat_intervals.run.job import fitted_to_jobs, prepare
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_block
-from sat_intervals.run.workers import connected, parse_memory
+from sat_intervals.run.workers import Outcome, connected, parse_memory
 from sat_intervals.store.folder import LocalFolder
 
 
@@ -454,6 +455,34 @@ def test_match_jobs__yields_a_job_whose_tiles_another_worker_finishes_meanwhile(
             assert not failures
             ended.append(job)
     assert ended == jobs
+
+
+class SlowTraces:
+    """Workers that trace states of the last wavefront only when nothing else is left to do; see `Workers`."""
+
+    traced = 0
+
+    def outcomes(self, tasks):
+        others, slow = [], []
+        while True:
+            while len(others) < 4 and (task := next(tasks, None)) is not None:
+                (slow if task.label[1].wavefront == LAST else others).append(task)
+            if not others and not slow:
+                return
+            task = others.pop(0) if others else slow.pop()
+            self.traced += task.label[1].wavefront == LAST
+            yield Outcome(task.label, task.function(*task.arguments), None)
+
+
+def test_match_jobs__yields_a_job_once_when_nothing_of_it_is_under_way(images, tmp_path):
+    """Steps may still be traced whose blocks have been matched meanwhile: the job would be yielded again."""
+    settings = {"disparity": {"minimum": -18, "maximum": 40}, "tiles": {"size": 64}}
+    job, workers = prepare(images / "left1.tif", images / "right1.tif", tmp_path, settings), SlowTraces()
+    job.begin()
+    traced = [workers.traced for _ in match_jobs(workers, [job], lambda stage, done, total: None)]
+    assert traced == [workers.traced]
+    assert traced[0] > 0
+    assert not job.waiting()
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,20 @@ def test_schedule__takes_from_a_block_under_way_what_cannot_be_traced(block_fail
     assert not schedule
 
 
+def test_schedule__ends_after_what_a_block_has_given_while_it_was_traced():
+    schedule, late = Schedule(GRID, GRID, set().__contains__), []
+    while together := list(iter(schedule.next, None)):
+        late += [step for step in together if step.wavefront == LAST]
+        for step in together:
+            if step.wavefront != LAST:
+                schedule.ended(step)
+    assert late
+    while late:
+        assert len(schedule) == len(late)
+        schedule.ended(late.pop())
+    assert not schedule
+
+
 def test_schedule__of_blocks_traces_inside_each():
     turns = list(in_turn(Schedule(GRID, GRID, set().__contains__, together=2)))
     traced = [step for steps in turns for step in steps if step.wavefront in (0, 1, 2)]
