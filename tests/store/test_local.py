@@ -1,0 +1,32 @@
+"""A folder on a local disk that the machine cannot list."""
+
+import resource
+from contextlib import contextmanager
+
+import pytest
+
+from sat_intervals.store.local import LocalFolder
+
+
+@contextmanager
+def no_more_files():
+    """Let this process open no file for the block."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_sizes__of_a_folder_that_cannot_be_listed_are_not_none(tmp_path):
+    """Tiles would seem to be missing that are done."""
+    folder = LocalFolder(tmp_path)
+    folder.write("tile", "done")
+    with no_more_files(), pytest.raises(OSError, match="Too many open files"):
+        folder.sizes()
+    assert folder.sizes() == {"tile": 4}
+
+
+def test_sizes__of_a_folder_that_was_deleted_are_none(tmp_path):
+    assert LocalFolder(tmp_path / "deleted").sizes() == {}
