@@ -87,7 +87,10 @@ class LocalFolder:
 
     def read_all(self, folder: str) -> dict[str, str]:
         """See `Folder`."""
-        files = (self.path / folder).glob("[!.]*.json")
+        names: list[str] = []
+        with suppress(FileNotFoundError, NotADirectoryError):
+            names = os.listdir(self.path / folder)
+        files = [self.path / folder / name for name in names if name.endswith(".json") and not name.startswith(".")]
         return {file.stem: file.read_text(errors="replace") for file in files if file.is_file()}
 
     def sizes(self) -> dict[str, int]:
