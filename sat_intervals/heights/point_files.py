@@ -14,13 +14,13 @@ from sat_intervals.raster.identity import watched
 
 # Bytes in which GDAL looks for what a file is.
 _HEAD = 4096
-# Endings of files that are read with others: of Shapefiles, MapInfo.
-_WITH = ".dbf", ".shx", ".prj", ".cpg", ".dat", ".map", ".id", ".mid"
+# Endings of files that are read with a Shapefile.
+_WITH = ".dbf", ".shx", ".prj", ".cpg"
 # Formats of vectors in one file, or in those with `_WITH`.
 _DRIVERS = {
-    *("CSV", "ESRI Shapefile", "FlatGeobuf", "GML", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "KML", "LIBKML"),
-    *("MapInfo File", "ODS", "Parquet", "SQLite", "TopoJSON", "XLSX"),
-}
+    "CSV", "ESRI Shapefile", "ESRIJSON", "FlatGeobuf", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "JSONFG", "KML",
+    "LIBKML", "ODS", "Parquet", "SQLite", "TopoJSON", "XLSX",
+}  # fmt: skip
 # Points read at a time.
 _PART = 500_000
 # Names of columns, in lower case; the first found counts. Those of ICESat-2 products are among them.
@@ -207,7 +207,8 @@ def _crs_of_vectors(path: Path) -> str | None:
         raise _unreadable(path, error) from error
     if info["driver"] not in _DRIVERS:
         raise SatIntervalsError(
-            f"{path} has the format {info['driver']}, which may be read from other files: convert it with ogr2ogr"
+            f"{path} has the format {info['driver']}, of which GDAL may read more files: convert it to GeoPackage with "
+            "ogr2ogr"
         )
     crs = info["crs"]
     return None if crs is None else str(crs)

@@ -405,11 +405,11 @@ def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_
     assert not (tmp_path / "truth.tif").exists()
 
 
-@pytest.mark.parametrize("name", ["p.dbf", "p.map", "p.gpkg-wal"])
+@pytest.mark.parametrize("name", ["p.dbf", "p.gpkg-wal"])
 def test_make_truth__ends_where_another_file_of_the_points_is_replaced_meanwhile(relief, tmp_path, monkeypatch, name):
     """Else the truth would mix two sets of heights."""
     out, files, _ = relief
-    points = tmp_path / {"p.dbf": "p.shp", "p.map": "p.tab", "p.gpkg-wal": "p.gpkg"}[name]
+    points = tmp_path / {"p.dbf": "p.shp", "p.gpkg-wal": "p.gpkg"}[name]
     write_csv(points, places(hills, 1500))
     (tmp_path / name).write_text("before")
     monkeypatch.setattr(point_files, "_crs_of_vectors", point_files._crs_of_table)
