@@ -87,7 +87,7 @@ def evaluate(
 
     check_arguments = watched_arguments(folders, judging.config_file)
     sources = _sources(folders, truth, mask, cost)
-    check_rasters = watched_pairs([source.pair for source in sources if source.pair], *_truths(sources))
+    check_rasters = watched_pairs([source.pair for source in sources if source.pair], *_truths(sources, group))
     configs = _configs(sources, judging, cost)
     judge = partial(evaluate_run, tolerance=judging.tolerance, remove_bias=remove_bias)
     scenes = [
@@ -148,13 +148,16 @@ def _sources(
     ]
 
 
-def _truths(sources: list[_Source]) -> list[Path | None]:
+def _truths(sources: list[_Source], group: str | None) -> list[Path | None]:
     """Return truths and masks that are given, and what is read beside the left images of runs."""
     from sat_intervals.results import open_run
 
-    truths = [open_run(source.name).truth_beside for source in sources if not source.pair]
-    beside = [file for truth in truths for file in (truth, truth.with_name("meta.json"))]
-    return [*beside, *(file for source in sources for file in (source.truth, source.mask))]
+    found = [file for source in sources for file in (source.truth, source.mask)]
+    for source in sources:
+        if not source.pair:
+            beside = open_run(source.name).truth_beside
+            found += [None if source.truth else beside, None if group else beside.with_name("meta.json")]
+    return found
 
 
 def _configs(sources: list[_Source], judging: Judging, costs: tuple[str, ...]) -> "list[Config | None]":

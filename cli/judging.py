@@ -96,12 +96,14 @@ def judging_options(command: Command) -> Command:
 def watched_arguments(pairs: Iterable[Path], settings: Path | None) -> Callable[[], None]:
     """Return a function that raises if pairs, settings or files that these name are not those of now.
 
-    Call this before they are read. Of a pair, its CSV file or meta.json is meant, not its images.
+    Call this before they are read. Of a pair, its CSV file or meta.json is meant, not its images; of a run, its files.
     """
     from sat_intervals.raster import watched_rasters
     from sat_intervals.raster.identity import watched
+    from sat_intervals.run.output import OUTPUTS
 
-    check_files = watched([settings, *(pair / "meta.json" if pair.is_dir() else pair for pair in pairs)])
+    files = [pair / name if pair.is_dir() else pair for pair in pairs for name in ("meta.json", *OUTPUTS)]
+    check_files = watched([settings, *files])
     check_named = watched_rasters(named_by(settings))  # one of ranges may be virtual
 
     def check() -> None:

@@ -18,7 +18,7 @@ from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, run_files
 from sat_intervals.raster.identity import compared
 from sat_intervals.run.copying import assemble_files
-from sat_intervals.run.inputs import appeared_mask
+from sat_intervals.run.inputs import appeared_file
 from sat_intervals.run.job import Job
 from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.scale import checked_scale
@@ -103,7 +103,7 @@ def assemble(
 
 
 def _check_content(job: Job, name: str | None) -> None:
-    """Raise if the content of an input has changed or a mask file has appeared.
+    """Raise if the content of an input has changed or a file beside it has appeared.
 
     If no time of the input has changed, the tiles are deleted, since they cannot be trusted.
     """
@@ -114,9 +114,9 @@ def _check_content(job: Job, name: str | None) -> None:
             f"{name} was changed during the run without a change of its modification time, as through a memory map: "
             "the tiles of the run are deleted: rerun the command when the file is complete"
         )
-    if mask := appeared_mask(job.left, job.right, job.files):
+    if file := appeared_file(job.left, job.right, job.files):
         job.store.remove()
-        raise RemovedTilesError(f"{mask} appeared during the run, whose tiles are deleted: rerun the command")
+        raise RemovedTilesError(f"{file} appeared during the run, whose tiles are deleted: rerun the command")
 
 
 def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> None:

@@ -12,7 +12,7 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.raster import Image, is_replaced, other_files
+from sat_intervals.raster import Image, is_replaced, other_files, read_files
 from sat_intervals.raster.identity import identity
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
@@ -78,10 +78,18 @@ def _with_others(name: str, identified: Callable[[str], dict[str, Any]]) -> dict
     return {**identified(name), "files": [identified(file) for file in other_files(name)]}
 
 
-def appeared_mask(left: Image, right: Image, files: Mapping[str, Any]) -> str | None:
-    """Return the first mask file beside an image or its sources that is not among the inputs; None if none is."""
-    read = (file for image in (left, right) if image.use_mask for file in other_files(image.path))
-    return next((file for file in read if file.endswith(".msk") and file not in files), None)
+def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | None:
+    """Return a mask file or ``.aux.xml`` beside images, masks or their sources that is not an input; None if none is.
+
+    Beside an image without a mask it does not matter: the image is read as it was when it was opened.
+    """
+    for image in (left, right):
+        for name in filter(None, (image.path, image.mask)):
+            for file in read_files(name):
+                matters = image.use_mask or not file.startswith(name)
+                if matters and file.lower().endswith((".msk", ".aux.xml")) and file not in files:
+                    return file
+    return None
 
 
 def _weights_identity(cost: Mccnn) -> dict[str, Any]:

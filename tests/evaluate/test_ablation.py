@@ -214,7 +214,7 @@ def test_commands__end_where_what_they_were_given_is_replaced_after_they_began(
     assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
 
 
-@pytest.mark.parametrize("name", ["truth.tif", "meta.json"])
+@pytest.mark.parametrize("name", ["pair/truth.tif", "pair/meta.json", "other/intervals.tif", "other/run.json"])
 def test_evaluate_command__ends_where_a_file_of_several_runs_is_replaced_between_them(
     folder, tmp_path, monkeypatch, name
 ):
@@ -223,10 +223,27 @@ def test_evaluate_command__ends_where_a_file_of_several_runs_is_replaced_between
     runs = [tmp_path / "one", tmp_path / "other"]
     for out in runs:
         match_pair(pair.left, pair.right, out, search)
-    file = pair.truth.with_name(name)
-    monkeypatch.setattr(disparity, "evaluate_run", written_again(file, disparity.evaluate_run))
+    monkeypatch.setattr(disparity, "evaluate_run", written_again(tmp_path / name, disparity.evaluate_run))
     result = invoke("evaluate", *runs, "--quiet")
     assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
+
+
+def test_evaluate_command__does_not_mind_files_that_it_does_not_read(folder, tmp_path, monkeypatch):
+    (pair,) = find_pairs([shutil.copytree(folder, tmp_path / "pair")])
+    match_pair(
+        pair.left, pair.right, tmp_path / "run", {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
+    )
+    shutil.copy(folder / "truth.tif", tmp_path / "given.tif")
+
+    def rewritten(*arguments, **named):
+        pair.truth.write_text("another truth")
+        pair.truth.with_name("meta.json").write_text("{}")
+        return evaluated(*arguments, **named)
+
+    evaluated = disparity.evaluate_run
+    monkeypatch.setattr(disparity, "evaluate_run", rewritten)
+    result = invoke("evaluate", tmp_path / "run", "--truth", tmp_path / "given.tif", "--group", "all")
+    assert result.exit_code == 0, result.output
 
 
 def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):
