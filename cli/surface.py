@@ -154,7 +154,9 @@ def _check(out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path],
     """Raise for what the later steps cannot use, before hours of matching."""
     from sat_intervals.heights.dsm import checked_cells, surface_tags
     from sat_intervals.heights.sensors import Sensors
+    from sat_intervals.raster import check_place
 
+    check_place(out / "points.tif")
     given = (cells[name] for name in ("resolution", "crs", "radius", "geoid"))
     _, cell, _, radius = checked_cells(out / "dsm.tif", *given)
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)

@@ -21,6 +21,7 @@ from sat_intervals.raster import (
     OutputWriter,
     Projection,
     check_as_made,
+    check_place,
     geoid_grid,
     is_surface,
     north_up,
@@ -150,6 +151,7 @@ def checked_cells(
     if path.exists() and not is_surface(path):
         raise SatIntervalsError(f"{path} exists and is not a surface model: move it away")
     check_as_made(path)
+    check_place(path)
     grid = None
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)

@@ -30,6 +30,7 @@ from sat_intervals.raster import (
     Vertical,
     check_as_made,
     check_made_by,
+    check_place,
     replaceable,
     truth_file,
     utm_of,
@@ -123,6 +124,7 @@ def make_truth(
     there = replaceable(path.parent, [truth_file(path.name)])
     check_made_by(path, "reference", "REFERENCE")
     check_as_made(path)
+    check_place(path)
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     check_rasters = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])
     check_points = watched_points(reference.path) if reference.is_points else lambda: None

@@ -14,6 +14,7 @@ from sat_intervals.raster.images import (
     is_replaced,
     open_image,
     other_files,
+    read_files,
     watched_images,
     watched_rasters,
 )
@@ -38,6 +39,7 @@ from sat_intervals.raster.layers import (
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
 from sat_intervals.raster.publishing import OutputError, stamps
+from sat_intervals.raster.seal import check_place
 from sat_intervals.raster.space import check_space, file_bytes, part_bytes
 from sat_intervals.raster.surfaces import (
     check_reference,
@@ -74,6 +76,7 @@ __all__ = [
     "check_made_by",
     "check_marked",
     "check_pair",
+    "check_place",
     "check_reference",
     "check_space",
     "codec_versions",
@@ -92,6 +95,7 @@ __all__ = [
     "other_files",
     "part_bytes",
     "put_back",
+    "read_files",
     "read_heights",
     "read_known",
     "read_layers",

@@ -339,20 +339,28 @@ def check_not_replaced(
     SatIntervalsError
         Names the first output that is a pipe, socket or device, or the first input that would be lost.
     """
-    outputs, parents = list(outputs), [Path(folder).resolve() for folder in folders]
+    written: dict[object, str | Path] = {}  # by what identifies them: a batch may have thousands
     for output in outputs:
         check_regular(output, "move it away or choose another output")
+        written |= dict.fromkeys(_identifiers(output), output)
+    parents = {os.path.realpath(folder) for folder in folders}
     for name in inputs:
         file = name if name is None or os.path.exists(name) else _local_file(os.fspath(name))
         if file is None:
             continue
-        place = Path(file).resolve()
-        for output in outputs:
-            is_same = os.path.exists(output) and os.path.samefile(file, output)
-            if is_same or place == Path(output).resolve():
-                raise SatIntervalsError(f"{name} is an input, and {output} would be written: choose another output")
-        for folder in parents:
-            if folder in place.parents:
+        for found in _identifiers(file) & written.keys():
+            raise SatIntervalsError(f"{name} is an input, and {written[found]} would be written: choose another output")
+        for folder in map(str, Path(os.path.realpath(file)).parents):
+            if folder in parents:
                 raise SatIntervalsError(
                     f"{name} is an input inside {folder}, whose files are written and deleted: choose another output"
                 )
+
+
+def _identifiers(file: str | Path) -> set[object]:
+    """Return the path of a file without links and, if it exists, what it has in common with its hard links."""
+    found: set[object] = {os.path.realpath(file)}
+    with suppress(OSError):
+        status = os.stat(file)
+        found.add((status.st_dev, status.st_ino))
+    return found

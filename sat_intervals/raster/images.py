@@ -17,7 +17,7 @@ from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError,
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import stamp_of, watched
-from sat_intervals.raster.seal import check_seal, has_statistics_only
+from sat_intervals.raster.seal import check_seal, is_read
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
@@ -141,7 +141,9 @@ def open_image(
             alpha=alphas[0] if alphas else None,
             mask=None if mask is None else _absolute(mask),
             georeferencing=Georeferencing.of(dataset),
-            beside=tuple(file for file in dataset.files if file.endswith((".msk", ".aux.xml")) and _is_read(file)),
+            beside=tuple(
+                file for file in dataset.files if file.lower().endswith((".msk", ".aux.xml")) and is_read(file)
+            ),
             stamps=stamps,
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
@@ -344,7 +346,7 @@ def _may_have_others(name: str) -> bool:
 
 def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:
     """Return what `watched` returns, for rasters and their `read_files`, none of which may appear either."""
-    names = [str(file) for file in files if file is not None]
+    names = {str(file) for file in files if file is not None}
     before = {name: read_files(name) for name in names}
     check_files = watched(file for name in names for file in before[name])
 
@@ -375,11 +377,7 @@ def watched_images(images: Iterable[Image], *others: str | Path | None) -> Calla
 
 def read_files(name: str) -> list[str]:
     """Return a raster and its `other_files`, but no ``.aux.xml`` that a program wrote which only showed it."""
-    return [name, *filter(_is_read, other_files(name))]
-
-
-def _is_read(file: str) -> bool:
-    return not (file.endswith(".aux.xml") and has_statistics_only(Path(file)))
+    return [name, *filter(is_read, other_files(name))]
 
 
 def stamps_of(name: str) -> dict[str, str | None]:

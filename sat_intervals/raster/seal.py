@@ -7,6 +7,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -18,8 +19,10 @@ _LINE, _ZEROS = b"SAT_INTERVALS_CRC_32=", b"00000000"
 _SEAL = re.compile(_LINE + rb"([0-9a-f]{8})\n")
 # Bytes of a file among which the line is.
 _BEGINNING = 1024
-# Endings of files that GDAL reads with a raster.
-_BESIDE = ".aux.xml", ".msk", ".ovr"
+# Endings, in any case, of files that GDAL reads with a raster: after its whole name, and instead of its own.
+_BESIDE, _OF_STEM = (".aux.xml", ".msk", ".ovr"), (".rpb", "_rpc.txt")
+# Those that it reads with a raster without a transform of its own.
+_PLACES = ".tfw", ".tifw", ".pgw", ".pngw", ".wld", ".tab"
 # Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes. Names of bands are repeated.
 _STATISTICS = {
     *("PAMDataset", "PAMRasterBand", "Description", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax"),
@@ -82,7 +85,7 @@ def _checksums(path: str | Path) -> tuple[int, int] | None:
 def check_beside(path: str | Path, files: Iterable[str]) -> None:
     """Raise if ``files`` next to one of our rasters change what GDAL reads.
 
-    These are masks, overviews, and an ``.aux.xml`` with more than statistics.
+    These are masks, overviews, sensor models, world files, and an ``.aux.xml`` with more than statistics.
 
     Raises
     ------
@@ -90,13 +93,27 @@ def check_beside(path: str | Path, files: Iterable[str]) -> None:
         Names the first such file.
     """
     for file in files:
-        if Path(file) != Path(path) and not (file.endswith(".aux.xml") and has_statistics_only(Path(file))):
+        if Path(file) != Path(path) and is_read(file):
             raise SatIntervalsError(f"{file} changes what is read from {path}: move it away")
 
 
-def check_place(path: Path) -> None:
-    """Raise if files next to the place of a raster would change what GDAL reads from it, see `check_beside`."""
-    check_beside(path, [file for ending in _BESIDE if os.path.lexists(file := f"{path}{ending}")])
+def check_place(path: Path, *, is_placed: bool = True) -> None:
+    """Raise if files next to the place of a raster would change what GDAL reads from it, see `check_beside`.
+
+    ``is_placed`` says whether the raster has a transform of its own.
+    """
+    of_stem = _OF_STEM if is_placed else (*_OF_STEM, *_PLACES)
+    names = {f"{path.name}{ending}".lower() for ending in _BESIDE}
+    names |= {f"{path.stem}{ending}".lower() for ending in of_stem}
+    there: list[str] = []
+    with suppress(OSError):  # GDAL cannot list it either
+        there = os.listdir(path.parent)
+    check_beside(path, sorted(str(path.parent / name) for name in there if name.lower() in names))
+
+
+def is_read(file: str) -> bool:
+    """Return whether a file of a raster decides what is read: an ``.aux.xml`` that a program wrote may not."""
+    return not (file.endswith(".aux.xml") and has_statistics_only(Path(file)))
 
 
 def has_statistics_only(file: Path) -> bool:

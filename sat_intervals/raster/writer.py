@@ -17,6 +17,7 @@ from rasterio.io import DatasetWriter
 from rasterio.shutil import copy
 from rasterio.windows import Window as RasterioWindow
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
@@ -104,12 +105,7 @@ class OutputWriter:
         self._is_published = False
 
     def __enter__(self) -> Self:
-        for file in self._files:
-            place = self._folder / file.name
-            if place.exists() and not place.is_file():
-                raise OutputError(f"{place} cannot be written: it is not a regular file: choose another name or folder")
-            if file.driver == "COG":
-                check_place(place)
+        self._check_places()
         with self._failing(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
         self._check_hidden()
@@ -140,6 +136,16 @@ class OutputWriter:
         is_ours = (self._hidden / _MADE).exists() or LocalFolder(self._hidden).has_lock()
         if not is_ours and (foreign := next(self._unfinished(), None)):
             raise OutputError(f"{foreign} was not written by sat-intervals: move {self._hidden} away")
+
+    def _check_places(self) -> None:
+        """Raise if something is in the place of a file, or beside it, that must not be there."""
+        for place in (self._folder / file.name for file in self._files):
+            if place.exists() and not place.is_file():
+                raise OutputError(f"{place} cannot be written: it is not a regular file: choose another name or folder")
+            try:
+                check_place(place, is_placed=self._georeferencing.transform is not None)
+            except SatIntervalsError as error:
+                raise OutputError(str(error)) from error
 
     def _check_folders(self) -> None:
         """Raise if folders of temporary files are not folders, are links, or are not those that were made."""

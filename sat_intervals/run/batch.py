@@ -79,8 +79,8 @@ def match_batch(
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
     common = load_config(sections, overrides, file=file)
     own = {pair.name: {**(overrides or {}), **_merged(overrides or {}, pair.settings)} for pair in pairs}
-    check_named = watched_rasters(file for settings in (sections, *own.values()) for file in named_files(settings))
-    _check_not_replaced(pairs, [file, common.disparity.grid], out, overwrite)
+    checks = _watched(sections, overrides, pairs)
+    _check_not_replaced(pairs, [file, *named_files(sections), *named_files(overrides)], out, overwrite)
     cluster = common.cluster
     _raise_file_limit()
     with ExitStack() as stack:
@@ -95,9 +95,9 @@ def match_batch(
             progress("pairs", number, len(pairs))
             try:
                 settings = load_config(sections, own[pair.name], preset_wins=True, file=file)
-                before = None if overwrite else _done_before(pair, out, settings, check_named)
+                before = None if overwrite else _done_before(pair, out, settings, checks[pair.name])
                 if before is None:
-                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find, check_named)
+                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find, checks[pair.name])
                 else:
                     tidy(out / pair.name, keep_tiles, cluster.store)
                     note({pair.name: {"state": "done before", **before}})
@@ -109,6 +109,22 @@ def match_batch(
             if (how := _finished(pair, report.states[pair.name], finish)) is not report.states[pair.name]:
                 note({pair.name: how})
     return report.states
+
+
+def _watched(
+    sections: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None, pairs: Sequence[PairOfBatch]
+) -> dict[str, Callable[[], None]]:
+    """Return functions by pair that raise if a file that its settings name, or those of all pairs, is not that of now.
+
+    Pairs share calibrations and ranges.
+    """
+    check_common = watched_rasters([*named_files(sections), *named_files(overrides)])
+
+    def check_both(check_own: Callable[[], None]) -> None:
+        check_common()
+        check_own()
+
+    return {pair.name: partial(check_both, watched_rasters(named_files(pair.settings))) for pair in pairs}
 
 
 class _Report:
@@ -139,15 +155,16 @@ def _check_not_replaced(
     pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path, overwrite: bool
 ) -> None:
     """Raise if an input of any pair, or another file that is read, is an output of any pair, or two pairs share one."""
-    names = {(out / pair.name).resolve(): pair.name for pair in pairs}
-    if shared := [pair.name for pair in pairs if names[(out / pair.name).resolve()] != pair.name]:
-        raise SatIntervalsError(f"{out / shared[0]} is the folder of another pair, too: remove the link")
+    folders: dict[str, Path] = {}
+    for folder in (out / pair.name for pair in pairs):
+        if (other := folders.setdefault(os.path.realpath(folder), folder)) != folder:
+            raise SatIntervalsError(f"{other} and {folder} are the same folder: remove the link")
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
     images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
-    files = [name for name in images if name and os.path.isfile(name)]
-    sensors = [name for pair in pairs for name in pair.sensors or ()]
+    named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
+    files = {str(name) for name in (*others, *images, *named) if name and os.path.isfile(name)}
     check_not_replaced(
-        [*others, *sensors, *(file for name in files for file in (name, *other_files(name)))],
+        [file for name in sorted(files) for file in (name, *other_files(name))],
         [out / REPORT, *(folder / name for folder in written for name in OUTPUTS)],
         [folder / "tiles" for folder in written],
     )

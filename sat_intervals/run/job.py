@@ -25,6 +25,7 @@ from sat_intervals.raster import (
     file_bytes,
     open_image,
     part_bytes,
+    read_files,
     run_files,
 )
 from sat_intervals.raster.identity import check_not_replaced, check_unchanged
@@ -260,7 +261,8 @@ def prepare(
     checked_pair(left, right, config)
     config = fitted_to_jobs(config)
     check_tiles(config, region)
-    read = [*files, config.disparity.grid, inputs["weights"]["path"] if "weights" in inputs else None]
+    ranges = config.disparity.grid
+    read = [*files, *(read_files(ranges) if ranges else ()), inputs["weights"]["path"] if "weights" in inputs else None]
     run = digest(_manifest(config, inputs, region, marked))
     elsewhere = _elsewhere(config.cluster.store, home, "-".join(filter(None, (pair, run))))
     # folders of runs in a local store: their names end with a digest

@@ -12,6 +12,7 @@ from sat_intervals.match.search_range import Found, with_range
 from sat_intervals.raster import (
     Image,
     check_made_by,
+    check_place,
     open_image,
     other_files,
     read_shape,
@@ -68,12 +69,13 @@ def replaceable_ranges(path: Path, left: Image, right: Image) -> dict[str, str]:
     Raises
     ------
     SatIntervalsError
-        It is a file of the images, or was not made by this tool.
+        It is a file of the images, was not made by this tool, or GDAL would read another one with it.
     """
     there = stamps(path.parent, [path.name])
     names = [name for image in (left, right) for name in (image.path, image.mask) if name]
     check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
     check_made_by(path, "range", _OF)
+    check_place(path, is_placed=left.georeferencing.transform is not None)
     return there
 
 

@@ -12,6 +12,7 @@ import rasterio
 from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid, sensor_words
 from finished import MAXIMUM, MINIMUM, write_run
 from helpers import invoke, write_pair
+from rasterio.shutil import copy
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
@@ -570,6 +571,47 @@ def test_batch_command__refuses_an_input_that_the_surface_of_another_pair_would_
     result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out")
     assert (result.exit_code, "points.tif would be written" in result.stderr) == (2, True)
     assert points.read_bytes() == before
+
+
+def test_batch_command__refuses_a_grid_that_a_run_would_replace(tmp_path):
+    write_pair(tmp_path, make_scene(60, 80, seed=4))
+    files = cameras(tmp_path, 60, 80)
+    (tmp_path / "out" / "a").mkdir(parents=True)
+    result = shutil.move(files[2], tmp_path / "out" / "a" / "intervals.tif")
+    with rasterio.open(result) as file:
+        copy(file, files[2], driver="VRT")
+    sensors = ",".join(file.name for file in files)
+    columns = "name,left,right,minimum,maximum,left_model,right_model,left_grid,right_grid,resolution"
+    (tmp_path / "pairs.csv").write_text(f"{columns}\na,left.tif,right.tif,0,9,{sensors},1\n")
+    ended = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out", "--overwrite")
+    assert (ended.exit_code, "intervals.tif is an input" in ended.stderr) == (2, True), ended.output
+    assert result.exists()
+
+
+@pytest.mark.parametrize("name", ["points.tif.msk", "dsm.tif.ovr"])
+def test_surface_command__refuses_a_file_beside_its_results_before_it_matches(tmp_path, name):
+    write_pair(tmp_path, make_scene(60, 80, seed=4))
+    files = cameras(tmp_path, 60, 80)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    result = invoke("surface", *images, tmp_path / "out", *sensor_words(files), "--disparity", 0, 9, "--resolution", 1)
+    assert (result.exit_code, f"{name} changes what is read from" in result.stderr) == (2, True), result.output
+    assert [file.name for file in (tmp_path / "out").iterdir()] == [name]
+
+
+def test_surface_command__keeps_the_source_of_its_grid(tmp_path):
+    write_pair(tmp_path, make_scene(60, 80, seed=4))
+    files, out = cameras(tmp_path, 60, 80), tmp_path / "out"
+    out.mkdir()
+    shutil.copy(tmp_path / "left.tif", out / "dsm.tif")
+    with rasterio.open(out / "dsm.tif") as file:
+        copy(file, tmp_path / "like.vrt", driver="VRT")
+    images = tmp_path / "left.tif", tmp_path / "right.tif"
+    words = "--disparity", 0, 9, "--grid-like", tmp_path / "like.vrt"
+    result = invoke("surface", *images, out, *sensor_words(files), *words)
+    assert (result.exit_code, "dsm.tif is an input" in result.stderr) == (2, True), result.output
+    assert [file.name for file in out.iterdir()] == ["dsm.tif"]
 
 
 def test_surface_command__ends_where_a_grid_is_replaced_while_it_matches(tmp_path, monkeypatch):

@@ -229,10 +229,45 @@ def test_match_batch__ends_pairs_whose_files_were_replaced_since_the_first_one(i
     assert f"{name} was replaced or changed while it was read: rerun the command" in states["pair2"]["error"]
 
 
+def test_match_batch__takes_no_pair_for_done_whose_ranges_were_replaced_since_it_began(images, tmp_path, monkeypatch):
+    """Else the pairs of a batch could have different ranges."""
+    write_ranges(tmp_path / "ranges.tif", images / "left1.tif", -9)
+    (pair,) = read_batch(rows(images))[:1]
+    settings = {"disparity": {"minimum": -18, "maximum": 40, "grid": str(tmp_path / "ranges.tif")}}
+    assert match_batch([pair], tmp_path / "out", settings)[pair.name]["state"] == "done"
+    found = batch.report_before
+
+    def and_replaced(*arguments):
+        report = found(*arguments)
+        shutil.copy(tmp_path / "ranges.tif", tmp_path / "new")
+        (tmp_path / "new").replace(tmp_path / "ranges.tif")
+        return report
+
+    monkeypatch.setattr(batch, "report_before", and_replaced)
+    state = match_batch([pair], tmp_path / "out", settings)[pair.name]
+    assert (state["state"], "ranges.tif was replaced or changed while it was read" in state["error"]) == (
+        "failed",
+        True,
+    )
+
+
+@pytest.mark.parametrize("of_row", [False, True])
+def test_match_batch__keeps_a_result_that_is_the_source_of_ranges(images, tmp_path, of_row):
+    (pair,) = read_batch(rows(images))[:1]
+    result = tmp_path / "out" / pair.name / "intervals.tif"
+    assert match_batch([pair], tmp_path / "out")[pair.name]["state"] == "done"
+    with rasterio.open(result) as file:
+        copy(file, tmp_path / "ranges.vrt", driver="VRT")
+    ranges = {"disparity": {"grid": str(tmp_path / "ranges.vrt")}}
+    given = replace(pair, settings={**pair.settings, **ranges}) if of_row else pair
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif is an input, and .*intervals.tif would be written"):
+        match_batch([given], tmp_path / "out", {} if of_row else ranges, overwrite=True)
+
+
 def test_match_batch__refuses_a_folder_that_is_a_link_to_that_of_another_pair(images, tmp_path):
     (tmp_path / "pair1").mkdir()
     (tmp_path / "pair2").symlink_to("pair1")
-    with pytest.raises(SatIntervalsError, match=r"pair1 is the folder of another pair, too: remove the link"):
+    with pytest.raises(SatIntervalsError, match=r"pair1 and .*pair2 are the same folder: remove the link"):
         match_batch(read_batch(rows(images)), tmp_path)
     assert not any((tmp_path / "pair1").iterdir())
 

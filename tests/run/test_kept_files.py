@@ -12,6 +12,7 @@ import sys
 import threading
 import zipfile
 from contextlib import suppress
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ import rasterio
 from finished import random_bands, write_run
 from helpers import COMMAND, OUTPUTS, PLACE, hashes, invoke, write_pair
 from matplotlib.figure import Figure
+from rasterio.shutil import copy
 
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
@@ -52,7 +54,7 @@ from sat_intervals.raster import (
 )
 from sat_intervals.raster import writer as raster_writer
 from sat_intervals.raster.files import File
-from sat_intervals.raster.identity import identity
+from sat_intervals.raster.identity import check_not_replaced, identity
 from sat_intervals.results import Run, open_results, open_run
 from sat_intervals.run import assemble as run_assemble
 from sat_intervals.run import copying, search_range, source, strips
@@ -162,17 +164,18 @@ def test_match_pair__ends_where_an_input_is_replaced_and_mixes_nothing(pair, nam
     assert hashes(folder / "out") == hashes(folder / "once")
 
 
-def test_read_window__ends_where_a_mask_cannot_be_found_any_more(pair):
+@pytest.mark.parametrize("name", ["left.tif.msk", "left.tif.MSK"])
+def test_read_window__ends_where_a_mask_cannot_be_found_any_more(pair, name):
     """As on a server that is busy: GDAL would read the image without its mask."""
     folder, _ = pair
     profile = {"driver": "GTiff", "height": 80, "width": 100, "count": 1, "dtype": "uint8"}
-    with rasterio.open(folder / "left.tif.msk", "w", **profile) as mask:
+    with rasterio.open(folder / name, "w", **profile) as mask:
         mask.update_tags(INTERNAL_MASK_FLAGS_1=2)  # for all bands
     image = open_image(folder / "left.tif")
     assert image.use_mask
     assert read_window(image, Window(0, 0, 8, 8))[1].all()
-    (folder / "left.tif.msk").unlink()
-    with pytest.raises(RunError, match=r"left.tif.msk was there when .*left.tif was opened, but cannot be found now"):
+    (folder / name).unlink()
+    with pytest.raises(RunError, match=rf"{name} was there when .*left.tif was opened, but cannot be found now"):
         read_window(image, Window(0, 0, 8, 8))
 
 
@@ -314,7 +317,8 @@ def test_other_files__are_those_of_warping_too(pair):
     positions = f'<Metadata domain="GEOLOCATION"><MDI key="X_DATASET">{folder / "left.tif"}</MDI></Metadata>'
     (folder / "warped.vrt").write_text(text.replace("</VRTDataset>", f"{positions}</VRTDataset>"))
     assert other_files(str(folder / "warped.vrt")) == [str(folder / "left.tif"), str(folder / "mask.tif")]
-    for other in (text.replace("<VRTDataset", '<VRTDataset xmlns="urn:x"'), text.replace("Filename", "FILENAME")):
+    others = {"<VRTDataset": '<VRTDataset xmlns="urn:x"', "Filename": "FILENAME", "relativeToVRT": "RELATIVETOVRT"}
+    for other in (text.replace(*spelling) for spelling in others.items()):
         (folder / "other.vrt").write_text(other)
         assert other_files(str(folder / "other.vrt")) == [str(folder / "mask.tif")]
     raw = text.replace('band="1"', 'band="1" subClass="VRTRawRasterBand"')
@@ -348,21 +352,35 @@ def test_open_image__refuses_formats_of_which_gdal_does_not_notice_missing_data_
         open_image(path)
 
 
-def test_match_pair__ends_where_a_mask_of_a_source_appears(pair, monkeypatch):
+MASK_BAND = (
+    "{}</SimpleSource></VRTRasterBand><MaskBand><VRTRasterBand dataType='Byte'><SimpleSource>{}"
+    "<SourceBand>mask,1</SourceBand></SimpleSource></VRTRasterBand></MaskBand></VRTDataset>"
+)
+USED_MASK = (
+    "<NoDataValue>0</NoDataValue><ComplexSource>{}<UseMaskBand>true</UseMaskBand></ComplexSource></VRTRasterBand>"
+    "</VRTDataset>"
+)
+
+
+@pytest.mark.parametrize("band", ["<SimpleSource>" + MASK_BAND, USED_MASK])
+@pytest.mark.parametrize("name", ["left.tif.msk", "left.tif.MSK", "left.tif.aux.xml"])  # GDAL reads all
+def test_match_pair__ends_where_a_mask_of_a_source_appears(pair, monkeypatch, band, name):
     folder, settings = pair
-    band = f"<SimpleSource><SourceFilename>{folder / 'left.tif'}</SourceFilename><SourceBand>{{}}</SourceBand>"
-    band += "</SimpleSource></VRTRasterBand>"
+    source = f"<SourceFilename>{folder / 'left.tif'}</SourceFilename>"
     (folder / "left.vrt").write_text(
-        f'<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType="UInt16" band="1">{band.format(1)}'
-        f'<MaskBand><VRTRasterBand dataType="Byte">{band.format("mask,1")}</MaskBand></VRTDataset>'
+        '<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType="UInt16" band="1">'
+        + band.format(source, source)
     )
 
     def match_and_mask(job, block):
         match_block(job, block)
-        shutil.copy(folder / "mask.tif", folder / "left.tif.msk")
+        if name.endswith("xml"):
+            (folder / name).write_text(NODATA)
+        else:
+            shutil.copy(folder / "mask.tif", folder / name)
 
     monkeypatch.setattr("sat_intervals.run.pair.match_block", match_and_mask)
-    with pytest.raises(RunError, match=r"left.tif.msk appeared during the run, whose tiles are deleted: rerun the com"):
+    with pytest.raises(RunError, match=rf"{name} appeared during the run, whose tiles are deleted: rerun the com"):
         match_pair(folder / "left.vrt", folder / "right.tif", folder / "out", settings)
     assert not list(folder.glob("out/tiles/records/*"))
 
@@ -965,10 +983,10 @@ def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
-@pytest.mark.parametrize("ending", [".aux.xml", ".msk", ".ovr"])
+@pytest.mark.parametrize("ending", [".tif.aux.xml", ".tif.msk", ".tif.ovr", ".tif.OVR", ".RPB", "_rpc.txt"])
 def test_match_pair__refuses_a_file_that_would_change_what_is_read_from_its_results(pair, ending):
     folder, settings = pair
-    mine = folder / "out" / f"intervals.tif{ending}"
+    mine = folder / "out" / f"intervals{ending}"
     mine.parent.mkdir()
     mine.write_text(NODATA)
     with pytest.raises(SatIntervalsError, match=rf"{ending} changes what is read from .*intervals.tif: move it away"):
@@ -981,8 +999,64 @@ def test_output_writer__leaves_statistics_beside_its_place(tmp_path):
     with writer(tmp_path):
         pass
     (tmp_path / "intervals.tif.ovr").write_text("of an earlier one")
-    with pytest.raises(SatIntervalsError, match=r"\.ovr changes what is read from"), writer(tmp_path):
+    with pytest.raises(OutputError, match=r"\.ovr changes what is read from"), writer(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("name", ["intervals.tfw", "intervals.WLD", "intervals.tab"])
+def test_output_writer__refuses_a_world_file_beside_a_raster_without_a_place(tmp_path, name):
+    (tmp_path / name).write_text("2\n0\n0\n-2\n9\n9\n")
+    with pytest.raises(OutputError, match=f"{name} changes what is read from .*intervals.tif"), writer(tmp_path):
+        pass
+    with OutputWriter(tmp_path, RUN_FILES, 4, 5, PLACE, {}):
+        pass  # GDAL ignores it
+
+
+def test_output_writer__refuses_a_mask_beside_a_picture(tmp_path):
+    (tmp_path / "mask.png.MSK").write_text("of an earlier one")
+    picture = replace(RUN_FILES[1], name="mask.png", driver="PNG")
+    with (
+        pytest.raises(OutputError, match=r"mask\.png\.MSK changes what is read from"),
+        OutputWriter(tmp_path, [picture], 4, 5, PLACE, {}),
+    ):
+        pass
+
+
+def test_match_pair__resumes_after_a_file_that_appeared_beside_its_results(pair, monkeypatch):
+    folder, settings = pair
+
+    def and_appears(job, block):
+        match_block(job, block)
+        (folder / "out" / "intervals.tif.ovr").write_text("mine")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sat_intervals.run.pair.match_block", and_appears)
+        with pytest.raises(RunError, match=r"ovr changes what is read from .*: move it away; rerun .*: it resumes"):
+            match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    (folder / "out" / "intervals.tif.ovr").unlink()
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+
+
+def test_match_pair__keeps_a_result_that_is_the_source_of_ranges(pair):
+    folder, settings = pair
+    images, out = (folder / "left.tif", folder / "right.tif"), folder / "out"
+    match_pair(*images, out, settings)
+    with rasterio.open(out / "intervals.tif") as file:
+        copy(file, folder / "ranges.vrt", driver="VRT")
+    text = (folder / "ranges.vrt").read_text()
+    bands = re.findall(r"<VRTRasterBand.*?</VRTRasterBand>", text, re.DOTALL)
+    for band in (bands[0], bands[3]):
+        text = text.replace(band, "")
+    (folder / "ranges.vrt").write_text(text.replace('band="2"', 'band="1"', 1).replace('band="3"', 'band="2"', 1))
+    ranges = {**settings, "disparity": {**settings["disparity"], "grid": str(folder / "ranges.vrt")}}
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif is an input, and .*intervals.tif would be written"):
+        match_pair(*images, out, ranges, overwrite=True)
+
+
+def test_check_not_replaced__follows_a_loop_of_links_no_further(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "input").write_text("mine")
+    check_not_replaced([tmp_path / "input"], [tmp_path / "loop"], [tmp_path / "loop"])
 
 
 def killed_overwrite(pair, out, monkeypatch):

@@ -192,6 +192,14 @@ def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
         assert invoke("range", *images, "--output", tmp_path / "range.tif").exit_code == 0
 
 
+def test_range__writes_nothing_beside_a_file_that_would_change_its_ranges(folder, tmp_path):
+    beside = tmp_path / "range.tif.aux.xml"
+    beside.write_text('<PAMDataset><PAMRasterBand band="1"><NoDataValue>-8</NoDataValue></PAMRasterBand></PAMDataset>')
+    result = invoke("range", folder / "left.tif", folder / "right.tif", "--output", tmp_path / "range.tif")
+    assert (result.exit_code, "range.tif.aux.xml changes what is read from" in result.stderr) == (2, True)
+    assert list(tmp_path.iterdir()) == [beside]
+
+
 def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
     grid = tmp_path / "tiles/range.tif"
     grid.parent.mkdir()
