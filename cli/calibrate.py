@@ -234,10 +234,12 @@ def _tune(
     from sat_intervals.cli.tables import show_tuned
     from sat_intervals.config.weights import INSTALL_MCCNN
     from sat_intervals.errors import RunError, SatIntervalsError
+    from sat_intervals.raster import watched_rasters
     from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
         console.say(f"MC-CNN is left out: to include it, {INSTALL_MCCNN}")
+    check_rasters = watched_rasters(_inputs(subjects, ()))  # one that cannot be read would leave out settings
     found = []
     for label, changes in candidates(subjects[0].config, with_network=has_network()):
         console.say(f"calibrating {label}")
@@ -247,6 +249,7 @@ def _tune(
             raise
         except SatIntervalsError as error:
             console.say(f"{label} is left out: {error}")
+    check_rasters()
     check_arguments()
     best = best_of(found)
     if as_json:

@@ -1,6 +1,7 @@
 """Calibrations of demo scenes: through the engine, against runs with them, and from mistaken inputs."""
 
 import dataclasses
+import itertools
 import json
 import os
 from shutil import copytree
@@ -355,6 +356,26 @@ def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
     used = json.loads((tmp_path / "out" / "run.json").read_text())["settings"]
     assert (used["sgm"]["p2"], used["interval"]["coverage"], used["tiles"]["size"]) == (64, 0.9, 512)
     assert used["interval"]["calibration"]["name"] == "stronger"
+
+
+def test_tune__ends_where_a_truth_is_lost_while_the_last_settings_are_tried(scene, tmp_path, monkeypatch):
+    """Else these would be left out, and others be the best."""
+    (tmp_path / "pair").mkdir()
+    with rasterio.open(scene / "truth.tif") as file:
+        pair = with_truth(scene, tmp_path / "pair", file.read(1))
+    monkeypatch.setattr(tune, "candidates", lambda own, with_network: [("one", None), ("last", {"sgm": {"p2": 64}})])
+    monkeypatch.setattr(measurement, "_RUNGS", 5)  # the levels do not matter here
+    tuned, calls = tune.tuned, itertools.count()
+
+    def and_lost(*arguments):
+        if next(calls):
+            (pair / "truth.tif").unlink()
+        return tuned(*arguments)
+
+    monkeypatch.setattr(tune, "tuned", and_lost)
+    result = invoke("calibrate", pair, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
+    assert (result.exit_code, "truth.tif was replaced or changed" in result.stderr) == (1, True), result.output
+    assert not (tmp_path / "tuned.yaml").exists()
 
 
 def test_tune__a_name_and_quiet(scene, tmp_path, monkeypatch):
