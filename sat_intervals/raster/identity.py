@@ -342,13 +342,13 @@ def check_not_replaced(
     written: dict[object, str | Path] = {}  # by what identifies them: a batch may have thousands
     for output in outputs:
         check_regular(output, "move it away or choose another output")
-        written |= dict.fromkeys(_identifiers(output), output)
+        written |= dict.fromkeys(identifiers(output), output)
     parents = {os.path.realpath(folder) for folder in folders}
     for name in inputs:
         file = name if name is None or os.path.exists(name) else _local_file(os.fspath(name))
         if file is None:
             continue
-        for found in _identifiers(file) & written.keys():
+        for found in identifiers(file) & written.keys():
             raise SatIntervalsError(f"{name} is an input, and {written[found]} would be written: choose another output")
         for folder in map(str, Path(os.path.realpath(file)).parents):
             if folder in parents:
@@ -357,7 +357,7 @@ def check_not_replaced(
                 )
 
 
-def _identifiers(file: str | Path) -> set[object]:
+def identifiers(file: str | Path) -> set[object]:
     """Return the path of a file without links and, if it exists, what it has in common with its hard links."""
     found: set[object] = {os.path.realpath(file)}
     with suppress(OSError):

@@ -22,7 +22,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.publishing import OutputError, check_own, pinned, rename_new, replace_same, stamps
-from sat_intervals.raster.seal import check_beside, is_as_made
+from sat_intervals.raster.seal import check_beside, check_place, is_as_made
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
 
@@ -190,8 +190,9 @@ def write_once(
     Raises
     ------
     SatIntervalsError
-        The file has other content, and ``overwrite`` is not set or the file has no mark.
+        The file has other content, and ``overwrite`` is not set or the file has no mark; or see `check_place`.
     """
+    check_place(path)
     if path.exists():
         with suppress(SatIntervalsError):
             if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):

@@ -18,7 +18,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, watched_rasters, whole_file
-from sat_intervals.raster.identity import check_not_replaced
+from sat_intervals.raster.identity import check_not_replaced, identifiers
 from sat_intervals.run.assemble import remove_tiles
 from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
@@ -155,10 +155,11 @@ def _check_not_replaced(
     pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path, overwrite: bool
 ) -> None:
     """Raise if an input of any pair, or another file that is read, is an output of any pair, or two pairs share one."""
-    folders: dict[str, Path] = {}
+    folders: dict[object, Path] = {}
     for folder in (out / pair.name for pair in pairs):
-        if (other := folders.setdefault(os.path.realpath(folder), folder)) != folder:
-            raise SatIntervalsError(f"{other} and {folder} are the same folder: remove the link")
+        for found in identifiers(folder):
+            if (other := folders.setdefault(found, folder)) != folder:
+                raise SatIntervalsError(f"{other} and {folder} are the same folder: remove the link")
     written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
     images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]

@@ -14,6 +14,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, POINTS, SURFACE
 from sat_intervals.raster import (
     Georeferencing,
+    check_place,
     is_surface,
     open_image,
     read_layers,
@@ -90,12 +91,15 @@ def write_project(out: str | Path) -> Written:
     Raises
     ------
     SatIntervalsError
-        The folder is not a run, or ``project.qgz`` was not made by this tool, or was saved by QGIS since.
+        The folder is not a run, or ``project.qgz`` was not made by this tool, or was saved by QGIS since; or see
+        `check_place`.
     """
     run = open_run(out)
     file = run.out / "project.qgz"
     run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
     check_made_here([file])
+    for name in ("width", "dsm_half_width"):
+        check_place(run.out / f"{name}.vrt")
     written = Written([], [])
     with run.unchanged("points.tif", "dsm.tif"):
         layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]

@@ -1688,6 +1688,20 @@ def test_demo__overwrites_no_image_that_it_did_not_make(tmp_path, name):
     assert invoke(*command).exit_code == 0
 
 
+@pytest.mark.parametrize("command", ["demo", "project"])
+def test_commands__refuse_masks_beside_the_rasters_that_they_write(pair, command):
+    folder, settings = pair
+    mask = folder / "out" / ("left.tif.msk" if command == "demo" else "width.vrt.MSK")
+    if command == "project":
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    mask.parent.mkdir(exist_ok=True)
+    shutil.copy(folder / "mask.tif", mask)
+    before = contents(mask.parent)
+    options = ["--size", 100, 110, "--quiet"] if command == "demo" else []
+    refused([command, mask.parent, *options], f"{mask.name} changes what is read from", "move it away")
+    assert contents(mask.parent) == before
+
+
 def test_demo__deletes_no_file_with_a_name_like_that_of_its_copies(tmp_path):
     mine = tmp_path / ".sat-intervals.mine.left.tif"
     mine.write_text("mine")
