@@ -368,9 +368,13 @@ def test_tune__ends_where_a_truth_is_lost_while_the_last_settings_are_tried(scen
     tuned, calls = tune.tuned, itertools.count()
 
     def and_lost(*arguments):
-        if next(calls):
-            (pair / "truth.tif").unlink()
-        return tuned(*arguments)
+        is_last = next(calls) > 0
+
+        def progress(stage, done, total):
+            if is_last and stage == "tiles":
+                (pair / "truth.tif").unlink(missing_ok=True)
+
+        return tuned(*arguments[:-1], progress)
 
     monkeypatch.setattr(tune, "tuned", and_lost)
     result = invoke("calibrate", pair, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
