@@ -26,12 +26,19 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.surface import surfaces_of
     from sat_intervals.config.pairs import REPORT, read_batch
-    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.raster.identity import check_not_replaced, watched
     from sat_intervals.run.batch import match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
+    check_list = watched([pairs])
     rows = read_batch(pairs)
     with Console(run.quiet or as_json) as console:
+
+        def progress(stage: str, done: int, total: int) -> None:
+            if stage == "pairs":  # while their images are opened
+                check_list()
+            console.progress(stage, done, total)
+
         report = match_batch(
             rows,
             out,
@@ -39,7 +46,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
             overrides=settings.sections,
             overwrite=run.overwrite,
             keep_tiles=run.keep_tiles,
-            progress=console.progress,
+            progress=progress,
             finish=surfaces_of(rows, out, console),
         )
     if as_json:

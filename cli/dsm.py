@@ -53,7 +53,8 @@ _CELL_OPTIONS = (
 def cell_options(command: Command) -> Command:
     """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`.
 
-    A `calibration_option` goes with it.
+    A `calibration_option` goes with it; the command also gets ``check_calibration``, which raises if its file is not
+    the one that was read.
     """
 
     @wraps(command)
@@ -67,10 +68,12 @@ def cell_options(command: Command) -> Command:
             raise click.UsageError("give either --resolution or --grid-like.")
         from sat_intervals.config import load_height_calibration
         from sat_intervals.heights.choices import SurfaceChoices
+        from sat_intervals.raster.identity import watched
 
+        check_calibration = watched([calibration])
         choices["calibration"] = calibration and load_height_calibration(calibration)
         cells |= {"resolution": like or cells["resolution"], "choices": SurfaceChoices(**choices)}
-        return command(cells=cells, **given)
+        return command(cells=cells, check_calibration=check_calibration, **given)
 
     return with_options(with_cells, *_CELL_OPTIONS)
 
@@ -126,7 +129,14 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 @json_option
 @quiet_option
 @log_options
-def dsm(outs: tuple[Path, ...], cells: dict[str, Any], output: Path | None, as_json: bool, quiet: bool) -> None:
+def dsm(
+    outs: tuple[Path, ...],
+    cells: dict[str, Any],
+    check_calibration: Callable[[], None],
+    output: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """Make a surface model from the points that `triangulate` wrote to the folders OUT.
 
     Bands: height, height_lower, height_upper, count, confidence, agreement. Heights refer to the WGS 84 ellipsoid
@@ -141,7 +151,12 @@ def dsm(outs: tuple[Path, ...], cells: dict[str, Any], output: Path | None, as_j
 
     output = output or outs[0] / "dsm.tif"
     with Console(quiet or as_json) as console:
-        report = make_surface(outs, output, **cells, progress=console.progress)
+
+        def progress(stage: str, done: int, total: int) -> None:
+            check_calibration()  # it was read before the points
+            console.progress(stage, done, total)
+
+        report = make_surface(outs, output, **cells, progress=progress)
     if as_json:
         say_json(report)
     say_surface(console, report)

@@ -36,7 +36,9 @@ def match(
     rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
+    from sat_intervals.raster.identity import check_not_replaced, watched
 
+    check_settings = watched([settings.file])
     config = settings.load()
     if dry_run:
         from sat_intervals.run.batch_system import job_script
@@ -44,11 +46,11 @@ def match(
         click.echo(job_script(config.cluster, out))
         return
     with Console(run.quiet or as_json) as console:
-        from sat_intervals.raster.identity import check_not_replaced
         from sat_intervals.run.output import OUTPUTS
 
         check_not_replaced([settings.file], [out / name for name in OUTPUTS], [out / "tiles"])
         left, right = pair.open()
+        check_settings()  # they and the images are of the same moment
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
     if as_json:
         say_json(report)

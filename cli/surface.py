@@ -42,6 +42,7 @@ def surface(
     out: Path,
     sensor_files: tuple[Path, Path, Path, Path],
     cells: dict[str, Any],
+    check_calibration: Callable[[], None],
     as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
@@ -52,7 +53,9 @@ def surface(
     finished match with these images and settings is kept, points and surface are made again.
     """
     from sat_intervals.cli.console import Console
+    from sat_intervals.raster.identity import watched
 
+    check_settings = watched([settings.file])
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
@@ -62,6 +65,8 @@ def surface(
         check_unchanged = _watched(sensor_files, cells)
         _check(out, cells, sensor_files, resolved(config).interval)
         left, right = pair.open()
+        check_settings()
+        check_calibration()
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)

@@ -18,6 +18,7 @@ from rasterio.shutil import copy
 from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
+from sat_intervals import config as of_config
 from sat_intervals.config import load_calibration, load_height_calibration
 from sat_intervals.errors import RunError
 from sat_intervals.heights import cells
@@ -401,6 +402,25 @@ classes:
 - {below: 5.0, margin: 0.75, cells: 100}
 - {below: null, margin: -4.0, cells: 100}
 """
+
+
+def test_dsm_command__ends_where_its_calibration_is_replaced_before_the_points_are_read(tmp_path, monkeypatch):
+    """Else an old calibration and new points would be mixed, where a whole folder is exchanged."""
+    out = with_coverage(write_points(tmp_path / "a", [0.5, 3.5], [-0.5, -0.9], [10, 14]))
+    file = tmp_path / "heights.yaml"
+    load = of_config.load_height_calibration
+    file.write_text(CALIBRATION)
+
+    def and_replaced(path):
+        calibration = load(path)
+        shutil.copy(file, tmp_path / "new")
+        (tmp_path / "new").replace(file)
+        return calibration
+
+    monkeypatch.setattr(of_config, "load_height_calibration", and_replaced)
+    result = invoke("dsm", out, "--resolution", 1, "--radius", 0.6, "--calibration", file)
+    assert (result.exit_code, "heights.yaml was replaced or changed" in result.stderr) == (1, True), result.output
+    assert not (out / "dsm.tif").exists()
 
 
 def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tmp_path):

@@ -20,11 +20,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
+from cameras import cameras, sensor_words
 from finished import random_bands, write_run
 from helpers import COMMAND, OUTPUTS, PLACE, hashes, invoke, write_pair
 from matplotlib.figure import Figure
 from rasterio.shutil import copy
 
+from sat_intervals.cli.matching import PairArguments
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
@@ -1035,6 +1037,25 @@ def test_match_pair__resumes_after_a_file_that_appeared_beside_its_results(pair,
             match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
     (folder / "out" / "intervals.tif.ovr").unlink()
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+
+
+@pytest.mark.parametrize("command", ["match", "surface"])
+def test_commands__end_where_settings_are_replaced_before_the_images_are_opened(pair, monkeypatch, command):
+    """Else old settings and new images would be mixed, where a whole folder is exchanged."""
+    folder, _ = pair
+    settings, opened = folder / "settings.yaml", PairArguments.open
+
+    def replaced_before(arguments):
+        shutil.copy(settings, folder / "new")
+        (folder / "new").replace(settings)
+        return opened(arguments)
+
+    monkeypatch.setattr(PairArguments, "open", replaced_before)
+    images = folder / "left.tif", folder / "right.tif", folder / "out"
+    sensors = [*sensor_words(cameras(folder, 80, 100)), "--resolution", 1] if command == "surface" else []
+    result = invoke(command, *images, *sensors, "--config", settings)
+    assert (result.exit_code, "settings.yaml was replaced or changed" in result.stderr) == (1, True), result.output
+    assert not (folder / "out" / "intervals.tif").exists()
 
 
 def test_match_pair__keeps_a_result_that_is_the_source_of_ranges(pair):
