@@ -233,9 +233,9 @@ def _tune(
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
     from sat_intervals.config.weights import INSTALL_MCCNN
-    from sat_intervals.errors import RunError, SatIntervalsError
+    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.raster import watched_rasters
-    from sat_intervals.run.tune import best_of, candidates, has_network, settings_of, tuned
+    from sat_intervals.run.tune import OF_ALL, best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
         console.say(f"MC-CNN is left out: to include it, {INSTALL_MCCNN}")
@@ -245,7 +245,7 @@ def _tune(
         console.say(f"calibrating {label}")
         try:
             found.append(tuned(label, changes, subjects, folder, console.progress))
-        except RunError:
+        except OF_ALL:
             raise
         except SatIntervalsError as error:
             console.say(f"{label} is left out: {error}")

@@ -11,17 +11,22 @@ import numpy as np
 
 from sat_intervals.config import PRESETS, Calibration, Config, Interval, key_of, load_config
 from sat_intervals.config.weights import weights_file
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.calibration import left_out, means
 from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.measurement import ladder
 from sat_intervals.progress import Progress
+from sat_intervals.raster import InputError, OutputError
 from sat_intervals.run.calibrate import calibration_from
 from sat_intervals.run.measure import Subject, measure_subjects
+from sat_intervals.store.manifest import StoreError
 
 COVERAGE = 0.9  # that settings are compared at
 # Settings with fewer good pixels than this share of the most are not chosen, however narrow their intervals.
 _GOOD_ENOUGH = 0.95
+
+# Errors that say nothing of the settings that are tried, such as a lost truth or a full disk.
+OF_ALL = RunError, InputError, OutputError, StoreError
 
 _CENSUS = {5: ((8, 64), (12, 64), (16, 128)), 7: ((8, 64), (32, 256)), 11: ((50, 350),)}
 _COSINE = ((0.5, 3.0, 40.0), (0.7, 4.0, 45.0), (1.0, 6.0, 60.0))

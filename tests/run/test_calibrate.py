@@ -21,12 +21,13 @@ from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.match import measurement
-from sat_intervals.raster import write_layer
+from sat_intervals.raster import OutputError, write_layer
 from sat_intervals.run import tune
 from sat_intervals.run.calibrate import check_subjects
 from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
 from sat_intervals.run.tune import Tuned, best_of, candidates
+from sat_intervals.store.manifest import StoreError
 
 
 @pytest.fixture(scope="module")
@@ -378,8 +379,39 @@ def test_tune__ends_where_a_truth_is_lost_while_the_last_settings_are_tried(scen
 
     monkeypatch.setattr(tune, "tuned", and_lost)
     result = invoke("calibrate", pair, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
+    assert (result.exit_code, "truth.tif cannot be read" in result.stderr) == (2, True), result.output
+    assert not (tmp_path / "tuned.yaml").exists()
+
+
+def test_tune__ends_where_a_truth_is_replaced_while_the_last_settings_are_tried(scene, tmp_path, monkeypatch):
+    (tmp_path / "pair").mkdir()
+    with rasterio.open(scene / "truth.tif") as file:
+        truth = file.read(1)
+    pair = with_truth(scene, tmp_path / "pair", truth)
+    monkeypatch.setattr(tune, "candidates", lambda own, with_network: [("one", None), ("last", {"sgm": {"p2": 64}})])
+    monkeypatch.setattr(measurement, "_RUNGS", 5)
+    tuned, calls = tune.tuned, itertools.count()
+
+    def and_replaced(*arguments):
+        if next(calls):
+            write_layer(pair / "truth.tif", np.full_like(truth, np.nan), np.nan, PLACE)
+            raise SatIntervalsError("no pixel has a truth")
+        return tuned(*arguments)
+
+    monkeypatch.setattr(tune, "tuned", and_replaced)
+    result = invoke("calibrate", pair, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
     assert (result.exit_code, "truth.tif was replaced or changed" in result.stderr) == (1, True), result.output
     assert not (tmp_path / "tuned.yaml").exists()
+
+
+@pytest.mark.parametrize("error", [StoreError, OutputError])
+def test_tune__ends_where_the_disk_is_full(scene, tmp_path, monkeypatch, error):
+    def full(*arguments):
+        raise error("no space")
+
+    monkeypatch.setattr(tune, "tuned", full)
+    result = invoke("calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
+    assert (result.exit_code, result.stderr) == (2, "sat-intervals: no space\n")
 
 
 def test_tune__a_name_and_quiet(scene, tmp_path, monkeypatch):
