@@ -30,13 +30,13 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     from sat_intervals.run.batch import match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
-    check_list = watched([pairs])
+    check_given = watched([pairs, settings.file])
     rows = read_batch(pairs)
     with Console(run.quiet or as_json) as console:
 
         def progress(stage: str, done: int, total: int) -> None:
-            if stage == "pairs":  # while their images are opened
-                check_list()
+            if stage == "pairs" and done < 2:  # while the images of the first one are opened
+                check_given()
             console.progress(stage, done, total)
 
         report = match_batch(

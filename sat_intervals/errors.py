@@ -15,6 +15,10 @@ class SatIntervalsError(ValueError):
     """Base class of the package's errors; the message names the file, the values and the way out."""
 
 
+class InputError(SatIntervalsError):
+    """An input that cannot be used."""
+
+
 class RunError(SatIntervalsError):
     """A run that failed although its arguments are correct; finished tiles are kept, so it can be resumed."""
 

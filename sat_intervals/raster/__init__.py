@@ -1,5 +1,6 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
+from sat_intervals.errors import InputError
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
@@ -9,7 +10,6 @@ from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.heightfield import GROUND, HeightRaster
 from sat_intervals.raster.images import (
     Image,
-    InputError,
     check_pair,
     is_replaced,
     open_image,

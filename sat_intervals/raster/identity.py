@@ -56,7 +56,7 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
         The path is a pipe or a device, a server does not say which file it sends, or GDAL hides the URL in a query.
     """
     check_regular(path)
-    if file := _local_file(path):
+    if file := local_file(path):
         name = str(file.resolve()) if file == Path(path) else path
         return {"path": name} | _of_file(file, (known or {}).get(name, {}))
     if path.startswith("/vsicurl?"):
@@ -75,7 +75,7 @@ def stamp_of(path: str) -> str | None:
 
     None if a server gives none or does not answer, "missing" for a local file that does not exist.
     """
-    if file := _local_file(path):
+    if file := local_file(path):
         return _stamp(file)
     now = identity(path)
     if now.get("etag"):
@@ -83,7 +83,7 @@ def stamp_of(path: str) -> str | None:
     return None if "://" in path or path.startswith("/vsi") else "missing"
 
 
-def _local_file(path: str) -> Path | None:
+def local_file(path: str) -> Path | None:
     """Return the local file behind a GDAL name, such as the archive in ``/vsizip/{a.zip}/left.tif``; None if remote."""
     name = path
     while found := _INSIDE.match(name):
@@ -143,7 +143,7 @@ class _Moment(NamedTuple):
 
 
 def _moment(path: str) -> _Moment:
-    file = _local_file(path)
+    file = local_file(path)
     return _Moment(None, []) if file is None else _Moment(_stamp(file), [*_way_to(file.absolute())])
 
 
@@ -213,7 +213,7 @@ def _of_url(url: str) -> dict[str, Any]:
 def is_changed(path: str, known: Mapping[str, Any]) -> bool:
     """Return whether a file differs from its `identity` of before; False if a server does not answer."""
     if "sha256" in known:
-        file = _local_file(path)
+        file = local_file(path)
         try:
             return file is None or (_stamp(file) != known.get("stamp") and _hashed(file)[1] != known["sha256"])
         except FileNotFoundError:
@@ -287,7 +287,7 @@ def compared(files: Mapping[str, Mapping[str, Any]]) -> Iterator[Callable[[], st
 
 def _differing(files: Mapping[str, Mapping[str, Any]], is_over: Event) -> str | None:
     for name, known in files.items():
-        if "sha256" not in known or (file := _local_file(name)) is None:
+        if "sha256" not in known or (file := local_file(name)) is None:
             continue
         digest = hashlib.sha256()
         try:
@@ -345,7 +345,7 @@ def check_not_replaced(
         written |= dict.fromkeys(identifiers(output), output)
     parents = {os.path.realpath(folder) for folder in folders}
     for name in inputs:
-        file = name if name is None or os.path.exists(name) else _local_file(os.fspath(name))
+        file = name if name is None or os.path.exists(name) else local_file(os.fspath(name))
         if file is None:
             continue
         for found in identifiers(file) & written.keys():

@@ -2,38 +2,29 @@
 
 import logging
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
-from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
+from sat_intervals.errors import ChangedInputError, InputError, RunError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.identity import stamp_of, watched
+from sat_intervals.raster.identity import local_file, stamp_of, watched
 from sat_intervals.raster.seal import check_seal, is_read
+from sat_intervals.raster.virtual import is_in_another, sources
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
-_IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
-# Elements of a virtual raster that name a file, and the metadata that do so: positions of a warped one.
-_SOURCE_TAGS, _GEOLOCATION_KEYS = {"sourcefilename", "sourcedataset", "dempath"}, {"X_DATASET", "Y_DATASET"}
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
 
 _LOG = logging.getLogger(__name__)
-
-
-class InputError(SatIntervalsError):
-    """An input that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -272,33 +263,6 @@ def _check_watched(name: str, dataset: DatasetReader) -> None:
         )
 
 
-def _sources(path: str) -> list[str]:
-    """Return all sources of a virtual raster, given as a file or as text.
-
-    GDAL lists only plain files, and not those of masks. It ignores case and namespaces.
-    """
-    text = Path(path).read_bytes() if os.path.isfile(path) else path.encode()
-    if b"<VRTDataset" not in text:
-        return []
-    try:
-        elements = ElementTree.fromstring(text).iter()
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path} is not well-formed XML: {error}: write it with gdalbuildvrt") from error
-    found = []
-    for element in elements:
-        tag, named = element.tag.rpartition("}")[2].lower(), {key.lower(): text for key, text in element.items()}
-        if (kind := named.get("subclass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
-            raise InputError(
-                f"{path} has a {kind}, of which GDAL does not report missing data or changed files: convert it with "
-                "gdal_translate"
-            )
-        is_named = tag in _SOURCE_TAGS or named.get("key") in _GEOLOCATION_KEYS
-        if is_named and (name := element.text):
-            is_relative = named.get("relativetovrt") == "1" and not _IN_ANOTHER.match(name)
-            found.append(os.path.join(os.path.dirname(path), name) if is_relative else name)
-    return found
-
-
 def other_files(name: str) -> list[str]:
     """Return the other files that a raster is read from: its mask file, sources of a virtual raster and their masks.
 
@@ -309,6 +273,7 @@ def other_files(name: str) -> list[str]:
     """
     seen: set[str] = set()
     asked: set[str] = set()
+    named: set[str] = set()  # by virtual rasters
     listed: dict[str, list[str]] = {}
     waiting = [name]
     while waiting:
@@ -322,9 +287,13 @@ def other_files(name: str) -> list[str]:
             with gdal.reading(path) as dataset:
                 _check_watched(path, dataset)
                 files = dataset.files
-                waiting += filter(_may_have_others, _sources(path) if dataset.driver == "VRT" else [])
-        except gdal.GDAL_ERRORS:  # a sidecar file that is not a raster
-            continue
+                others = [source for source in sources(path, dataset) if source not in files]
+        except gdal.GDAL_ERRORS as error:
+            if path in named:
+                raise InputError(f"{path}, of which {name} is made, cannot be read: {gdal.reason(error)}") from error
+            continue  # a sidecar file that is not a raster
+        named.update(others)
+        waiting += others
         new = [file for file in files if file not in seen and not _is_same(file, name)]
         seen.update(new)
         waiting += filter(_may_have_others, new)
@@ -333,15 +302,15 @@ def other_files(name: str) -> list[str]:
 
 def _is_same(file: str, name: str) -> bool:
     """Return whether GDAL lists a raster of this name as a file."""
-    _, is_url, place = name.partition("://")
-    is_listed = bool(is_url) and file.startswith("/vsi") and file.endswith(place)
+    scheme, is_url, place = name.partition("://")
+    is_listed = bool(is_url) and scheme != "vrt" and file.startswith("/vsi") and file.endswith(place)
     return is_listed or Path(file).resolve() == Path(name).resolve()
 
 
 def _may_have_others(name: str) -> bool:
     """Return whether to open a file for others: no pipe, which could block; of remote ones only virtual rasters."""
     is_remote_vrt = name.endswith((".vrt", ".VRT")) and not os.path.exists(name)
-    return os.path.isfile(name) or is_remote_vrt or _IN_ANOTHER.match(name) is not None
+    return local_file(name) is not None or is_remote_vrt or is_in_another(name)
 
 
 def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from rasterio.windows import Window as RasterioWindow
 
+from sat_intervals.errors import InputError
 from sat_intervals.products import MASKED, NO_DATA
-from sat_intervals.raster.images import Image, InputError, opened
+from sat_intervals.raster.images import Image, opened
 from sat_intervals.tiling import View, Views, Window
 
 # Types whose values are all exact in float32.

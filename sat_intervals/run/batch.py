@@ -18,7 +18,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
 from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, watched_rasters, whole_file
-from sat_intervals.raster.identity import check_not_replaced, identifiers, watched
+from sat_intervals.raster.identity import check_not_replaced, identifiers
 from sat_intervals.run.assemble import remove_tiles
 from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
@@ -76,11 +76,10 @@ def match_batch(
         An error that stops all pairs, such as a full disk.
     """
     file = Path(config) if isinstance(config, (str, Path)) else None
-    check_settings = watched([file])
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
     common = load_config(sections, overrides, file=file)
     own = {pair.name: {**(overrides or {}), **_merged(overrides or {}, pair.settings)} for pair in pairs}
-    checks = _watched(check_settings, sections, overrides, pairs)
+    checks = _watched(sections, overrides, pairs)
     _check_not_replaced(pairs, [file, *named_files(sections), *named_files(overrides)], out, overwrite)
     _raise_file_limit()
     with ExitStack() as stack:
@@ -112,19 +111,15 @@ def match_batch(
 
 
 def _watched(
-    check_settings: Callable[[], None],
-    sections: Mapping[str, Any] | None,
-    overrides: Mapping[str, Any] | None,
-    pairs: Sequence[PairOfBatch],
+    sections: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None, pairs: Sequence[PairOfBatch]
 ) -> dict[str, Callable[[], None]]:
-    """Return functions by pair that raise if settings changed, or a file that they or those of the pair name.
+    """Return functions by pair that raise if a file changed that settings of all pairs or of this one name.
 
-    Pairs share settings, calibrations and ranges.
+    Pairs share calibrations and ranges.
     """
     check_common = watched_rasters([*named_files(sections), *named_files(overrides)])
 
     def check_both(check_own: Callable[[], None]) -> None:
-        check_settings()
         check_common()
         check_own()
 

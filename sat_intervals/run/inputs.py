@@ -81,13 +81,14 @@ def _with_others(name: str, identified: Callable[[str], dict[str, Any]]) -> dict
 def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | None:
     """Return a mask file or ``.aux.xml`` beside images, masks or their sources that is not an input; None if none is.
 
-    Beside an image without a mask it does not matter: the image is read as it was when it was opened.
+    That of an image without a mask does not matter: the image is read as it was when it was opened.
     """
+    endings = ".msk", ".aux.xml"
     for image in (left, right):
         for name in filter(None, (image.path, image.mask)):
+            own = [] if image.use_mask else [f"{name}{ending}".lower() for ending in endings]
             for file in read_files(name):
-                matters = image.use_mask or not file.startswith(name)
-                if matters and file.lower().endswith((".msk", ".aux.xml")) and file not in files:
+                if file.lower().endswith(endings) and file.lower() not in own and file not in files:
                     return file
     return None
 

@@ -470,7 +470,7 @@ def test_point_file__refuses_a_format_that_may_be_read_from_other_files(tmp_path
 
     path, point = tmp_path / "p.dxf", shapely.to_wkb(shapely.points([[5.0, 43.0, 100.0]]))
     pyogrio.raw.write(path, point, [], [], geometry_type="Point Z", crs="EPSG:4326", driver="DXF")
-    with pytest.raises(SatIntervalsError, match=r"p\.dxf has the format DXF, .*: convert it with ogr2ogr"):
+    with pytest.raises(SatIntervalsError, match=r"p\.dxf has the format DXF, .*: convert it to GeoPackage"):
         point_files.PointFile(path, "EPSG:4326", Vertical(True, None))
 
 

@@ -1,0 +1,177 @@
+"""Sources of virtual rasters: whatever their spelling, the tool knows all files that GDAL reads."""
+
+import gzip
+import re
+import zipfile
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.rpc import RPC
+from rasterio.transform import from_origin
+
+from sat_intervals.raster import InputError, open_image, other_files
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+SIZE = 16
+BAND = '<VRTRasterBand dataType="{}"{}><SimpleSource>{}<SourceBand>1</SourceBand></SimpleSource></VRTRasterBand>'
+SOURCE = '<SourceFilename relativeToVRT="{}">{}</SourceFilename>'
+
+
+def virtual(image, mask=""):
+    """The text of a virtual raster of an image, with a mask from another source."""
+    mask = f"<MaskBand>{BAND.format('Byte', '', mask)}</MaskBand>" if mask else ""
+    band = BAND.format("UInt16", ' band="1"', SOURCE.format(*image))
+    return f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}">{band}{mask}</VRTDataset>'
+
+
+def write(path, dtype="uint16", **profile):
+    path.parent.mkdir(exist_ok=True)
+    with rasterio.open(path, "w", "GTiff", SIZE, SIZE, 1, dtype=dtype, **profile) as file:
+        file.write(np.ones((1, SIZE, SIZE), dtype))
+        return file
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write(tmp_path / "image.tif")
+    write(tmp_path / "mask.tif", "uint8")
+    return tmp_path
+
+
+def zipped(folder, name, file):
+    with zipfile.ZipFile(folder / f"{name}.zip", "w") as archive:
+        archive.write(folder / file, file)
+    return f"/vsizip/{folder}/{name}.zip/{file}"
+
+
+def compressed(folder, file):
+    (folder / f"{file}.gz").write_bytes(gzip.compress((folder / file).read_bytes()))
+    return f"/vsigzip/{folder}/{file}.gz"
+
+
+MASKS = {
+    "relative": lambda folder: (SOURCE.format(1, "mask.tif"), folder / "mask.tif"),
+    "another number": lambda folder: (SOURCE.format(2, "mask.tif"), folder / "mask.tif"),
+    "absolute": lambda folder: (SOURCE.format(0, folder / "mask.tif"), folder / "mask.tif"),
+    "lines": lambda folder: (SOURCE.format(1, "\n  mask.tif"), folder / "mask.tif"),
+    "entity": lambda folder: (SOURCE.format(1, "mask&#46;tif"), folder / "mask.tif"),
+    "section": lambda folder: (SOURCE.format(1, "<![CDATA[mask.tif]]>"), folder / "mask.tif"),
+    "like a subdataset": lambda folder: (
+        SOURCE.format(1, (folder / "mask.tif").rename(folder / "A:mask.tif").name),
+        folder / "A:mask.tif",
+    ),
+    "in an archive": lambda folder: (SOURCE.format(0, zipped(folder, "mask", "mask.tif")), folder / "mask.zip"),
+    "compressed": lambda folder: (SOURCE.format(0, compressed(folder, "mask.tif")), folder / "mask.tif.gz"),
+    "part of a file": lambda folder: (
+        SOURCE.format(0, f"/vsisubfile/0_{(folder / 'mask.tif').stat().st_size},{folder}/mask.tif"),
+        folder / "mask.tif",
+    ),
+}
+
+
+def local_files(name):
+    """The local files behind the names of a raster's other files."""
+    return {re.sub(r"^/vsi\w+/(\d+_\d+,)?(.*\.(zip|gz)|.*).*", r"\2", file) for file in other_files(name)}
+
+
+@pytest.mark.parametrize("spelling", MASKS)
+def test_other_files__have_the_mask_of_a_virtual_raster_in_any_spelling(folder, spelling):
+    mask, file = MASKS[spelling](folder)
+    (folder / "image.vrt").write_text(virtual((1, "image.tif"), mask))
+    assert open_image(folder / "image.vrt").use_mask
+    assert local_files(str(folder / "image.vrt")) == {str(folder / "image.tif"), str(file)}
+
+
+@pytest.mark.parametrize("is_absolute", [False, True])
+def test_other_files__are_those_of_the_virtual_raster_that_a_link_names(folder, is_absolute):
+    (folder / "image.vrt").write_text(virtual((1, "image.tif"), SOURCE.format(1, "mask.tif")))
+    link = folder / "linked" / "image.vrt"
+    write(folder / "linked" / "mask.tif", "uint8")  # another one
+    link.symlink_to(folder / "image.vrt" if is_absolute else "../image.vrt")
+    assert str(folder / "mask.tif") in other_files(str(link))
+
+
+def test_other_files__are_those_of_virtual_rasters_in_archives(folder):
+    (folder / "image.vrt").write_text(virtual((0, folder / "image.tif"), SOURCE.format(0, folder / "mask.tif")))
+    sources = {str(folder / "image.tif"), str(folder / "mask.tif")}
+    assert sources <= set(other_files(zipped(folder, "image", "image.vrt")))
+    (folder / "outer.vrt").write_text(virtual((0, compressed(folder, "image.vrt"))))
+    assert sources <= set(other_files(str(folder / "outer.vrt")))
+
+
+def test_other_files__of_a_name_of_one_in_an_archive_are_the_archive(folder):
+    name = zipped(folder, "image", "image.tif")
+    assert other_files(f"vrt://{name}") == [name]
+
+
+def test_other_files__are_those_of_warping_too(folder, monkeypatch):
+    monkeypatch.chdir(folder)  # GDAL looks there for heights
+    write(folder / "heights.tif", "float32", crs="EPSG:4326", transform=from_origin(5.3, 43.7, 0.03, 0.03))
+    numbers = {"line": "0 0 -1" + 17 * " 0", "samp": "0 1" + 18 * " 0"}
+    values = {"lat_off": 43.5, "long_off": 5.5, "height_off": 0, "line_off": 8, "samp_off": 8}
+    values |= {"lat_scale": 0.1, "long_scale": 0.1, "height_scale": 500, "line_scale": 8, "samp_scale": 8}
+    values |= {f"{side}_num_coeff": text for side, text in numbers.items()}
+    values |= {f"{side}_den_coeff": "1" + 19 * " 0" for side in numbers}
+    with rasterio.open(folder / "image.tif", "r+") as file:
+        coefficients = {name: [float(part) for part in str(value).split()] for name, value in values.items()}
+        file.rpcs = RPC(**{name: part if "coeff" in name else part[0] for name, part in coefficients.items()})
+    model = "".join(f'<MDI key="{name.upper()}">{value}</MDI>' for name, value in values.items())
+    (folder / "warped.vrt").write_text(
+        f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}" subClass="VRTWarpedDataset"><SRS>EPSG:4326</SRS>'
+        '<GeoTransform>5.4, 0.0125, 0, 43.6, 0, -0.0125</GeoTransform><VRTRasterBand dataType="UInt16" band="1" '
+        'subClass="VRTWarpedRasterBand"/><BlockXSize>16</BlockXSize><BlockYSize>16</BlockYSize><GDALWarpOptions>'
+        '<SourceDataset relativeToVRT="1">image.tif</SourceDataset><Transformer><GenImgProjTransformer>'
+        f"<SrcRPCTransformer><RPCTransformer><DEMPath>heights.tif</DEMPath><Metadata>{model}</Metadata>"
+        "</RPCTransformer></SrcRPCTransformer><DstGeoTransform>5.4,0.0125,0,43.6,0,-0.0125</DstGeoTransform>"
+        "<DstInvGeoTransform>-432,80,0,3488,0,-80</DstInvGeoTransform></GenImgProjTransformer></Transformer>"
+        '<BandList><BandMapping src="1" dst="1"/></BandList></GDALWarpOptions></VRTDataset>'
+    )
+    assert set(other_files(str(folder / "warped.vrt"))) == {str(folder / "image.tif"), "heights.tif"}
+
+
+def test_other_files__are_those_of_positions_too(folder):
+    write(folder / "x.tif", "float64")
+    positions = '<Metadata domain="GEOLOCATION"><MDI key="X_DATASET">x.tif</MDI><MDI key="Y_DATASET">gone.tif</MDI>'
+    text = virtual((1, "image.tif")).replace("<VRTRasterBand", f"{positions}</Metadata><VRTRasterBand", 1)
+    (folder / "image.vrt").write_text(text)
+    assert other_files(str(folder / "image.vrt")) == [str(folder / "image.tif"), str(folder / "x.tif")]
+
+
+REFUSED = {
+    "raw": (
+        f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}"><VRTRasterBand dataType="Byte" band="1" '
+        'subclass="vrtrawrasterband"><SourceFilename relativeToVRT="1">mask.tif</SourceFilename></VRTRasterBand>'
+        "</VRTDataset>",
+        "has a VRTRawRasterBand",
+    ),
+    "processed": (
+        '<VRTDataset subClass="VRTProcessedDataset"><Input><SourceFilename relativeToVRT="1">mask.tif</SourceFilename>'
+        "</Input><ProcessingSteps><Step><Algorithm>BandAffineCombination</Algorithm><Argument "
+        'name="coefficients_1">0,1</Argument></Step></ProcessingSteps></VRTDataset>',
+        "has a VRTProcessedDataset",
+    ),
+    "another folder": (
+        virtual((1, "image.tif")).replace(
+            "<SourceBand>", '<OpenOptions><OOI key="ROOT_PATH">elsewhere</OOI></OpenOptions><SourceBand>'
+        ),
+        "has sources in another folder than it says",
+    ),
+    "a subdataset beside it": (
+        virtual((1, "image.tif"), SOURCE.format(1, "GTIFF_DIR:1:mask.tif")),
+        r"GTIFF_DIR:1:mask.tif, of which .*image.vrt is made, cannot be read",
+    ),
+    "a lost mask": (
+        virtual((1, "image.tif"), SOURCE.format(1, "gone.tif")),
+        r"gone.tif, of which .*image.vrt is made, cannot be read",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_other_files__refuse_what_they_could_not_name(folder, kind):
+    text, problem = REFUSED[kind]
+    (folder / "image.vrt").write_text(text)
+    with pytest.raises(InputError, match=problem):
+        other_files(str(folder / "image.vrt"))
