@@ -67,6 +67,8 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
             new = own / f"{uuid.uuid4().hex}{path.suffix}"  # nobody can put a link there before
             yield new
             check_own(new)
+            with new.open("rb") as file:
+                os.fsync(file.fileno())  # after a power loss it could be empty
             if path.name in before and os.path.lexists(path):
                 replace_same(new, path, before[path.name])
             else:

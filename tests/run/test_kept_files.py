@@ -1693,6 +1693,14 @@ def test_demo__overwrites_no_image_that_it_did_not_make(tmp_path, name):
     assert invoke(*command).exit_code == 0
 
 
+def test_whole_file__is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):
+    written, path = [], tmp_path / "file"
+    monkeypatch.setattr(layers.os, "fsync", lambda file: written.append((os.pread(file, 9, 0), path.exists())))
+    with layers.whole_file(path) as new:
+        new.write_text("content")
+    assert (written, path.read_text()) == ([(b"content", False)], "content")
+
+
 @pytest.mark.parametrize("command", ["demo", "project"])
 def test_commands__refuse_masks_beside_the_rasters_that_they_write(pair, command):
     folder, settings = pair
