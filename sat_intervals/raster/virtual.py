@@ -29,7 +29,7 @@ def sources(path: str, dataset: DatasetReader) -> list[str]:
     InputError
         A source has no name that can be watched.
     """
-    positions = dataset.tags(ns="GEOLOCATION")
+    positions = {key.upper(): value for key, value in dataset.tags(ns="GEOLOCATION").items()}
     found = [_resolved(path, positions[key], may_be_relative=True) for key in _POSITIONS if key in positions]
     found = list(filter(os.path.exists, found))  # needed only where GDAL warps
     if dataset.driver == "VRT":

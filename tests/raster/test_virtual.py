@@ -133,7 +133,7 @@ def test_other_files__are_those_of_warping_too(folder, monkeypatch):
 
 def test_other_files__are_those_of_positions_too(folder):
     write(folder / "x.tif", "float64")
-    positions = '<Metadata domain="GEOLOCATION"><MDI key="X_DATASET">x.tif</MDI><MDI key="Y_DATASET">gone.tif</MDI>'
+    positions = '<Metadata domain="GEOLOCATION"><MDI key="x_dataset">x.tif</MDI><MDI key="Y_DATASET">gone.tif</MDI>'
     text = virtual((1, "image.tif")).replace("<VRTRasterBand", f"{positions}</Metadata><VRTRasterBand", 1)
     (folder / "image.vrt").write_text(text)
     assert other_files(str(folder / "image.vrt")) == [str(folder / "image.tif"), str(folder / "x.tif")]
