@@ -1023,7 +1023,7 @@ def test_match_pair__resumes_after_a_file_that_appeared_beside_its_results(pair,
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
 
 
-@pytest.mark.parametrize("command", ["match", "surface"])
+@pytest.mark.parametrize("command", ["match", pytest.param("surface", marks=pytest.mark.peer("shareloc"))])
 def test_commands__end_where_settings_are_replaced_before_the_images_are_opened(pair, monkeypatch, command):
     """Else old settings and new images would be mixed, where a whole folder is exchanged."""
     folder, _ = pair
