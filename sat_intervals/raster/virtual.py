@@ -30,8 +30,9 @@ def sources(path: str, dataset: DatasetReader) -> list[str]:
         A source has no name that can be watched.
     """
     positions = {key.upper(): value for key, value in dataset.tags(ns="GEOLOCATION").items()}
-    found = [_resolved(path, positions[key], may_be_relative=True) for key in _POSITIONS if key in positions]
-    found = list(filter(os.path.exists, found))  # needed only where GDAL warps
+    names = [positions[key] for key in _POSITIONS if key in positions]
+    # needed only where GDAL warps
+    found = [place for name in names for place in (_beside(path, name), name) if os.path.exists(place)]
     if dataset.driver == "VRT":
         for element in ElementTree.fromstring(_text(path, dataset)).iter():
             if (kind := element.get("subClass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
@@ -42,7 +43,8 @@ def sources(path: str, dataset: DatasetReader) -> list[str]:
             if element.get("key") == "ROOT_PATH" and not _is_own_folder(path, element.text):
                 raise InputError(f"{path} has sources in another folder than it says: convert it with gdal_translate")
             if element.tag in _TAGS and element.text:
-                found.append(_resolved(path, element.text, may_be_relative=element.get("relativeToVRT") == "1"))
+                is_relative = element.get("relativeToVRT") == "1"
+                found.append(_resolved(path, element.text) if is_relative else element.text)
     return found
 
 
@@ -57,7 +59,12 @@ def _text(path: str, dataset: DatasetReader) -> str:
         raise InputError(f"{path} is not in UTF-8: write it with gdalbuildvrt") from error
 
 
-def _resolved(path: str, name: str, *, may_be_relative: bool) -> str:
-    """Return the name of a source from the working directory; GDAL follows a link to the virtual raster first."""
-    beside = os.path.join(os.path.dirname(os.path.realpath(path) if os.path.isfile(path) else path), name)
-    return beside if may_be_relative and os.path.exists(beside) else name
+def _resolved(path: str, name: str) -> str:
+    """Return the name of a relative source as seen from the working directory; ``A:b.tif`` may be a file, too."""
+    beside = _beside(path, name)
+    return beside if os.path.exists(beside) or not is_in_another(name) else name
+
+
+def _beside(path: str, name: str) -> str:
+    """Return a name in the folder of a virtual raster; GDAL follows a link to it first."""
+    return os.path.join(os.path.dirname(os.path.realpath(path) if os.path.isfile(path) else path), name)

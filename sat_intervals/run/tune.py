@@ -24,7 +24,6 @@ from sat_intervals.store.manifest import StoreError
 COVERAGE = 0.9  # that settings are compared at
 # Settings with fewer good pixels than this share of the most are not chosen, however narrow their intervals.
 _GOOD_ENOUGH = 0.95
-
 # Errors that say nothing of the settings that are tried, such as a lost truth or a full disk.
 OF_ALL = RunError, InputError, OutputError, StoreError
 

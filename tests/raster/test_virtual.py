@@ -101,6 +101,15 @@ def test_other_files__are_those_of_virtual_rasters_in_archives(folder):
     assert sources <= set(other_files(str(folder / "outer.vrt")))
 
 
+def test_other_files__are_those_beside_a_virtual_raster_in_an_archive(folder):
+    (folder / "image.vrt").write_text(virtual((1, "image.tif"), SOURCE.format(1, "mask.tif")))
+    with zipfile.ZipFile(folder / "all.zip", "w") as archive:
+        for name in ("image.vrt", "image.tif", "mask.tif"):
+            archive.write(folder / name, name)
+    inside = f"/vsizip/{folder}/all.zip"
+    assert other_files(f"{inside}/image.vrt") == [f"{inside}/image.tif", f"{inside}/mask.tif"]
+
+
 def test_other_files__of_a_name_of_one_in_an_archive_are_the_archive(folder):
     name = zipped(folder, "image", "image.tif")
     assert other_files(f"vrt://{name}") == [name]
