@@ -35,7 +35,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     with Console(run.quiet or as_json) as console:
 
         def progress(stage: str, done: int, total: int) -> None:
-            if stage == "pairs" and done < 2:  # while the images of the first one are opened
+            if stage == "pairs":  # between opening the images of one and those of the next
                 check_given()
             console.progress(stage, done, total)
 

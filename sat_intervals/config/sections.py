@@ -1,9 +1,9 @@
 """Sections of the settings: names, ranges and meanings."""
 
 import json
-import os
 from collections.abc import Mapping
 from decimal import Decimal
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
@@ -83,7 +83,7 @@ class Disparity(Section):
     @field_validator("grid")
     @classmethod
     def _make_absolute(cls, value: str | None) -> str | None:
-        return None if value is None else os.path.abspath(value)
+        return None if value is None else str(Path(value).absolute())
 
     @property
     def is_local(self) -> bool:
@@ -171,7 +171,7 @@ class Mccnn(Section):
     @field_validator("weights")
     @classmethod
     def _make_absolute(cls, value: str | None) -> str | None:
-        return None if value is None else os.path.abspath(value)  # workers may have another working directory
+        return None if value is None else str(Path(value).absolute())  # workers may have another working directory
 
     @property
     def window(self) -> int:

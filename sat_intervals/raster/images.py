@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -16,11 +17,13 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import local_file, stamp_of, watched
 from sat_intervals.raster.seal import check_seal, is_read
-from sat_intervals.raster.virtual import is_in_another, sources
+from sat_intervals.raster.virtual import sources_of
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
+# Names of files whose changes would not be noticed: in archives on servers.
+_IN_REMOTE = re.compile(r"(/?vsi(zip|tar|gzip|7z|rar|subfile)/(\d+(_\d+)?,)?\{?)+/?vsi(curl|s3|gs|az|adls|oss|swift)")
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
 
@@ -219,7 +222,8 @@ def _check_beside(path: str, listed: dict[str, list[str]] | None = None) -> None
 def _absolute(path: str | os.PathLike[str]) -> str:
     """Return the absolute path of a local file, and other GDAL names unchanged."""
     name = os.fspath(path)
-    return os.path.abspath(name) if os.path.exists(name) else name
+    # "link/.." is the folder above the target of the link, which os.path.abspath takes for that above the link
+    return str(Path(name).absolute()) if os.path.exists(name) else name
 
 
 def _kinds(dataset: DatasetReader) -> tuple[list[int], list[int]]:
@@ -251,7 +255,10 @@ def _check_mask(image: Image, mask: str) -> None:
 
 def _check_watched(name: str, dataset: DatasetReader) -> None:
     """Raise if the tool could not notice that files of a raster are incomplete or change."""
-    if any(map(os.path.isdir, (name, *dataset.files))) or "/vsisparse/" in name or "/vsicached" in name:
+    names = name, *dataset.files
+    if remote := next(filter(_IN_REMOTE.match, names), None):
+        raise InputError(f"{remote} is in an archive on a server, of which a change would not be noticed: download it")
+    if any(map(os.path.isdir, names)) or "/vsisparse/" in name or "/vsicached" in name:
         raise InputError(
             f"{name} is read from files that GDAL does not list, which may change during a run: convert it with "
             "gdal_translate"
@@ -271,11 +278,22 @@ def other_files(name: str) -> list[str]:
     InputError
         GDAL does not list all of them.
     """
+    return _survey(name)[0]
+
+
+def is_resampled(name: str) -> bool:
+    """Return whether GDAL may read a raster from overviews of other files: a source of a virtual one is resampled."""
+    return _survey(name)[1]
+
+
+def _survey(name: str) -> tuple[list[str], bool]:
+    """Return `other_files`, and `is_resampled`."""
     seen: set[str] = set()
     asked: set[str] = set()
     named: set[str] = set()  # by virtual rasters
     listed: dict[str, list[str]] = {}
     waiting = [name]
+    are_resampled = False
     while waiting:
         path = waiting.pop()
         if path in asked:
@@ -286,18 +304,27 @@ def other_files(name: str) -> list[str]:
         try:
             with gdal.reading(path) as dataset:
                 _check_watched(path, dataset)
-                files = dataset.files
-                others = [source for source in sources(path, dataset) if source not in files]
+                files, sources = dataset.files, sources_of(path, dataset)
         except gdal.GDAL_ERRORS as error:
             if path in named:
-                raise InputError(f"{path}, of which {name} is made, cannot be read: {gdal.reason(error)}") from error
+                raise InputError(
+                    f"{path}, of which {name} is made, cannot be read: {gdal.reason(error)}: restore it or make {name} "
+                    "again"
+                ) from error
             continue  # a sidecar file that is not a raster
-        named.update(others)
-        waiting += others
-        new = [file for file in files if file not in seen and not _is_same(file, name)]
-        seen.update(new)
-        waiting += filter(_may_have_others, new)
-    return sorted(seen)
+        known = set(map(_place, files))
+        others = {source for source in sources.names if _place(source) not in known}
+        new = {file for file in files if file not in seen and not _is_same(file, name)}
+        seen |= new | {source for source in others if not _may_have_others(source)}
+        named |= others
+        waiting += [*filter(_may_have_others, new | others), *sources.positions]
+        are_resampled |= sources.are_resampled
+    return sorted(seen), are_resampled
+
+
+def _place(name: str) -> str:
+    """Return a local file without links, and other names as they are."""
+    return os.path.realpath(name) if os.path.exists(name) else name
 
 
 def _is_same(file: str, name: str) -> bool:
@@ -308,9 +335,9 @@ def _is_same(file: str, name: str) -> bool:
 
 
 def _may_have_others(name: str) -> bool:
-    """Return whether to open a file for others: no pipe, which could block; of remote ones only virtual rasters."""
-    is_remote_vrt = name.endswith((".vrt", ".VRT")) and not os.path.exists(name)
-    return local_file(name) is not None or is_remote_vrt or is_in_another(name)
+    """Return whether to open a file for others: of remote ones only virtual rasters."""
+    is_remote = local_file(name) is None and name.startswith(("/vsi", "http", "s3:", "gs:", "az:"))
+    return not is_remote or name.endswith((".vrt", ".VRT"))
 
 
 def watched_rasters(files: Iterable[str | Path | None]) -> Callable[[], None]:

@@ -7,7 +7,6 @@ import os
 import re
 import zlib
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,7 +19,7 @@ _SEAL = re.compile(_LINE + rb"([0-9a-f]{8})\n")
 # Bytes of a file among which the line is.
 _BEGINNING = 1024
 # Endings, in any case, of files that GDAL reads with a raster: after its whole name, and instead of its own.
-_BESIDE, _OF_STEM = (".aux.xml", ".msk", ".ovr"), (".rpb", "_rpc.txt")
+_BESIDE, _OF_STEM = (".aux.xml", ".aux", ".msk", ".ovr"), (".aux", ".rpb", ".rpc", "_rpc.txt", ".imd")
 # Those that it reads with a raster without a transform of its own.
 _PLACES = ".tfw", ".tifw", ".pgw", ".pngw", ".wld", ".tab"
 # Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes. Names of bands are repeated.
@@ -103,12 +102,13 @@ def check_place(path: Path, *, is_placed: bool = True) -> None:
     ``is_placed`` says whether the raster has a transform of its own.
     """
     of_stem = _OF_STEM if is_placed else (*_OF_STEM, *_PLACES)
-    names = {f"{path.name}{ending}".lower() for ending in _BESIDE}
-    names |= {f"{path.stem}{ending}".lower() for ending in of_stem}
-    there: list[str] = []
-    with suppress(OSError):  # GDAL cannot list it either
-        there = os.listdir(path.parent)
-    check_beside(path, sorted(str(path.parent / name) for name in there if name.lower() in names))
+    names = [f"{path.name}{ending}" for ending in _BESIDE] + [f"{path.stem}{ending}" for ending in of_stem]
+    try:
+        lowered = {name.lower() for name in names}
+        there = [name for name in os.listdir(path.parent) if name.lower() in lowered]
+    except OSError:  # GDAL asks for each name in a folder that it cannot list
+        there = [name for name in names if os.path.lexists(path.with_name(name))]
+    check_beside(path, sorted(str(path.with_name(name)) for name in there))
 
 
 def is_read(file: str) -> bool:

@@ -2,6 +2,8 @@
 
 import os
 import re
+from collections.abc import Iterator
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 from rasterio.io import DatasetReader
@@ -14,13 +16,26 @@ _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
 _TAGS, _POSITIONS = ("SourceFilename", "SourceDataset", "DEMPath"), ("X_DATASET", "Y_DATASET")
 
 
-def is_in_another(name: str) -> bool:
-    """Return whether a name of GDAL contains that of a file."""
-    return _IN_ANOTHER.match(name) is not None
+class Sources(NamedTuple):
+    """What a raster is made of.
+
+    Attributes
+    ----------
+    names
+        Sources of the bands and masks of a virtual raster.
+    positions
+        Rasters with the positions of pixels: they are read only where GDAL warps, and need not exist.
+    are_resampled
+        Whether GDAL may read sources at another resolution, and thus their overviews.
+    """
+
+    names: list[str]
+    positions: list[str]
+    are_resampled: bool
 
 
-def sources(path: str, dataset: DatasetReader) -> list[str]:
-    """Return the names of all sources of an open raster: those of bands, masks and positions of a virtual one.
+def sources_of(path: str, dataset: DatasetReader) -> Sources:
+    """Return the sources of an open raster.
 
     They are taken from the text that GDAL writes of the raster, in one spelling, however its own is spelled.
 
@@ -29,42 +44,67 @@ def sources(path: str, dataset: DatasetReader) -> list[str]:
     InputError
         A source has no name that can be watched.
     """
-    positions = {key.upper(): value for key, value in dataset.tags(ns="GEOLOCATION").items()}
-    names = [positions[key] for key in _POSITIONS if key in positions]
-    # needed only where GDAL warps
-    found = [place for name in names for place in (_beside(path, name), name) if os.path.exists(place)]
-    if dataset.driver == "VRT":
-        for element in ElementTree.fromstring(_text(path, dataset)).iter():
-            if (kind := element.get("subClass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
-                raise InputError(
-                    f"{path} has a {kind}, of which GDAL does not report missing data or changed files: convert it "
-                    "with gdal_translate"
-                )
-            if element.get("key") == "ROOT_PATH" and not _is_own_folder(path, element.text):
-                raise InputError(f"{path} has sources in another folder than it says: convert it with gdal_translate")
-            if element.tag in _TAGS and element.text:
-                is_relative = element.get("relativeToVRT") == "1"
-                found.append(_resolved(path, element.text) if is_relative else element.text)
-    return found
+    names, are_resampled, metadata = [], False, list(dataset.tags(ns="GEOLOCATION").items())
+    own = "" if path.lstrip().startswith("<") else next(iter(dataset.files), path)  # "/vsicurl/http://" for "http://"
+    for element in _elements(path, dataset) if dataset.driver == "VRT" else ():
+        if (kind := element.get("subClass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
+            raise InputError(
+                f"{path} has a {kind}, of which GDAL does not report missing data or changed files: convert it with "
+                "gdal_translate"
+            )
+        if element.tag == "OOI" and element.get("key") == "ROOT_PATH" and not _is_own_folder(path, element.text):
+            raise InputError(
+                f"{path} has sources relative to {element.text} (ROOT_PATH): convert it with gdal_translate"
+            )
+        metadata.append((element.get("key", ""), element.text or ""))
+        if element.tag in _TAGS and element.text:
+            names.append(_resolved(own, element) if element.get("relativeToVRT") == "1" else element.text)
+        are_resampled |= element.find("SourceFilename") is not None and _is_resampled(element)
+    positions = [name for key, name in metadata if key.upper() in _POSITIONS]
+    return Sources(names, [place for name in positions for place in (_beside(own, name), name)], are_resampled)
+
+
+def _elements(path: str, dataset: DatasetReader) -> Iterator[ElementTree.Element]:
+    """Yield the elements of a virtual raster, but not its metadata, which may be any XML."""
+    try:
+        root = ElementTree.fromstring(str(dataset.tags(ns="xml:VRT")["xml:VRT"]))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not in UTF-8: write it with gdalbuildvrt") from error
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path} has metadata that are not XML ({error}): convert it with gdal_translate") from error
+    for parent in [*root.iter("VRTDataset"), *root.iter("VRTRasterBand")]:
+        for metadata in parent.findall("Metadata"):
+            parent.remove(metadata)
+    return root.iter()
 
 
 def _is_own_folder(path: str, folder: str | None) -> bool:
     return not folder or os.path.realpath(folder) == os.path.dirname(os.path.realpath(path))
 
 
-def _text(path: str, dataset: DatasetReader) -> str:
-    try:
-        return str(dataset.tags(ns="xml:VRT")["xml:VRT"])
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not in UTF-8: write it with gdalbuildvrt") from error
+def _is_resampled(source: ElementTree.Element) -> bool:
+    """Return whether a source is, or may be, read at another size than its own."""
+    parts = source.find("SrcRect"), source.find("DstRect")
+    sizes = [[float(part.get(side, "nan")) for side in ("xSize", "ySize")] for part in parts if part is not None]
+    return len(sizes) < 2 or sizes[0] != sizes[1]
 
 
-def _resolved(path: str, name: str) -> str:
-    """Return the name of a relative source as seen from the working directory; ``A:b.tif`` may be a file, too."""
-    beside = _beside(path, name)
-    return beside if os.path.exists(beside) or not is_in_another(name) else name
+def _resolved(own: str, source: ElementTree.Element) -> str:
+    """Return the name of a relative source as seen from the working directory; ``A:b.tif`` may be a file, too.
+
+    GDAL follows a link to a virtual raster, but writes the source of a warped one relative to the link.
+    """
+    name = source.text or ""
+    beside = _beside(own if source.tag == "SourceDataset" else _followed(own), name)
+    return beside if os.path.exists(beside) or not _IN_ANOTHER.match(name) else name
 
 
 def _beside(path: str, name: str) -> str:
-    """Return a name in the folder of a virtual raster; GDAL follows a link to it first."""
-    return os.path.join(os.path.dirname(os.path.realpath(path) if os.path.isfile(path) else path), name)
+    return os.path.join(os.path.dirname(path), name)
+
+
+def _followed(path: str) -> str:
+    """Return the target of a link, whatever the links on the way to it."""
+    while os.path.islink(path):
+        path = _beside(path, os.readlink(path))
+    return path

@@ -106,6 +106,7 @@ class OutputWriter:
 
     def __enter__(self) -> Self:
         self._check_places()
+        self._check_beside_places()
         with self._failing(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
         self._check_hidden()
@@ -119,7 +120,7 @@ class OutputWriter:
                 self._pinned = self._locked.enter_context(pinned(self._scratch))
                 self._folders = {place: place.lstat() for place in (self._hidden, self._scratch, self._replaced)}
                 self._there = stamps(self._folder, self._names)
-            self._check_space(1)
+            check_space(self._folder, file_bytes(self._files, *self._shape), "files")
         except BaseException:
             self._clean()
             raise
@@ -138,10 +139,14 @@ class OutputWriter:
             raise OutputError(f"{foreign} was not written by sat-intervals: move {self._hidden} away")
 
     def _check_places(self) -> None:
-        """Raise if something is in the place of a file, or beside it, that must not be there."""
+        """Raise if something is in the place of a file that is not a file."""
         for place in (self._folder / file.name for file in self._files):
             if place.exists() and not place.is_file():
                 raise OutputError(f"{place} cannot be written: it is not a regular file: choose another name or folder")
+
+    def _check_beside_places(self) -> None:
+        """Raise if GDAL would read a file with one of those that are written, see `check_place`."""
+        for place in (self._folder / file.name for file in self._files):
             try:
                 check_place(place, is_placed=self._georeferencing.transform is not None)
             except SatIntervalsError as error:
@@ -168,7 +173,7 @@ class OutputWriter:
     def write(self, row: int, *rasters: np.ndarray) -> None:
         """Write the strip that begins at ``row``; one array per file, ``(bands, rows, width)`` or ``(rows, width)``."""
         if not row:
-            self._check_space(2)  # for parts or a plain file beside each final one
+            check_space(self._folder, 2 * file_bytes(self._files, *self._shape), "files")  # parts or plain files, too
         for file, raster in zip(self._files, rasters, strict=True):
             bands = np.ascontiguousarray(raster.reshape(-1, *raster.shape[-2:]), file.dtype)
             with self._failing(self._folder / file.name):
@@ -258,6 +263,7 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 if checksum_of(self._pinned / name) != checksum:
                     raise OSError(errno.EIO, "the content read back differs from that written")
+        self._check_beside_places()  # some may have appeared
         self._check_folders()
         if not self._scratch.exists():  # perhaps another folder took the place of the whole one
             raise OutputError(f"{self._scratch}, a folder of temporary files, is gone: rerun the command")
@@ -291,9 +297,6 @@ class OutputWriter:
         # GDAL hides the system's reason
         is_full = shutil.disk_usage(self._folder).free < file_bytes(self._files, *self._shape)
         return f"{os.strerror(errno.ENOSPC)}: {gdal.reason(error)}" if is_full else gdal.reason(error)
-
-    def _check_space(self, copies: int) -> None:
-        check_space(self._folder, copies * file_bytes(self._files, *self._shape), "files")
 
     def _clean(self) -> None:
         for strips, _ in self._pictures.values():

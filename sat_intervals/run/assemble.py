@@ -88,6 +88,8 @@ def assemble(
             parts, workers = finish_strips(job, client, scale, records, progress)
         with logged_stage(seconds, "files"):
             assemble_files(job, writer, parts, workers, progress)
+            if keep_tiles:  # strips of a killed run are finished without reading its tiles again
+                job.store.check_intact(records)
             job.check_inputs()
             steps = len(files) * len(parts)
             progress("files", steps, steps)  # a last chance to interrupt the run before it publishes

@@ -102,6 +102,7 @@ def match_batch(
                     note({pair.name: {"state": "done before", **before}})
             except Exception as error:  # one pair's failure must not stop the others
                 note({pair.name: _failed(error)})
+        progress("pairs", len(pairs), len(pairs))
         for name, how in _matched(jobs, connection, keep_tiles, progress):
             note({name: how})
         for pair in pairs:

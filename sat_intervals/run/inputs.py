@@ -12,11 +12,14 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.raster import Image, is_replaced, other_files, read_files
+from sat_intervals.raster import Image, is_replaced, is_resampled, read_files
 from sat_intervals.raster.identity import identity
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
+
+# Endings, in any case, of files beside a raster that GDAL reads with it: masks, no-data values and overviews.
+_SIDECARS = ".msk", ".aux.xml", ".aux", ".ovr"
 
 
 def describe_inputs(
@@ -75,20 +78,23 @@ def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dic
 
 def _with_others(name: str, identified: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
     """Return the identity of a raster and of the other files it is read from."""
-    return {**identified(name), "files": [identified(file) for file in other_files(name)]}
+    return {**identified(name), "files": [identified(file) for file in read_files(name)[1:]]}
 
 
 def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | None:
-    """Return a mask file or ``.aux.xml`` beside images, masks or their sources that is not an input; None if none is.
+    """Return a file beside sources of images or masks that is no input but may change what is read; None if none is.
 
-    That of an image without a mask does not matter: the image is read as it was when it was opened.
+    One beside the image itself does not matter, which is read as it was when it was opened; but for a mask, if the
+    image has one.
     """
-    endings = ".msk", ".aux.xml"
     for image in (left, right):
         for name in filter(None, (image.path, image.mask)):
-            own = [] if image.use_mask else [f"{name}{ending}".lower() for ending in endings]
+            own = {f"{name}{ending}".lower() for ending in _SIDECARS}
+            if name == image.path and image.use_mask:
+                own.remove(f"{name}.msk".lower())
             for file in read_files(name):
-                if file.lower().endswith(endings) and file.lower() not in own and file not in files:
+                is_sidecar = file.lower().endswith(_SIDECARS) and file.lower() not in own and file not in files
+                if is_sidecar and (not file.lower().endswith(".ovr") or is_resampled(name)):
                     return file
     return None
 

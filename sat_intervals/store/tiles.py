@@ -325,6 +325,12 @@ class Store:
         with self._damage_handled():
             yield from self._arrays.strips(rows, _checksums(records), first, last)
 
+    def check_intact(self, records: Records) -> None:
+        """Compare the files of all tiles with their checksums; errors as in `strips`."""
+        with self._damage_handled():
+            if not self._arrays.are_intact(_checksums(records)):
+                raise DamagedFileError
+
     @contextmanager
     def _damage_handled(self) -> Iterator[None]:
         """If the block meets a damaged file, delete all damaged tiles, so that one retry matches them again."""

@@ -1,12 +1,14 @@
 """Identity of input files; inputs on a web server, read by windows and identified by size and ETag."""
 
 import hashlib
+import io
 import itertools
 import json
 import os
 import subprocess
 import sys
 import time
+import zipfile
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 
@@ -212,6 +214,27 @@ def test_open_image__counts_each_file_on_a_server_once(web_server, images):
     put({**images, "left.tif.msk": mask_of(SIDE)}, web_server.folder)
     name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
     assert opened(name) == [True, name, f"/vsicurl/{name}.msk"]
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        "/vsizip//vsicurl/{}/left.tif",
+        "/vsizip/{{/vsicurl/{}}}/left.tif",
+        "zip+{}!left.tif",
+        "vrt:///vsizip//vsicurl/{}/left.tif",
+    ],
+)
+def test_open_image__refuses_archives_on_servers(web_server, images, way):
+    """Nobody would notice a change: GDAL does not say whether one has changed."""
+    memory = io.BytesIO()
+    with zipfile.ZipFile(memory, "w") as archive:
+        archive.writestr("left.tif", images["left.tif"])
+    put({"all.zip": memory.getvalue()}, web_server.folder)
+    name = way.format(f"http://127.0.0.1:{web_server.server_address[1]}/all.zip")
+    with pytest.raises(subprocess.CalledProcessError) as failure:
+        opened(name)
+    assert "is in an archive on a server, of which a change would not be noticed: download it" in failure.value.stderr
 
 
 def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, monkeypatch):

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import warnings
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -39,6 +40,7 @@ from sat_intervals.raster import (
     check_pair,
     gdal,
     open_image,
+    other_files,
     publishing,
     read_layers,
     read_window,
@@ -47,6 +49,7 @@ from sat_intervals.raster import (
     write_layer,
     write_rows,
 )
+from sat_intervals.raster.identity import local_file
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.tiling import View, Window
 
@@ -142,6 +145,28 @@ def test_open_image__finds_a_relative_path_from_anywhere(tmp_path, monkeypatch):
     make(tmp_path / "left.tif", RAMP)
     monkeypatch.chdir(tmp_path)
     assert open_image("left.tif").path == str(tmp_path / "left.tif")
+
+
+def test_open_image__opens_the_file_that_the_system_finds_above_the_target_of_a_link(tmp_path, monkeypatch):
+    (tmp_path / "job" / "lists").mkdir(parents=True)
+    make(tmp_path / "left.tif", RAMP)
+    make(tmp_path / "job" / "left.tif", RAMP + 1)
+    (tmp_path / "lists").symlink_to("job/lists")
+    monkeypatch.chdir(tmp_path)
+    for name in ("lists/../left.tif", tmp_path / "lists" / ".." / "left.tif"):
+        image = open_image(name)
+        np.testing.assert_array_equal(read_window(image, whole(image))[0], RAMP + 1)
+
+
+@pytest.mark.parametrize("name", ["file://{}", "zip://{}!left.tif", "zip+file://{}!left.tif"])
+def test_other_files__of_a_name_of_rasterio_are_the_local_file(tmp_path, name):
+    file = make(tmp_path / "left.tif", RAMP)
+    if name.startswith("zip"):
+        with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+            archive.write(file, "left.tif")
+        file = tmp_path / "all.zip"
+    image = open_image(name.format(file))
+    assert str(local_file(*other_files(image.path))) == str(file)
 
 
 def test_open_image__reads_through_the_virtual_file_systems_of_gdal(tmp_path):

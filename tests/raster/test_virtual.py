@@ -1,22 +1,36 @@
 """Sources of virtual rasters: whatever their spelling, the tool knows all files that GDAL reads."""
 
 import gzip
+import os
 import re
 import zipfile
 
 import numpy as np
 import pytest
 import rasterio
+from rasterio.crs import CRS
 from rasterio.rpc import RPC
 from rasterio.transform import from_origin
 
-from sat_intervals.raster import InputError, open_image, other_files
+from sat_intervals.raster import InputError, is_resampled, open_image, other_files
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 SIZE = 16
 BAND = '<VRTRasterBand dataType="{}"{}><SimpleSource>{}<SourceBand>1</SourceBand></SimpleSource></VRTRasterBand>'
 SOURCE = '<SourceFilename relativeToVRT="{}">{}</SourceFilename>'
+
+WARPED = (
+    f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}" subClass="VRTWarpedDataset"><SRS>EPSG:4326</SRS>'
+    '<GeoTransform>5.4, 0.0125, 0, 43.6, 0, -0.0125</GeoTransform><VRTRasterBand dataType="UInt16" band="1" '
+    'subClass="VRTWarpedRasterBand"/><BlockXSize>16</BlockXSize><BlockYSize>16</BlockYSize><GDALWarpOptions>'
+    '<SourceDataset relativeToVRT="1">image.tif</SourceDataset><Transformer><GenImgProjTransformer>{}'
+    "<DstGeoTransform>5.4,0.0125,0,43.6,0,-0.0125</DstGeoTransform>"
+    "<DstInvGeoTransform>-432,80,0,3488,0,-80</DstInvGeoTransform></GenImgProjTransformer></Transformer>"
+    '<BandList><BandMapping src="1" dst="1"/></BandList></GDALWarpOptions></VRTDataset>'
+)
+
+GRID = "5.4,0.0125,0,43.6,0,-0.0125"
 
 
 def virtual(image, mask=""):
@@ -90,7 +104,7 @@ def test_other_files__are_those_of_the_virtual_raster_that_a_link_names(folder, 
     link = folder / "linked" / "image.vrt"
     write(folder / "linked" / "mask.tif", "uint8")  # another one
     link.symlink_to(folder / "image.vrt" if is_absolute else "../image.vrt")
-    assert str(folder / "mask.tif") in other_files(str(link))
+    assert str(folder / "mask.tif") in map(os.path.realpath, other_files(str(link)))
 
 
 def test_other_files__are_those_of_virtual_rasters_in_archives(folder):
@@ -127,15 +141,9 @@ def test_other_files__are_those_of_warping_too(folder, monkeypatch):
         coefficients = {name: [float(part) for part in str(value).split()] for name, value in values.items()}
         file.rpcs = RPC(**{name: part if "coeff" in name else part[0] for name, part in coefficients.items()})
     model = "".join(f'<MDI key="{name.upper()}">{value}</MDI>' for name, value in values.items())
+    heights = f"<DEMPath>heights.tif</DEMPath><Metadata>{model}</Metadata>"
     (folder / "warped.vrt").write_text(
-        f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}" subClass="VRTWarpedDataset"><SRS>EPSG:4326</SRS>'
-        '<GeoTransform>5.4, 0.0125, 0, 43.6, 0, -0.0125</GeoTransform><VRTRasterBand dataType="UInt16" band="1" '
-        'subClass="VRTWarpedRasterBand"/><BlockXSize>16</BlockXSize><BlockYSize>16</BlockYSize><GDALWarpOptions>'
-        '<SourceDataset relativeToVRT="1">image.tif</SourceDataset><Transformer><GenImgProjTransformer>'
-        f"<SrcRPCTransformer><RPCTransformer><DEMPath>heights.tif</DEMPath><Metadata>{model}</Metadata>"
-        "</RPCTransformer></SrcRPCTransformer><DstGeoTransform>5.4,0.0125,0,43.6,0,-0.0125</DstGeoTransform>"
-        "<DstInvGeoTransform>-432,80,0,3488,0,-80</DstInvGeoTransform></GenImgProjTransformer></Transformer>"
-        '<BandList><BandMapping src="1" dst="1"/></BandList></GDALWarpOptions></VRTDataset>'
+        WARPED.format(f"<SrcRPCTransformer><RPCTransformer>{heights}</RPCTransformer></SrcRPCTransformer>")
     )
     assert set(other_files(str(folder / "warped.vrt"))) == {str(folder / "image.tif"), "heights.tif"}
 
@@ -165,7 +173,7 @@ REFUSED = {
         virtual((1, "image.tif")).replace(
             "<SourceBand>", '<OpenOptions><OOI key="ROOT_PATH">elsewhere</OOI></OpenOptions><SourceBand>'
         ),
-        "has sources in another folder than it says",
+        "has sources relative to elsewhere",
     ),
     "a subdataset beside it": (
         virtual((1, "image.tif"), SOURCE.format(1, "GTIFF_DIR:1:mask.tif")),
@@ -184,3 +192,82 @@ def test_other_files__refuse_what_they_could_not_name(folder, kind):
     (folder / "image.vrt").write_text(text)
     with pytest.raises(InputError, match=problem):
         other_files(str(folder / "image.vrt"))
+
+
+@pytest.mark.parametrize("is_zipped", [False, True])
+def test_other_files__are_the_positions_that_a_warped_raster_names(folder, is_zipped):
+    steps = 0.0125 * np.arange(SIZE)
+    for name, values in (("x.tif", 5.4 + steps), ("y.tif", 43.6 - steps[:, np.newaxis])):
+        write(folder / name, "float64")
+        with rasterio.open(folder / name, "r+") as file:
+            file.write(np.broadcast_to(values, (1, SIZE, SIZE)))
+    names = [zipped(folder, name, f"{name}.tif") if is_zipped else str(folder / f"{name}.tif") for name in "xy"]
+    metadata = "".join(
+        f'<MDI key="{key}_DATASET">{name}</MDI><MDI key="{key}_BAND">1</MDI>'
+        for key, name in zip("XY", names, strict=True)
+    )
+    offsets = {
+        "PIXEL_OFFSET": 0,
+        "LINE_OFFSET": 0,
+        "PIXEL_STEP": 1,
+        "LINE_STEP": 1,
+        "SRS": CRS.from_epsg(4326).to_wkt(),
+    }
+    metadata += "".join(f'<MDI key="{key}">{value}</MDI>' for key, value in offsets.items())
+    transformer = f"<GeoLocTransformer><Reversed>0</Reversed><Metadata>{metadata}</Metadata></GeoLocTransformer>"
+    (folder / "warped.vrt").write_text(WARPED.format(f"<SrcGeoLocTransformer>{transformer}</SrcGeoLocTransformer>"))
+    assert set(other_files(str(folder / "warped.vrt"))) == {str(folder / "image.tif"), *names}
+
+
+def test_other_files__are_the_source_of_a_warped_raster_behind_a_link(folder):
+    """GDAL writes the source of a warped raster relative to the link, not to its target."""
+    (folder / "below").mkdir()
+    write(folder / "below" / "image.tif")
+    (folder / "below" / "warped.vrt").write_text(WARPED.format(f"<SrcGeoTransform>{GRID}</SrcGeoTransform>"))
+    (folder / "warped.vrt").symlink_to("below/warped.vrt")
+    assert other_files(str(folder / "warped.vrt")) == [str(folder / "below" / "image.tif")]
+
+
+def test_other_files__below_a_linked_folder_are_named_once(folder):
+    (folder / "image.vrt").write_text(virtual((1, "image.tif"), SOURCE.format(1, "mask.tif")))
+    link = folder.with_name(f"{folder.name}-linked")
+    link.symlink_to(folder)
+    assert other_files(str(link / "image.vrt")) == [str(link / "image.tif"), str(link / "mask.tif")]
+
+
+def test_other_files__of_a_text_are_found_from_the_working_directory(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert other_files(virtual((1, "image.tif"), SOURCE.format(1, "mask.tif"))) == ["image.tif", "mask.tif"]
+
+
+HISTORY = (
+    '<Metadata><MDI key="ROOT_PATH">/elsewhere</MDI></Metadata>'
+    '<Metadata domain="xml:HISTORY" format="xml"><SourceDataset>gone.tif</SourceDataset></Metadata>'
+)
+
+
+@pytest.mark.parametrize("parent", ["VRTDataset", "VRTRasterBand"])
+def test_other_files__are_not_those_that_metadata_mention(folder, parent):
+    text = re.sub(f"(<{parent}[^>]*>)", rf"\1{HISTORY}", virtual((1, "image.tif")), count=1)
+    (folder / "image.vrt").write_text(text)
+    assert other_files(str(folder / "image.vrt")) == [str(folder / "image.tif")]
+
+
+def test_open_image__names_a_virtual_raster_with_metadata_that_are_not_xml(folder):
+    history = '<Metadata domain="xml:HISTORY" format="xml"><its:history/></Metadata><VRTRasterBand'
+    (folder / "image.vrt").write_text(virtual((1, "image.tif")).replace("<VRTRasterBand", history))
+    with pytest.raises(InputError, match=r"image\.vrt has metadata that are not XML \(.*\): convert it with gdal_tr"):
+        open_image(folder / "image.vrt")
+
+
+@pytest.mark.parametrize(("size", "is_other"), [(SIZE, False), (SIZE // 2, True), (None, True)])
+def test_is_resampled__of_a_virtual_raster_of_virtual_ones(folder, size, is_other):
+    parts = f'<SrcRect xSize="{size}" ySize="{SIZE}"/><DstRect xSize="{SIZE}.0" ySize="{SIZE}"/>' if size else ""
+    parts = f"<SourceBand>1</SourceBand>{parts}"
+    (folder / "inner.vrt").write_text(virtual((1, "image.tif")).replace("<SourceBand>1</SourceBand>", parts))
+    outer = virtual((0, "vrt://inner.vrt")).replace(
+        "<SourceBand>1</SourceBand>", parts.replace(str(SIZE // 2), str(SIZE))
+    )
+    (folder / "outer.vrt").write_text(outer.replace("inner.vrt", str(folder / "inner.vrt")))
+    assert is_resampled(str(folder / "inner.vrt")) == is_resampled(str(folder / "outer.vrt")) == is_other
+    assert not is_resampled(str(folder / "image.tif"))

@@ -229,22 +229,24 @@ def test_match_batch__ends_pairs_whose_files_were_replaced_since_the_first_one(i
     assert f"{name} was replaced or changed while it was read: rerun the command" in states["pair2"]["error"]
 
 
+@pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("name", ["pairs.csv", "settings.yaml"])
 def test_batch__ends_where_what_it_was_given_is_replaced_before_the_images_are_opened(
-    images, tmp_path, monkeypatch, name
+    images, tmp_path, monkeypatch, name, count
 ):
     """Else old settings and new images would be mixed, where a whole folder is exchanged."""
-    lines = [f"{pair.name},{pair.left},{pair.right},-18,40" for pair in read_batch(rows(images))]
+    lines = [f"{pair.name},{pair.left},{pair.right},-18,40" for pair in read_batch(rows(images))[:count]]
     (tmp_path / "pairs.csv").write_text("\n".join(["name,left,right,minimum,maximum", *lines]) + "\n")
     (tmp_path / "settings.yaml").write_text("sgm: {p2: 48}")
-    read_report = batch.read_report
+    prepared, opened = batch.prepare, itertools.count(1)
 
-    def and_replaced(out):
-        shutil.copy(tmp_path / name, tmp_path / "new")
-        (tmp_path / "new").replace(tmp_path / name)
-        return read_report(out)
+    def and_replaced(*arguments, **named):
+        if next(opened) == count:
+            shutil.copy(tmp_path / name, tmp_path / "new")
+            (tmp_path / "new").replace(tmp_path / name)
+        return prepared(*arguments, **named)
 
-    monkeypatch.setattr(batch, "read_report", and_replaced)
+    monkeypatch.setattr(batch, "prepare", and_replaced)
     result = invoke("batch", tmp_path / "pairs.csv", tmp_path / "out", "--config", tmp_path / "settings.yaml", "-q")
     assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
 

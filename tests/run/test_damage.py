@@ -123,6 +123,21 @@ def test_match__matches_tiles_again_that_were_exchanged(scene, tmp_path):
     assert_same(scene, tmp_path / "out")
 
 
+def test_match__matches_kept_tiles_again_that_were_damaged_after_its_strips_were_finished(scene, tmp_path):
+    def stop(stage, done, total):
+        if stage == "files":
+            raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        match_pair(scene / "left.tif", scene / "right.tif", out, scene / "settings.yaml", progress=stop)
+    intact = (out / "tiles" / SHARDS[0]).read_bytes()
+    damage(out / "tiles" / SHARDS[0], "zeros")
+    assert "are damaged" in match(scene, out, "--keep-tiles")
+    assert (out / "tiles" / SHARDS[0]).read_bytes() == intact
+    assert_same(scene, out)
+
+
 def test_match__matches_tiles_again_that_are_of_another_run(scene, tmp_path):
     other = tmp_path / "other"
     settings = yaml.safe_load((scene / "settings.yaml").read_text())

@@ -24,6 +24,7 @@ from cameras import cameras, sensor_words
 from finished import random_bands, write_run
 from helpers import COMMAND, OUTPUTS, PLACE, hashes, invoke, write_pair
 from matplotlib.figure import Figure
+from rasterio.errors import RasterioDeprecationWarning
 from rasterio.shutil import copy
 
 from sat_intervals.cli.matching import PairArguments
@@ -348,8 +349,13 @@ USED_MASK = (
 
 
 @pytest.mark.parametrize("band", ["<SimpleSource>" + MASK_BAND, USED_MASK])
-@pytest.mark.parametrize("name", ["left.tif.msk", "left.tif.MSK", "left.tif.aux.xml"])  # GDAL reads all
-@pytest.mark.parametrize("image", ["left.vrt", "left"])
+@pytest.mark.parametrize(
+    ("image", "name"),
+    [
+        *itertools.product(["left.vrt", "left"], ["left.tif.msk", "left.tif.MSK", "left.tif.aux.xml", "left.tif.ovr"]),
+        ("left.vrt", "left.aux"),
+    ],
+)
 def test_match_pair__ends_where_a_mask_of_a_source_appears(pair, monkeypatch, band, name, image):
     folder, settings = pair
     source = f"<SourceFilename>{folder / 'left.tif'}</SourceFilename>"
@@ -362,6 +368,10 @@ def test_match_pair__ends_where_a_mask_of_a_source_appears(pair, monkeypatch, ba
         match_block(job, block)
         if name.endswith("xml"):
             (folder / name).write_text(NODATA)
+        elif name.endswith("aux"):
+            of_image = {"AUX": "YES", "DEPENDENT_FILE": "left.tif", "nodata": 7}
+            with rasterio.open(folder / name, "w", "HFA", 100, 80, 1, dtype="uint16", **of_image):
+                pass
         else:
             shutil.copy(folder / "mask.tif", folder / name)
 
@@ -369,6 +379,46 @@ def test_match_pair__ends_where_a_mask_of_a_source_appears(pair, monkeypatch, ba
     with pytest.raises(RunError, match=rf"{name} appeared during the run, whose tiles are deleted: rerun the com"):
         match_pair(folder / image, folder / "right.tif", folder / "out", settings)
     assert not list(folder.glob("out/tiles/records/*"))
+
+
+@pytest.mark.parametrize("name", ["left.tif.ovr", "left.vrt.ovr", "left.tif.aux.xml", "mask.tif.aux.xml"])
+def test_match_pair__goes_on_where_a_file_appears_that_changes_nothing(pair, monkeypatch, name):
+    """Overviews are not read where nothing is resampled, and a mask in the file comes before a no-data value."""
+    folder, settings = pair
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(folder / "left.tif", "r+") as file:
+        file.write_mask(np.full(file.shape, 255, np.uint8))
+    copy(folder / "left.tif", folder / "left.vrt", driver="VRT")
+    left = folder / ("left.vrt" if name.endswith("ovr") else "left.tif")
+
+    def and_appears(job, block):
+        match_block(job, block)
+        if name.endswith("xml"):
+            (folder / name).write_text(NODATA)
+        else:
+            shutil.copy(folder / "mask.tif", folder / name)
+
+    monkeypatch.setattr("sat_intervals.run.pair.match_block", and_appears)
+    match_pair(open_image(left, mask=folder / "mask.tif"), folder / "right.tif", folder / "out", settings)
+    assert (folder / "out" / "intervals.tif").exists()
+
+
+def test_match_pair__resumes_when_its_image_was_shown_meanwhile(pair):
+    folder, settings = pair
+
+    def stop(stage, done, total):
+        if stage == "tiles" and done:
+            raise KeyboardInterrupt
+
+    images = folder / "left.tif", folder / "right.tif", folder / "out"
+    with pytest.raises(KeyboardInterrupt):
+        match_pair(*images, settings, progress=stop)
+    with rasterio.open(folder / "left.tif") as dataset, pytest.warns(RasterioDeprecationWarning):  # as QGIS
+        dataset.statistics(1, approx=False)
+    assert (folder / "left.tif.aux.xml").exists()
+    done = {file: file.stat().st_mtime_ns for file in folder.glob("out/tiles/records/*")}
+    match_pair(*images, settings, keep_tiles=True)
+    assert done
+    assert all(file.stat().st_mtime_ns == time for file, time in done.items())
 
 
 def test_match_pair__ends_where_a_memory_map_changes_an_input(pair, monkeypatch):
@@ -969,7 +1019,9 @@ def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its
     assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
-@pytest.mark.parametrize("ending", [".tif.aux.xml", ".tif.msk", ".tif.ovr", ".tif.OVR", ".RPB", "_rpc.txt"])
+@pytest.mark.parametrize(
+    "ending", [".tif.aux.xml", ".tif.msk", ".tif.OVR", ".tif.aux", ".aux", ".RPB", ".rpc", "_rpc.txt"]
+)
 def test_match_pair__refuses_a_file_that_would_change_what_is_read_from_its_results(pair, ending):
     folder, settings = pair
     mine = folder / "out" / f"intervals{ending}"
@@ -996,6 +1048,25 @@ def test_output_writer__refuses_a_world_file_beside_a_raster_without_a_place(tmp
         pass
     with OutputWriter(tmp_path, RUN_FILES, 4, 5, PLACE, {}):
         pass  # GDAL ignores it
+
+
+def test_output_writer__finds_files_beside_its_place_in_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
+    def fail(folder):
+        raise PermissionError
+
+    (tmp_path / "intervals.tif.msk").write_text("mine")
+    monkeypatch.setattr("sat_intervals.raster.seal.os.listdir", fail)
+    with pytest.raises(OutputError, match=r"intervals\.tif\.msk changes what is read from"), writer(tmp_path):
+        pass
+
+
+def test_output_writer__publishes_no_file_beside_a_mask_that_appears_meanwhile(tmp_path):
+    with writer(tmp_path) as output:
+        output.write(0, *(np.zeros((len(file.bands), 4, 5), file.dtype) for file in RUN_FILES))
+        (tmp_path / "intervals.tif.msk").write_text("mine")
+        with pytest.raises(OutputError, match=r"intervals\.tif\.msk changes what is read from .*: move it away"):
+            output.publish()
+    assert sorted(file.name for file in tmp_path.glob("[!.]*")) == ["intervals.tif.msk"]
 
 
 def test_output_writer__refuses_a_mask_beside_a_picture(tmp_path):
