@@ -28,7 +28,7 @@ _LOCK = threading.Lock()
 UNCHECKED = {
     "AAIGrid", "BAG", "DAAS", "EEDAI", "ENVI", "ESRIC", "GPKG", "GRASSASCIIGrid", "GTI", "HDF5", "HDF5Image", "ILWIS",
     "ISG", "KMLSUPEROVERLAY", "MBTiles", "MRF", "PCIDSK", "PCRaster", "PLMOSAIC", "Rasterlite", "S102", "S104", "S111",
-    "SQLite", "STACIT", "STACTA", "WCS", "WMS", "WMTS", "netCDF",
+    "SQLite", "STACIT", "STACTA", "WCS", "WMS", "WMTS", "Zarr", "netCDF",
 }  # fmt: skip
 # GDAL's prefixes of files on servers, with and without a URL in the form of a query.
 _REMOTE = "vsicurl/", "vsicurl?", "vsis3/", "vsigs/", "vsiaz/", "vsiadls/", "vsioss/", "vsiswift/", "vsiwebhdfs/"

@@ -303,16 +303,18 @@ def _differing(files: Mapping[str, Mapping[str, Any]], is_over: Event) -> str | 
 
 
 def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
-    """Return a function that raises if a file was made, replaced or changed since; None and remote files are ignored.
+    """Return a function that raises if a file was made, replaced or changed since; None is ignored.
 
     Call it between reading several times from files and publishing what was made of them. Of rasters, see
-    `watched_rasters`.
+    `watched_rasters`. A server that does not answer does not change a file.
     """
-    before = {str(file): _moment(str(file)) for file in files if file is not None}
+    names = {str(file) for file in files if file is not None}
+    before = {file: (_moment(file), stamp_of(file)) for file in names}
 
     def check() -> None:
-        for file, moment in before.items():
-            if moment.is_touched(_moment(file)):
+        for file, (moment, stamp) in before.items():
+            now = stamp_of(file)
+            if moment.is_touched(_moment(file)) or (None not in (stamp, now) and stamp != now):
                 raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
 
     return check

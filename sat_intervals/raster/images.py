@@ -22,7 +22,8 @@ from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# Names of files whose changes would not be noticed: in archives on servers.
+# File systems of GDAL of which it does not say what it reads, or that tell of no change.
+_UNKNOWN = re.compile(r"/vsi(sparse/|cached|\w+_streaming/)")
 _IN_REMOTE = re.compile(r"(/?vsi(zip|tar|gzip|7z|rar|subfile)/(\d+(_\d+)?,)?\{?)+/?vsi(curl|s3|gs|az|adls|oss|swift)")
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
@@ -186,7 +187,7 @@ def check_pair(left: Image, right: Image, count: int) -> None:
 @contextmanager
 def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
     """Open a raster for reading and turn GDAL's errors into `InputError`; ``window`` is for the message."""
-    _check_beside(path)
+    _check_pipes_beside(path)
     check_regular(path)
     try:
         with gdal.reading(path) as dataset:
@@ -202,7 +203,7 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
         ) from error
 
 
-def _check_beside(path: str, listed: dict[str, list[str]] | None = None) -> None:
+def _check_pipes_beside(path: str, listed: dict[str, list[str]] | None = None) -> None:
     """Raise if a file beside a raster, such as a mask, is a pipe: GDAL would wait for it.
 
     ``listed`` keeps such files by folder, so that the folder of many rasters is listed once.
@@ -258,7 +259,7 @@ def _check_watched(name: str, dataset: DatasetReader) -> None:
     names = name, *dataset.files
     if remote := next(filter(_IN_REMOTE.match, names), None):
         raise InputError(f"{remote} is in an archive on a server, of which a change would not be noticed: download it")
-    if any(map(os.path.isdir, names)) or "/vsisparse/" in name or "/vsicached" in name:
+    if any(map(os.path.isdir, names)) or any(map(_UNKNOWN.search, names)):
         raise InputError(
             f"{name} is read from files that GDAL does not list, which may change during a run: convert it with "
             "gdal_translate"
@@ -299,7 +300,7 @@ def _survey(name: str) -> tuple[list[str], bool]:
         if path in asked:
             continue
         asked.add(path)
-        _check_beside(path, listed)
+        _check_pipes_beside(path, listed)
         check_regular(path)
         try:
             with gdal.reading(path) as dataset:

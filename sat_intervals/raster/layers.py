@@ -175,8 +175,9 @@ def _write(
                 difference -= sum_of_bits(dataset.read(window=RasterioWindow(0, window.row, width, window.height)))
         if difference % SUM_WRAPS:
             raise OSError(errno.EIO, "the content read back differs from that written")
-        if MARK.items() <= tags.items():
-            check_marked(Path(path))  # again: a file may have appeared meanwhile
+        if MARK.items() <= tags.items():  # again: files may have appeared meanwhile
+            check_marked(Path(path))
+            check_place(Path(path), has_transform=georeferencing.transform is not None)
 
 
 def sum_of_bits(bands: np.ndarray) -> int:

@@ -20,8 +20,8 @@ _SEAL = re.compile(_LINE + rb"([0-9a-f]{8})\n")
 _BEGINNING = 1024
 # Endings, in any case, of files that GDAL reads with a raster: after its whole name, and instead of its own.
 _BESIDE, _OF_STEM = (".aux.xml", ".aux", ".msk", ".ovr"), (".aux", ".rpb", ".rpc", "_rpc.txt", ".imd")
-# Those that it reads with a raster without a transform of its own.
-_PLACES = ".tfw", ".tifw", ".pgw", ".pngw", ".wld", ".tab"
+# World files, which it reads with a raster without a transform of its own.
+_WORLD_FILES = ".wld", ".tab"
 # Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes. Names of bands are repeated.
 _STATISTICS = {
     *("PAMDataset", "PAMRasterBand", "Description", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax"),
@@ -96,12 +96,13 @@ def check_beside(path: str | Path, files: Iterable[str]) -> None:
             raise SatIntervalsError(f"{file} changes what is read from {path}: move it away")
 
 
-def check_place(path: Path, *, is_placed: bool = True) -> None:
+def check_place(path: Path, *, has_transform: bool = True) -> None:
     """Raise if files next to the place of a raster would change what GDAL reads from it, see `check_beside`.
 
-    ``is_placed`` says whether the raster has a transform of its own.
+    ``has_transform`` says whether the raster has a transform of its own.
     """
-    of_stem = _OF_STEM if is_placed else (*_OF_STEM, *_PLACES)
+    kind = path.suffix
+    of_stem = _OF_STEM if has_transform else (*_OF_STEM, *_WORLD_FILES, f"{kind}w", f"{kind[:2]}{kind[-1:]}w")
     names = [f"{path.name}{ending}" for ending in _BESIDE] + [f"{path.stem}{ending}" for ending in of_stem]
     try:
         lowered = {name.lower() for name in names}

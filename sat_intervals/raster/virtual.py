@@ -12,6 +12,7 @@ from sat_intervals.errors import InputError
 
 # Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
 _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
+_SCHEME = "vrt://"
 # Elements of a virtual raster that name a file, and the metadata that do so: positions of a warped one.
 _TAGS, _POSITIONS = ("SourceFilename", "SourceDataset", "DEMPath"), ("X_DATASET", "Y_DATASET")
 
@@ -45,7 +46,11 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
         A source has no name that can be watched.
     """
     names, are_resampled, metadata = [], False, list(dataset.tags(ns="GEOLOCATION").items())
-    own = "" if path.lstrip().startswith("<") else next(iter(dataset.files), path)  # "/vsicurl/http://" for "http://"
+    own = next(iter(dataset.files), path)  # "/vsicurl/http://" for "http://"
+    if path.startswith(_SCHEME):
+        names.append(path.removeprefix(_SCHEME).partition("?")[0])
+    if path.lstrip().startswith(("<", _SCHEME)):
+        own = ""  # sources are named as from the working directory
     for element in _elements(path, dataset) if dataset.driver == "VRT" else ():
         if (kind := element.get("subClass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
             raise InputError(

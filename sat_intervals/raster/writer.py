@@ -148,7 +148,7 @@ class OutputWriter:
         """Raise if GDAL would read a file with one of those that are written, see `check_place`."""
         for place in (self._folder / file.name for file in self._files):
             try:
-                check_place(place, is_placed=self._georeferencing.transform is not None)
+                check_place(place, has_transform=self._georeferencing.transform is not None)
             except SatIntervalsError as error:
                 raise OutputError(str(error)) from error
 

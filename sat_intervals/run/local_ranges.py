@@ -75,7 +75,7 @@ def replaceable_ranges(path: Path, left: Image, right: Image) -> dict[str, str]:
     names = [name for image in (left, right) for name in (image.path, image.mask) if name]
     check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
     check_made_by(path, "range", _OF)
-    check_place(path, is_placed=left.georeferencing.transform is not None)
+    check_place(path, has_transform=left.georeferencing.transform is not None)
     return there
 
 

@@ -126,7 +126,8 @@ def measure_subjects(
     """
     found: list[Measured] = []
     cost = subjects[0].config.cost
-    check_truths = watched_images(subject.truth.image for subject in subjects)
+    images = (image for subject in subjects for image in (subject.left, subject.right, subject.truth.image))
+    check_images = watched_images(images)
     check_weights = watched([weights_file(cost.weights)] if isinstance(cost, Mccnn) else [])
     key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
@@ -138,8 +139,8 @@ def measure_subjects(
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
             found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
-    check_truths()
-    check_weights()  # between subjects: each job checks its own
+    check_images()  # each job checks its own, but not whether files appeared beside them
+    check_weights()  # between subjects
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found, key

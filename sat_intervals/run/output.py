@@ -34,7 +34,7 @@ def check_output(out: Path, overwrite: bool, left: Image | None = None) -> None:
         if home.is_symlink():
             raise SatIntervalsError(f"{home} is a symbolic link: give the folder of the tiles with --store")
         for file in RUN_FILES:
-            check_place(out / file.name, is_placed=left is None or left.georeferencing.transform is not None)
+            check_place(out / file.name, has_transform=left is None or left.georeferencing.transform is not None)
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:

@@ -216,6 +216,26 @@ def test_open_image__counts_each_file_on_a_server_once(web_server, images):
     assert opened(name) == [True, name, f"/vsicurl/{name}.msk"]
 
 
+def test_watched_rasters__sees_a_source_on_a_server_that_changes(web_server, images, tmp_path):
+    put(images, web_server.folder)
+    source = f"/vsicurl/http://127.0.0.1:{web_server.server_address[1]}/left.tif"
+    band = f"<SimpleSource><SourceFilename>{source}</SourceFilename></SimpleSource>"
+    (tmp_path / "truth.vrt").write_text(
+        f"<VRTDataset rasterXSize='{SIDE}' rasterYSize='{SIDE}'><VRTRasterBand dataType='UInt16' band='1'>{band}"
+        "</VRTRasterBand></VRTDataset>"
+    )
+    script = (
+        "import sys\nfrom sat_intervals.raster import watched_rasters\ncheck = watched_rasters(sys.argv[1:])\ncheck()\n"
+        "print(flush=True)\nsys.stdin.readline()\ncheck()"
+    )
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen([sys.executable, "-c", script, tmp_path / "truth.vrt"], text=True, **pipes) as process:
+        process.stdout.readline()
+        put({"left.tif": images["right.tif"]}, web_server.folder)
+        _, errors = process.communicate("\n", timeout=60)
+    assert f"{source} was replaced or changed while it was read: rerun the command" in errors
+
+
 @pytest.mark.parametrize(
     "way",
     [
@@ -235,6 +255,13 @@ def test_open_image__refuses_archives_on_servers(web_server, images, way):
     with pytest.raises(subprocess.CalledProcessError) as failure:
         opened(name)
     assert "is in an archive on a server, of which a change would not be noticed: download it" in failure.value.stderr
+
+
+def test_open_image__refuses_a_stream(web_server, images):
+    put(images, web_server.folder)
+    with pytest.raises(subprocess.CalledProcessError) as failure:
+        opened(f"/vsicurl_streaming/http://127.0.0.1:{web_server.server_address[1]}/left.tif")
+    assert "is read from files that GDAL does not list" in failure.value.stderr
 
 
 def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, monkeypatch):

@@ -219,6 +219,14 @@ def test_other_files__are_the_positions_that_a_warped_raster_names(folder, is_zi
     assert set(other_files(str(folder / "warped.vrt"))) == {str(folder / "image.tif"), *names}
 
 
+@pytest.mark.parametrize("is_relative", [False, True])
+def test_other_files__of_a_name_of_a_virtual_raster_have_this_one_and_its_sources(folder, monkeypatch, is_relative):
+    monkeypatch.chdir(folder.parent)
+    (folder / "image.vrt").write_text(virtual((1, "image.tif")))
+    place = folder.name if is_relative else str(folder)
+    assert other_files(f"vrt://{place}/image.vrt?bands=1") == [f"{place}/image.tif", f"{place}/image.vrt"]
+
+
 def test_other_files__are_the_source_of_a_warped_raster_behind_a_link(folder):
     """GDAL writes the source of a warped raster relative to the link, not to its target."""
     (folder / "below").mkdir()

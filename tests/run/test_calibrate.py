@@ -190,6 +190,19 @@ def test_measure_subjects__ends_where_a_truth_is_replaced_meanwhile(scene, tmp_p
         measure_subjects(subjects, tmp_path, replace)
 
 
+def test_measure_subjects__ends_where_a_mask_appears_beside_an_image(scene, tmp_path):
+    for name in ("left.tif", "right.tif", "truth.tif", "meta.json"):
+        (tmp_path / name).write_bytes((scene / name).read_bytes())
+    subjects = _subjects((tmp_path,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+
+    def appear(stage, done, total):
+        if stage == "tiles":
+            (tmp_path / "left.tif.msk").write_bytes((scene / "truth.tif").read_bytes())
+
+    with pytest.raises(RunError, match=r"a file beside .*left\.tif appeared while it was read: rerun the command"):
+        measure_subjects(subjects, tmp_path, appear)
+
+
 def off(folder):
     file = folder / "off.yaml"
     file.write_text("regularization: null\n")

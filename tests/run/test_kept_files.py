@@ -326,6 +326,8 @@ def test_open_image__refuses_a_folder_whose_files_gdal_does_not_list(pair):
         file.write(np.ones((1, 80, 100), np.uint16))
     with pytest.raises(InputError, match=r"left\.zarr is read from files that GDAL does not list, .*: convert it"):
         open_image(folder / "left.zarr")
+    with pytest.raises(InputError, match=r'^ZARR:.*left\.zarr" has the format Zarr, .*: convert it'):
+        open_image(f'ZARR:"{folder}/left.zarr"')
 
 
 @pytest.mark.parametrize("driver", ["AAIGrid", "ENVI", "PCIDSK", "MRF", "ILWIS", "GPKG"])
@@ -1041,7 +1043,7 @@ def test_output_writer__leaves_statistics_beside_its_place(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("name", ["intervals.tfw", "intervals.WLD", "intervals.tab"])
+@pytest.mark.parametrize("name", ["intervals.tfw", "intervals.tifW", "intervals.WLD", "intervals.tab"])
 def test_output_writer__refuses_a_world_file_beside_a_raster_without_a_place(tmp_path, name):
     (tmp_path / name).write_text("2\n0\n0\n-2\n9\n9\n")
     with pytest.raises(OutputError, match=f"{name} changes what is read from .*intervals.tif"), writer(tmp_path):

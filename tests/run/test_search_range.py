@@ -145,6 +145,19 @@ def test_range__keeps_a_raster_of_another_pair_that_appears_meanwhile(folder, tm
     assert (result.exit_code, file.read_bytes()) == (2, there)
 
 
+def test_range__writes_no_raster_beside_a_mask_that_appears_meanwhile(folder, tmp_path, monkeypatch):
+    find = search_range.find_here
+
+    def appears_before(*arguments):
+        (tmp_path / "ranges.tif.msk").write_text("mine")
+        return find(*arguments)
+
+    monkeypatch.setattr(search_range, "find_here", appears_before)
+    result = invoke("range", folder / "left.tif", folder / "right.tif", "--output", tmp_path / "ranges.tif")
+    assert "ranges.tif.msk changes what is read from" in result.stderr
+    assert (result.exit_code, [file.name for file in tmp_path.iterdir()]) == (2, ["ranges.tif.msk"])
+
+
 def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):
     images = folder / "left.tif", folder / "right.tif"
     assert invoke("range", *images, "--output", tmp_path / "range.tif", "-q").exit_code == 0
