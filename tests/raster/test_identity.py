@@ -216,6 +216,21 @@ def test_open_image__counts_each_file_on_a_server_once(web_server, images):
     assert opened(name) == [True, name, f"/vsicurl/{name}.msk"]
 
 
+def test_open_image__of_a_virtual_raster_on_a_server_asks_as_much_with_either_name(web_server, images):
+    band = '<VRTRasterBand dataType="UInt16" band="1">{}</VRTRasterBand>'
+    source = '<SimpleSource><SourceFilename relativeToVRT="1">left{}.tif</SourceFilename></SimpleSource>'
+    sources = "".join(source.format(number) for number in range(5))
+    text = f'<VRTDataset rasterXSize="{SIDE}" rasterYSize="{SIDE}">{band.format(sources)}</VRTDataset>'
+    put({f"left{number}.tif": images["left.tif"] for number in range(5)}, web_server.folder)
+    put({"left.vrt": text.encode()}, web_server.folder)
+    name, sent = f"http://127.0.0.1:{web_server.server_address[1]}/left.vrt", []
+    for prefix in ("/vsicurl/", ""):
+        web_server.sent.clear()
+        opened(prefix + name)
+        sent.append(len(web_server.sent))
+    assert sent[1] <= 1.2 * sent[0], sent
+
+
 def test_watched_rasters__sees_a_source_on_a_server_that_changes(web_server, images, tmp_path):
     put(images, web_server.folder)
     source = f"/vsicurl/http://127.0.0.1:{web_server.server_address[1]}/left.tif"
