@@ -1034,6 +1034,18 @@ def test_match_pair__refuses_a_file_that_would_change_what_is_read_from_its_resu
     assert [file.name for file in mine.parent.iterdir()] == [mine.name]
 
 
+def test_match_pair__refuses_a_world_file_beside_its_results_before_it_matches(pair):
+    """Images without a transform have results without one."""
+    folder, settings = pair
+    for side in ("left", "right"):
+        write_layer(folder / f"{side}.tif", read_layers(folder / f"{side}.tif")[0], 0, Georeferencing())
+    (folder / "out").mkdir()
+    (folder / "out" / "intervals.tfw").write_text("2\n0\n0\n-2\n9\n9\n")
+    with pytest.raises(SatIntervalsError, match=r"intervals\.tfw changes what is read from .*: move it away"):
+        match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    assert [file.name for file in (folder / "out").iterdir()] == ["intervals.tfw"]
+
+
 def test_output_writer__leaves_statistics_beside_its_place(tmp_path):
     (tmp_path / "intervals.tif.aux.xml").write_text(STATISTICS)
     with writer(tmp_path):
