@@ -24,6 +24,7 @@ from sat_intervals.tiling import Window
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
 # File systems of GDAL of which it does not say what it reads, or that tell of no change.
 _UNKNOWN = re.compile(r"/vsi(sparse/|cached|\w+_streaming/)")
+# Archives on servers.
 _IN_REMOTE = re.compile(r"(/?vsi(zip|tar|gzip|7z|rar|subfile)/(\d+(_\d+)?,)?\{?)+/?vsi(curl|s3|gs|az|adls|oss|swift)")
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
