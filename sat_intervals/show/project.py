@@ -98,8 +98,7 @@ def write_project(out: str | Path) -> Written:
     file = run.out / "project.qgz"
     run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
     check_made_here([file])
-    for name in ("width", "dsm_half_width"):
-        check_place(run.out / f"{name}.vrt")
+    _check_places(run)
     written = Written([], [])
     with run.unchanged("points.tif", "dsm.tif"):
         layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
@@ -108,8 +107,15 @@ def write_project(out: str | Path) -> Written:
         with whole_file(file) as new, zipfile.ZipFile(new, "w") as archive:
             # stored, so that the mark is in the first bytes
             archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(_project(run, layers), _HEAD))
-            check_made_here([file])  # again: a file may have appeared meanwhile
+            check_made_here([file])  # again: files may have appeared meanwhile
+            _check_places(run)
     return Written([*written.files, file], written.notes)
+
+
+def _check_places(run: Run) -> None:
+    """Raise if GDAL would read other files with the virtual rasters of the project."""
+    for name in ("width", "dsm_half_width"):
+        check_place(run.out / f"{name}.vrt")
 
 
 def _write_defaults(run: Run, layers: list[Layer], written: Written) -> None:

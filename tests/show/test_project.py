@@ -176,6 +176,20 @@ def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_
     assert invoke("project", write_run(tmp_path / "none", *no_bands(30, 20))).exit_code == 0
 
 
+@pytest.mark.parametrize("name", ["width.vrt.msk", "dsm_half_width.vrt.ovr"])
+def test_project__ends_where_a_file_appears_beside_its_rasters(run, monkeypatch, name):
+    out, _, _ = run
+
+    def and_appears(*arguments):
+        (out / name).write_text("mine")
+        return write_difference(*arguments)
+
+    monkeypatch.setattr("sat_intervals.show.styles.write_difference", and_appears)
+    done = invoke("project", out)
+    assert (done.exit_code, f"{name} changes what is read from" in done.stderr) == (2, True), done.output
+    assert not (out / "project.qgz").exists()
+
+
 @pytest.mark.process
 def test_project__in_qgis(run, tmp_path):
     """Every layer is valid and styled, rasters opened alone take the same styles, and QGIS removes the mark."""
