@@ -370,7 +370,8 @@ def _opened(record: dict[str, Any]) -> Image:
             f"{image.path} has {image.height} x {image.width} pixels, but had {record['height']} x {record['width']} "
             "when it was matched: restore that image or match again"
         )
-    for file in (record, *record.get("files", ()), *([mask] if mask else [])):
+    ways = [one for one in (record, mask) if one]
+    for file in (file for one in ways for file in (one, *one.get("files", ()))):
         if is_changed(file["path"], file):
             raise SatIntervalsError(f"{file['path']} has changed since it was matched: restore it or match again")
     return image

@@ -14,7 +14,6 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainSerializer,
-    field_validator,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -39,7 +38,14 @@ def as_written(value: Any) -> Any:
     return Decimal(repr(value)) if type(value) in (int, float) else value
 
 
+def absolute(value: str) -> str:
+    """Return a path that workers with another working directory find; ".." after a link leaves the link's target."""
+    path = Path(value).absolute()
+    return str(path.parent.resolve() / path.name if ".." in path.parts else path)
+
+
 Odd = Annotated[int, AfterValidator(check_odd)]
+AbsolutePath = Annotated[str, AfterValidator(absolute)]
 # A number whose thresholds must be exact; a plain number in JSON, so that settings of a run can be read back.
 Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(float, when_used="json")]
 # Disparities are stored as int16; within this limit the difference of any two also fits.
@@ -76,14 +82,9 @@ class Disparity(Section):
     )
 
     local: bool = Field(False, description="search a separate range in each cell of the image, found from the images")
-    grid: str | None = Field(
+    grid: AbsolutePath | None = Field(
         None, description="raster of two bands, minimum and maximum, for local ranges; null: found from the images"
     )
-
-    @field_validator("grid")
-    @classmethod
-    def _make_absolute(cls, value: str | None) -> str | None:
-        return None if value is None else str(Path(value).absolute())
 
     @property
     def is_local(self) -> bool:
@@ -166,12 +167,7 @@ class Mccnn(Section):
     """Matching cost: 1 - cosine of features of the network MC-CNN fast (Zbontar and LeCun 2016)."""
 
     method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
-    weights: str | None = Field(None, description="ONNX file of the network; null: that of the extra [mccnn]")
-
-    @field_validator("weights")
-    @classmethod
-    def _make_absolute(cls, value: str | None) -> str | None:
-        return None if value is None else str(Path(value).absolute())  # workers may have another working directory
+    weights: AbsolutePath | None = Field(None, description="ONNX file of the network; null: that of the extra [mccnn]")
 
     @property
     def window(self) -> int:

@@ -23,7 +23,7 @@ from sat_intervals.tiling import Window
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
 # File systems of GDAL of which it does not say what it reads, or that tell of no change.
-_UNKNOWN = re.compile(r"/vsi(sparse/|cached|\w+_streaming/)")
+_UNKNOWN = re.compile(r"/vsi(sparse/|cached\?|\w+_streaming/)")
 # Archives on servers.
 _IN_REMOTE = re.compile(r"(/?vsi(zip|tar|gzip|7z|rar|subfile)/(\d+(_\d+)?,)?\{?)+/?vsi(curl|s3|gs|az|adls|oss|swift)")
 # Relative difference below which pixel sizes are equal up to rounding.
@@ -255,9 +255,9 @@ def _check_mask(image: Image, mask: str) -> None:
             )
 
 
-def _check_watched(name: str, dataset: DatasetReader) -> None:
-    """Raise if the tool could not notice that files of a raster are incomplete or change."""
-    names = name, *dataset.files
+def _check_watched(name: str, dataset: DatasetReader, sources: Iterable[str] = ()) -> None:
+    """Raise if the tool could not notice that files of a raster, or ``sources``, are incomplete or change."""
+    names = name, *dataset.files, *sources
     if remote := next(filter(_IN_REMOTE.match, names), None):
         raise InputError(f"{remote} is in an archive on a server, of which a change would not be noticed: download it")
     if any(map(os.path.isdir, names)) or any(map(_UNKNOWN.search, names)):
@@ -280,21 +280,20 @@ def other_files(name: str) -> list[str]:
     InputError
         GDAL does not list all of them.
     """
-    return _survey(name)[0]
+    return survey(name)[0]
 
 
-def is_resampled(name: str) -> bool:
-    """Return whether GDAL may read a raster from overviews of other files: a source of a virtual one is resampled."""
-    return _survey(name)[1]
+def survey(name: str) -> tuple[list[str], set[str], bool]:
+    """Return `other_files`, those of them that are sources of virtual rasters, and whether sources are resampled.
 
-
-def _survey(name: str) -> tuple[list[str], bool]:
-    """Return `other_files`, and `is_resampled`."""
+    GDAL may read overviews of sources that are resampled. Raises as `other_files`.
+    """
     seen: set[str] = set()
     asked: set[str] = set()
     named: set[str] = set()  # by virtual rasters
     listed: dict[str, list[str]] = {}
     waiting = [name]
+    of_virtual: set[str] = set()
     are_resampled = False
     while waiting:
         path = waiting.pop()
@@ -305,8 +304,8 @@ def _survey(name: str) -> tuple[list[str], bool]:
         check_regular(path)
         try:
             with gdal.reading(path) as dataset:
-                _check_watched(path, dataset)
                 files, sources = dataset.files, sources_of(path, dataset)
+                _check_watched(path, dataset, sources.names)
         except gdal.GDAL_ERRORS as error:
             if path in named:
                 raise InputError(
@@ -320,8 +319,9 @@ def _survey(name: str) -> tuple[list[str], bool]:
         seen |= new | {source for source in others if not _may_have_others(source)}
         named |= others
         waiting += [*filter(_may_have_others, new | others), *sources.positions]
+        of_virtual |= set(map(_place, sources.names))
         are_resampled |= sources.are_resampled
-    return sorted(seen), are_resampled
+    return sorted(seen), {file for file in seen if _place(file) in of_virtual}, are_resampled
 
 
 def _place(name: str) -> str:

@@ -195,7 +195,7 @@ def write_once(
     SatIntervalsError
         The file has other content, and ``overwrite`` is not set or the file has no mark; or see `check_place`.
     """
-    check_place(path)
+    check_place(path, has_transform=georeferencing.transform is not None)
     if path.exists():
         with suppress(SatIntervalsError):
             if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):

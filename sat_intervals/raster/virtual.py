@@ -23,9 +23,9 @@ class Sources(NamedTuple):
     Attributes
     ----------
     names
-        Sources of the bands and masks of a virtual raster.
+        Sources of the bands and masks of a virtual raster, and heights to warp them.
     positions
-        Rasters with the positions of pixels: they are read only where GDAL warps, and need not exist.
+        Where rasters with the positions of pixels may be.
     are_resampled
         Whether GDAL may read sources at another resolution, and thus their overviews.
     """
@@ -45,7 +45,7 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
     InputError
         A source has no name that can be watched.
     """
-    names, are_resampled, metadata = [], False, list(dataset.tags(ns="GEOLOCATION").items())
+    names, positions, are_resampled = [], [], False
     own = next(iter(dataset.files), path)  # "/vsicurl/http://" for "http://"
     if path.startswith(_SCHEME):
         names.append(path.removeprefix(_SCHEME).partition("?")[0])
@@ -61,12 +61,14 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
             raise InputError(
                 f"{path} has sources relative to {element.text} (ROOT_PATH): convert it with gdal_translate"
             )
-        metadata.append((element.get("key", ""), element.text or ""))
+        if element.get("key", "").upper() in _POSITIONS:
+            positions += [_beside(own, element.text or ""), element.text or ""]
         if element.tag in _TAGS and element.text:
+            if "relativetovrt" in element.text.lower().replace('relativetovrt="0"', ""):
+                raise InputError(f"{path} has a source that is a text with relative names: write that to a file")
             names.append(_resolved(own, element) if element.get("relativeToVRT") == "1" else element.text)
         are_resampled |= element.find("SourceFilename") is not None and _is_resampled(element)
-    positions = [name for key, name in metadata if key.upper() in _POSITIONS]
-    return Sources(names, [place for name in positions for place in (_beside(own, name), name)], are_resampled)
+    return Sources(names, positions, are_resampled)
 
 
 def _elements(path: str, dataset: DatasetReader) -> Iterator[ElementTree.Element]:

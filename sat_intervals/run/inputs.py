@@ -12,13 +12,14 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.raster import Image, is_replaced, is_resampled, read_files
+from sat_intervals.raster import Image, is_replaced, read_files, survey
 from sat_intervals.raster.identity import identity
+from sat_intervals.raster.seal import is_read
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
 
-# Endings, in any case, of files beside a raster that GDAL reads with it: masks, no-data values and overviews.
+# Endings, in any case, of files beside a raster that GDAL reads with it: masks, no-data values, and last overviews.
 _SIDECARS = ".msk", ".aux.xml", ".aux", ".ovr"
 
 
@@ -82,19 +83,21 @@ def _with_others(name: str, identified: Callable[[str], dict[str, Any]]) -> dict
 
 
 def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | None:
-    """Return a file beside sources of images or masks that is no input but may change what is read; None if none is.
+    """Return a file that images or masks are read from now, but that is no input; None if there is none.
 
-    One beside the image itself does not matter, which is read as it was when it was opened; but for a mask, if the
-    image has one.
+    These are files beside sources, and other sources: a link to a virtual raster may have another target. Most files
+    beside the image itself do not matter, which is read as it was when it was opened; but for a mask, if it has one.
     """
     for image in (left, right):
         for name in filter(None, (image.path, image.mask)):
             own = {f"{name}{ending}".lower() for ending in _SIDECARS}
             if name == image.path and image.use_mask:
                 own.remove(f"{name}.msk".lower())
-            for file in read_files(name):
-                is_sidecar = file.lower().endswith(_SIDECARS) and file.lower() not in own and file not in files
-                if is_sidecar and (not file.lower().endswith(".ovr") or is_resampled(name)):
+            others, sources, are_resampled = survey(name)
+            endings = _SIDECARS if are_resampled else _SIDECARS[:-1]
+            for file in filter(is_read, others):
+                is_sidecar = file.lower().endswith(endings) and file.lower() not in own
+                if file not in files and (is_sidecar or file in sources):
                     return file
     return None
 

@@ -125,7 +125,7 @@ class Job:
         """
         if not overwrite and is_complete(self.out):  # another run may have ended before this one got the lock
             raise holds_run(self.out, OUTPUTS)
-        check_output(self.out, overwrite, self.left)
+        check_output(self.out, overwrite, has_transform=self.left.georeferencing.transform is not None)
         self.store.open(self.manifest, overwrite=overwrite, replaceable=replaceable(self.out, overwrite=overwrite))
         if self.found or self.local:
             search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
@@ -252,7 +252,7 @@ def prepare(
     region = checked_region(left, window)
     if not config.disparity.is_auto:
         check_tiles(fitted_to_jobs(config), region)
-    check_output(out, overwrite, left)
+    check_output(out, overwrite, has_transform=left.georeferencing.transform is not None)
     home = out / "tiles"
     inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
     before = None if overwrite else _found_before(home, config.cluster.store, inputs)

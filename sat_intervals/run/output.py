@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError, check_regular
-from sat_intervals.raster import RUN_FILES, Image, is_marked, restore, stamps
+from sat_intervals.raster import RUN_FILES, is_marked, restore, stamps
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.seal import check_place
 from sat_intervals.store.manifest import SEAL, unsealed
@@ -18,8 +18,8 @@ from sat_intervals.store.tiles import has_begun
 OUTPUTS = (*(file.name for file in RUN_FILES), "run.json")
 
 
-def check_output(out: Path, overwrite: bool, left: Image | None = None) -> None:
-    """Create the folder of a run of a left image, or raise if it cannot be used."""
+def check_output(out: Path, overwrite: bool, *, has_transform: bool = True) -> None:
+    """Create the folder of a run, or raise if it cannot be used; see `check_place`."""
     if os.path.lexists(out) and not out.is_dir():
         raise SatIntervalsError(f"{out} is not a folder: choose another")
     try:
@@ -34,7 +34,7 @@ def check_output(out: Path, overwrite: bool, left: Image | None = None) -> None:
         if home.is_symlink():
             raise SatIntervalsError(f"{home} is a symbolic link: give the folder of the tiles with --store")
         for file in RUN_FILES:
-            check_place(out / file.name, has_transform=left is None or left.georeferencing.transform is not None)
+            check_place(out / file.name, has_transform=has_transform)
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:

@@ -17,6 +17,9 @@ from sat_intervals.store.tiles import store_of
 
 __all__ = ["ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
 
+# States of the pairs of a batch.
+_STATES = "waiting", "done", "done before", "failed"
+
 
 @dataclass(frozen=True)
 class Status:
@@ -79,9 +82,10 @@ def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
     if text is None:
         return None
     try:
-        return {
-            str(name): {"error": "", **ended, "state": str(ended["state"])} for name, ended in json.loads(text).items()
-        }
+        states = {str(name): {"error": "", **ended} for name, ended in json.loads(text).items()}
+        if not states or not all(ended["state"] in _STATES for ended in states.values()):
+            raise ValueError("it has other states")
+        return states
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise SatIntervalsError(
             f"{out / REPORT} is not the report of a batch: move it away and rerun the batch"

@@ -505,3 +505,21 @@ def test_thresholds__are_none_where_their_step_is_off() -> None:
 def test_count__is_the_number_of_candidates(one: int, other: int) -> None:
     disparity = Disparity(minimum=min(one, other), maximum=max(one, other))
     assert disparity.count == len(range(disparity.minimum, disparity.maximum + 1))
+
+
+@pytest.mark.parametrize("section", ["disparity.grid", "cost.weights"])
+def test_load_config__names_the_file_that_the_system_finds_above_the_target_of_a_link(tmp_path, monkeypatch, section):
+    """In one spelling from any working directory, so that a run can be resumed from another one."""
+    (tmp_path / "job" / "lists").mkdir(parents=True)
+    (tmp_path / "lists").symlink_to("job/lists")
+    found = set()
+    for folder, name in (
+        (tmp_path, "lists/../a.tif"),
+        (tmp_path / "job" / "lists", "../a.tif"),
+        (tmp_path, "job/a.tif"),
+    ):
+        monkeypatch.chdir(folder)
+        given = {"disparity": {"minimum": 0, "maximum": 9, "grid": name}, "cost": {"method": "mccnn", "weights": name}}
+        config = load_config(given)
+        found.add(config.disparity.grid if section == "disparity.grid" else config.cost.weights)
+    assert found == {str(tmp_path / "job" / "a.tif")}

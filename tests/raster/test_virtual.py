@@ -1,6 +1,7 @@
 """Sources of virtual rasters: whatever their spelling, the tool knows all files that GDAL reads."""
 
 import gzip
+import html
 import os
 import re
 import zipfile
@@ -12,7 +13,7 @@ from rasterio.crs import CRS
 from rasterio.rpc import RPC
 from rasterio.transform import from_origin
 
-from sat_intervals.raster import InputError, is_resampled, open_image, other_files
+from sat_intervals.raster import InputError, open_image, other_files, survey
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -148,14 +149,6 @@ def test_other_files__are_those_of_warping_too(folder, monkeypatch):
     assert set(other_files(str(folder / "warped.vrt"))) == {str(folder / "image.tif"), "heights.tif"}
 
 
-def test_other_files__are_those_of_positions_too(folder):
-    write(folder / "x.tif", "float64")
-    positions = '<Metadata domain="GEOLOCATION"><MDI key="x_dataset">x.tif</MDI><MDI key="Y_DATASET">gone.tif</MDI>'
-    text = virtual((1, "image.tif")).replace("<VRTRasterBand", f"{positions}</Metadata><VRTRasterBand", 1)
-    (folder / "image.vrt").write_text(text)
-    assert other_files(str(folder / "image.vrt")) == [str(folder / "image.tif"), str(folder / "x.tif")]
-
-
 REFUSED = {
     "raw": (
         f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}"><VRTRasterBand dataType="Byte" band="1" '
@@ -203,7 +196,7 @@ def test_other_files__are_the_positions_that_a_warped_raster_names(folder, is_zi
             file.write(np.broadcast_to(values, (1, SIZE, SIZE)))
     names = [zipped(folder, name, f"{name}.tif") if is_zipped else str(folder / f"{name}.tif") for name in "xy"]
     metadata = "".join(
-        f'<MDI key="{key}_DATASET">{name}</MDI><MDI key="{key}_BAND">1</MDI>'
+        f'<MDI key="{key}_{"dataset" if is_zipped else "DATASET"}">{name}</MDI><MDI key="{key}_BAND">1</MDI>'
         for key, name in zip("XY", names, strict=True)
     )
     offsets = {
@@ -269,7 +262,7 @@ def test_open_image__names_a_virtual_raster_with_metadata_that_are_not_xml(folde
 
 
 @pytest.mark.parametrize(("size", "is_other"), [(SIZE, False), (SIZE // 2, True), (None, True)])
-def test_is_resampled__of_a_virtual_raster_of_virtual_ones(folder, size, is_other):
+def test_survey__says_whether_sources_of_virtual_rasters_of_virtual_ones_are_resampled(folder, size, is_other):
     parts = f'<SrcRect xSize="{size}" ySize="{SIZE}"/><DstRect xSize="{SIZE}.0" ySize="{SIZE}"/>' if size else ""
     parts = f"<SourceBand>1</SourceBand>{parts}"
     (folder / "inner.vrt").write_text(virtual((1, "image.tif")).replace("<SourceBand>1</SourceBand>", parts))
@@ -277,5 +270,24 @@ def test_is_resampled__of_a_virtual_raster_of_virtual_ones(folder, size, is_othe
         "<SourceBand>1</SourceBand>", parts.replace(str(SIZE // 2), str(SIZE))
     )
     (folder / "outer.vrt").write_text(outer.replace("inner.vrt", str(folder / "inner.vrt")))
-    assert is_resampled(str(folder / "inner.vrt")) == is_resampled(str(folder / "outer.vrt")) == is_other
-    assert not is_resampled(str(folder / "image.tif"))
+    assert [survey(str(folder / name))[2] for name in ("inner.vrt", "outer.vrt")] == [is_other, is_other]
+    assert not survey(str(folder / "image.tif"))[2]
+
+
+@pytest.mark.parametrize("spelling", ['relativeToVRT="1"', "relativetovrt='01'"])
+def test_other_files__refuse_a_source_that_is_a_text_with_relative_names(folder, monkeypatch, spelling):
+    """GDAL finds them in the folder of the file that has the text, which other files do not tell."""
+    monkeypatch.chdir(folder.parent)
+    text = html.escape(virtual((1, "image.tif")).replace('relativeToVRT="1"', spelling))
+    (folder / "outer.vrt").write_text(virtual((0, text)))
+    with pytest.raises(InputError, match=r"outer\.vrt has a source that is a text with relative names: write that to"):
+        other_files(f"{folder.name}/outer.vrt")
+
+
+@pytest.mark.parametrize(
+    "name", ["/vsizip//vsicurl/http://127.0.0.1:1/all.zip/mask.tif", "/vsicurl_streaming/http://h/m"]
+)
+def test_other_files__refuse_masks_of_which_a_change_would_not_be_noticed(folder, name):
+    (folder / "image.vrt").write_text(virtual((1, "image.tif"), SOURCE.format(0, name)))
+    with pytest.raises(InputError, match=r"of which a change would not be noticed|from files that GDAL does not list"):
+        other_files(str(folder / "image.vrt"))

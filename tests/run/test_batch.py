@@ -107,7 +107,7 @@ def test_match_batch__removes_what_a_death_left_of_files_that_have_their_names(i
     assert sorted(file.name for file in (tmp_path / "pair1").iterdir()) == OUTPUTS
 
 
-@pytest.mark.parametrize("text", ["mine", "[1, 2]", '{"pairs": [1]}'])
+@pytest.mark.parametrize("text", ["mine", "[1, 2]", "{}", '{"pairs": [1]}', '{"notes": {"state": "mine"}}'])
 def test_match_batch__keeps_a_report_that_is_not_of_a_batch(images, tmp_path, text):
     (tmp_path / "batch.json").write_text(text)
     with pytest.raises(SatIntervalsError, match=r"batch\.json is not the report of a batch: move it away and rerun"):

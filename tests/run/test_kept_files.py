@@ -28,6 +28,7 @@ from rasterio.errors import RasterioDeprecationWarning
 from rasterio.shutil import copy
 
 from sat_intervals.cli.matching import PairArguments
+from sat_intervals.config import load_config
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
@@ -41,6 +42,7 @@ from sat_intervals.raster import (
     InputError,
     OutputError,
     OutputWriter,
+    gdal,
     layers,
     open_image,
     other_files,
@@ -62,6 +64,7 @@ from sat_intervals.results import Run, open_results, open_run
 from sat_intervals.run import assemble as run_assemble
 from sat_intervals.run import copying, search_range, source, strips
 from sat_intervals.run.batch import match_batch
+from sat_intervals.run.inputs import appeared_file, describe_inputs
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.tile import match_block
@@ -381,6 +384,73 @@ def test_match_pair__ends_where_a_mask_of_a_source_appears(pair, monkeypatch, ba
     with pytest.raises(RunError, match=rf"{name} appeared during the run, whose tiles are deleted: rerun the com"):
         match_pair(folder / image, folder / "right.tif", folder / "out", settings)
     assert not list(folder.glob("out/tiles/records/*"))
+
+
+@pytest.mark.parametrize("which", ["image", "mask"])
+def test_match_pair__ends_where_a_link_to_a_virtual_raster_gets_another_target_of_the_same_bytes(
+    pair, monkeypatch, which
+):
+    """GDAL finds their sources beside the target."""
+    folder, settings = pair
+    source = "mask.tif" if which == "mask" else "left.tif"
+    for name in "ab":
+        (folder / name).mkdir()
+        shutil.copy(folder / source, folder / name / source)
+        copy(folder / name / source, folder / name / "virtual.vrt", driver="VRT")
+    assert (folder / "a" / "virtual.vrt").read_bytes() == (folder / "b" / "virtual.vrt").read_bytes()
+    link = folder / "link.vrt"
+    link.symlink_to("a/virtual.vrt")
+
+    def and_exchange(job, block):
+        match_block(job, block)
+        link.unlink()
+        link.symlink_to("b/virtual.vrt")
+
+    monkeypatch.setattr("sat_intervals.run.pair.match_block", and_exchange)
+    left = open_image(folder / "left.tif", mask=link) if which == "mask" else link
+    with pytest.raises(RunError, match=rf"b/{source} appeared during the run, whose tiles are deleted: rerun the com"):
+        match_pair(left, folder / "right.tif", folder / "out", settings)
+
+
+@pytest.mark.parametrize("name", ["mask.vrt", "mask.tif"])
+def test_open_results__refuses_a_run_whose_mask_was_changed_since(pair, name):
+    folder, settings = pair
+    left = open_image(folder / "left.tif", mask=folder / "mask.vrt")
+    match_pair(left, folder / "right.tif", folder / "out", settings)
+    open_results(folder / "out")
+    with (folder / name).open("ab") as file:
+        file.write(b" ")
+    with pytest.raises(SatIntervalsError, match=rf"{name} has changed since it was matched"):
+        open_results(folder / "out")
+
+
+def test_appeared_file__opens_a_mosaic_with_new_overviews_once(pair, monkeypatch):
+    """Not once for each of them: there may be thousands."""
+    folder, _ = pair
+    part = "<SimpleSource><SourceFilename relativeToVRT='1'>{}.tif</SourceFilename>{}</SimpleSource>"
+    sizes = "<SrcRect xSize='100' ySize='80'/><DstRect xSize='100' ySize='80'/>"
+    band = "".join(part.format(number, sizes) for number in range(9))
+    for number in range(9):
+        shutil.copy(folder / "left.tif", folder / f"{number}.tif")
+    (folder / "left.vrt").write_text(
+        f"<VRTDataset rasterXSize='100' rasterYSize='80'><VRTRasterBand dataType='UInt16' band='1'>{band}"
+        "</VRTRasterBand></VRTDataset>"
+    )
+    images = open_image(folder / "left.vrt"), open_image(folder / "right.tif")
+    files = describe_inputs(*images, load_config({"disparity": {"minimum": 0, "maximum": 9}}), {})[1]
+    opened, reading = [], gdal.reading
+
+    def counted(path, **options):
+        opened.append(path)
+        return reading(path, **options)
+
+    monkeypatch.setattr(gdal, "reading", counted)
+    assert appeared_file(*images, files) is None
+    once = len(opened)
+    for number in range(9):
+        shutil.copy(folder / "mask.tif", folder / f"{number}.tif.ovr")
+    assert appeared_file(*images, files) is None
+    assert len(opened) < 4 * once
 
 
 @pytest.mark.parametrize("name", ["left.tif.ovr", "left.vrt.ovr", "left.tif.aux.xml", "mask.tif.aux.xml"])
