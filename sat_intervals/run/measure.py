@@ -13,7 +13,7 @@ import numpy as np
 from sat_intervals.config import Calibration, Config, Interval, Mccnn, key_of
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.config.weights import weights_file
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ladder, measure
 from sat_intervals.match.memory import STRIP_PIXELS
@@ -31,6 +31,7 @@ from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, Layer, open_image, watched_images
 from sat_intervals.raster.identity import watched
+from sat_intervals.run.inputs import appeared_file
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
 from sat_intervals.run.scale import checked_scale
@@ -126,8 +127,7 @@ def measure_subjects(
     """
     found: list[Measured] = []
     cost = subjects[0].config.cost
-    images = (image for subject in subjects for image in (subject.left, subject.right, subject.truth.image))
-    check_images = watched_images(images)
+    check_truths = watched_images(subject.truth.image for subject in subjects)
     check_weights = watched([weights_file(cost.weights)] if isinstance(cost, Mccnn) else [])
     key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
@@ -139,8 +139,8 @@ def measure_subjects(
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
             found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
-    check_images()  # each job checks its own, but not whether files appeared beside them
-    check_weights()  # between subjects
+    check_truths()
+    check_weights()  # between subjects: each job checks its own
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found, key
@@ -173,6 +173,8 @@ def _of_subject(
                 check_failures(job, matched.failures)
                 gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)
                 gauge.add(job, 2 * jobs.index(job))
+                if file := appeared_file(job.left, job.right, job.files):
+                    raise ChangedInputError(f"{file} appeared while {job.left.path} was matched: rerun the command")
                 job.store.remove()
     assert gauge is not None  # there are jobs
     return gauge.measured()

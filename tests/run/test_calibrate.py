@@ -11,6 +11,7 @@ import pytest
 import rasterio
 import yaml
 from helpers import PLACE, invoke, write_pair
+from rasterio.shutil import copy
 
 from sat_intervals import SatIntervalsError, match_pair, open_image
 from sat_intervals.cli.calibrate import _Judging, _subjects
@@ -190,16 +191,18 @@ def test_measure_subjects__ends_where_a_truth_is_replaced_meanwhile(scene, tmp_p
         measure_subjects(subjects, tmp_path, replace)
 
 
-def test_measure_subjects__ends_where_a_mask_appears_beside_an_image(scene, tmp_path):
-    for name in ("left.tif", "right.tif", "truth.tif", "meta.json"):
+def test_measure_subjects__ends_where_a_mask_appears_beside_the_source_of_an_image(scene, tmp_path):
+    for name in ("left.tif", "right.tif", "truth.tif"):
         (tmp_path / name).write_bytes((scene / name).read_bytes())
-    subjects = _subjects((tmp_path,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    copy(tmp_path / "left.tif", tmp_path / "left.vrt", driver="VRT")
+    (tmp_path / "pairs.csv").write_text("left,right,truth,minimum,maximum\nleft.vrt,right.tif,truth.tif,-10,10\n")
+    subjects = _subjects((tmp_path / "pairs.csv",), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
 
     def appear(stage, done, total):
         if stage == "tiles":
             (tmp_path / "left.tif.msk").write_bytes((scene / "truth.tif").read_bytes())
 
-    with pytest.raises(RunError, match=r"a file beside .*left\.tif appeared while it was read: rerun the command"):
+    with pytest.raises(RunError, match=r"left\.tif\.msk appeared while .*left\.vrt was matched: rerun the command"):
         measure_subjects(subjects, tmp_path, appear)
 
 
