@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pyproj
-from rasterio.enums import Resampling
+from rasterio.enums import MaskFlags, Resampling
 from rasterio.transform import array_bounds
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform, transform_bounds
@@ -111,7 +111,7 @@ def read_heights(
     Parameters
     ----------
     path
-        Any raster with a CRS; scale and offset of its band are applied.
+        Any raster with a CRS; its mask, no-data value, scale and offset are applied.
     place, shape
         Georeferencing and size of the grid of cells.
     window
@@ -122,10 +122,15 @@ def read_heights(
     height, width = shape
     grid = {"crs": place.crs, "transform": place.transform, "height": height, "width": width}
     grid |= {"resampling": Resampling.bilinear if smooth else Resampling.nearest}
+    area = RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
         try:
             with WarpedVRT(dataset, dtype="float64", nodata=np.nan, **grid) as warped:
-                values = warped.read(1, window=RasterioWindow(window.column, window.row, window.width, window.height))
+                values = warped.read(1, window=area)
+            # GDAL ignores the mask of a raster with a no-data value
+            if dataset.nodata is not None and MaskFlags.per_dataset in dataset.mask_flag_enums[0]:
+                with WarpedVRT(dataset, src_nodata=None, dtype="float64", nodata=np.nan, **grid) as masked:
+                    values[masked.read(1, window=area) != values] = np.nan  # also where one of both was interpolated
         except gdal.GDAL_ERRORS as error:
             raise SatIntervalsError(f"{path} cannot be resampled to the surface: {gdal.reason(error)}") from error
         return np.asarray(values * dataset.scales[0] + dataset.offsets[0])

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import rasterio
 from pyproj import Transformer
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster
 
 from sat_intervals.raster import Georeferencing, covered_window
+from sat_intervals.raster.surfaces import read_heights
 from sat_intervals.tiling import Window
 
 GRID = Georeferencing(crs="EPSG:32631", transform=PLACE)
@@ -35,3 +37,21 @@ def test_covered_window__in_degrees_is_at_most_some_cells_larger(tmp_path):
         write_raster(tmp_path / "reference.tif", [np.zeros((40, 40))], place, "EPSG:4326"), GRID, (200, 300)
     )
     np.testing.assert_allclose((found.row, found.column, found.height, found.width), (100, 100, 44, 32), atol=4)
+
+
+@pytest.mark.parametrize("is_inside", [False, True])
+@pytest.mark.parametrize("smooth", [False, True])
+def test_read_heights__of_a_raster_with_a_mask_and_a_no_data_value_has_neither(tmp_path, is_inside, smooth):
+    """GDAL takes the no-data value only."""
+    heights, mask = np.full((1, 9, 12), 70, np.float32), np.full((9, 12), 255, np.uint8)
+    heights[0, :, :4], heights[0, :, 8:], mask[:, 8:] = -50, 9000, 0
+    kind = {"height": 9, "width": 12, "count": 1, "dtype": "float32", "nodata": -50}
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=is_inside),
+        rasterio.open(tmp_path / "a.tif", "w", "GTiff", crs=GRID.crs, transform=GRID.transform, **kind) as file,
+    ):
+        file.write(heights)
+        file.write_mask(mask)
+    read = read_heights(tmp_path / "a.tif", GRID, (9, 12), Window(0, 0, 9, 12), smooth=smooth)
+    np.testing.assert_array_equal(np.isfinite(read), np.broadcast_to([False, True, False], (9, 3)).repeat(4, axis=1))
+    assert set(read[np.isfinite(read)]) == {70}
