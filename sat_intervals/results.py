@@ -353,8 +353,7 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     """
     run = open_run(out)
     left, right = (_opened(run.report["inputs"][side]) for side in ("left", "right"))
-    if truth is None and run.truth_beside.exists():
-        truth = run.truth_beside
+    truth = truth or (run.truth_beside if run.truth_beside.exists() else None)
     layer = None if truth is None else run.layer(truth)
     return Results(run.out, run.report, run.config, run.region, run.which, left, right, layer)
 
@@ -370,8 +369,9 @@ def _opened(record: dict[str, Any]) -> Image:
             f"{image.path} has {image.height} x {image.width} pixels, but had {record['height']} x {record['width']} "
             "when it was matched: restore that image or match again"
         )
-    ways = [one for one in (record, mask) if one]
-    for file in (file for one in ways for file in (one, *one.get("files", ()))):
+    if image.use_mask != record.get("use_mask", image.use_mask):
+        raise SatIntervalsError(f"{image.path} has got or lost a mask since it was matched: restore it or match again")
+    for file in (record, *record.get("files", ()), *([mask, *mask.get("files", ())] if mask else [])):
         if is_changed(file["path"], file):
             raise SatIntervalsError(f"{file['path']} has changed since it was matched: restore it or match again")
     return image

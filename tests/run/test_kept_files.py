@@ -424,6 +424,16 @@ def test_open_results__refuses_a_run_whose_mask_was_changed_since(pair, name):
         open_results(folder / "out")
 
 
+def test_open_results__refuses_a_run_whose_image_got_a_mask_since(pair):
+    folder, settings = pair
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
+    shutil.copy(folder / "mask.tif", folder / "left.tif.msk")
+    with rasterio.open(folder / "left.tif.msk", "r+") as dataset:
+        dataset.update_tags(INTERNAL_MASK_FLAGS_1="2")
+    with pytest.raises(SatIntervalsError, match=r"left\.tif has got or lost a mask since it was matched: restore it"):
+        open_results(folder / "out")
+
+
 def test_appeared_file__opens_a_mosaic_with_new_overviews_once(pair, monkeypatch):
     """Not once for each of them: there may be thousands."""
     folder, _ = pair
