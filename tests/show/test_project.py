@@ -184,7 +184,7 @@ def test_project__ends_where_a_file_appears_beside_its_rasters(run, monkeypatch,
         (out / name).write_text("mine")
         return write_difference(*arguments)
 
-    monkeypatch.setattr("sat_intervals.show.styles.write_difference", and_appears)
+    monkeypatch.setattr(project.styles, "write_difference", and_appears)
     done = invoke("project", out)
     assert (done.exit_code, f"{name} changes what is read from" in done.stderr) == (2, True), done.output
     assert not (out / "project.qgz").exists()
