@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
@@ -22,9 +23,8 @@ from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
 _NO_MASK = ([MaskFlags.all_valid], [MaskFlags.nodata], [MaskFlags.per_dataset, MaskFlags.alpha])
-# File systems of GDAL of which it does not say what it reads, or that tell of no change.
+# File systems of which GDAL does not say what it reads, or whether it has changed; archives on servers.
 _UNKNOWN = re.compile(r"/vsi(sparse/|cached\?|\w+_streaming/)")
-# Archives on servers.
 _IN_REMOTE = re.compile(r"(/?vsi(zip|tar|gzip|7z|rar|subfile)/(\d+(_\d+)?,)?\{?)+/?vsi(curl|s3|gs|az|adls|oss|swift)")
 # Relative difference below which pixel sizes are equal up to rounding.
 _SAME_SIZE = 1e-6
@@ -120,7 +120,6 @@ def open_image(
     name = _absolute(path)
     stamps = stamps_of(name)
     with opened(name) as dataset:
-        _check_watched(name, dataset)
         check_seal(name, dataset.files)
         bands, alphas = _kinds(dataset)
         band = _chosen(name, bands, band)
@@ -222,9 +221,11 @@ def _check_pipes_beside(path: str, listed: dict[str, list[str]] | None = None) -
 
 
 def _absolute(path: str | os.PathLike[str]) -> str:
-    """Return the absolute path of a local file, and other GDAL names unchanged."""
+    """Return the absolute path of a local file, and other GDAL names unchanged.
+
+    ``link/..`` is the folder above the target of the link, which `os.path.abspath` takes for that above the link.
+    """
     name = os.fspath(path)
-    # "link/.." is the folder above the target of the link, which os.path.abspath takes for that above the link
     return str(Path(name).absolute()) if os.path.exists(name) else name
 
 
@@ -255,7 +256,7 @@ def _check_mask(image: Image, mask: str) -> None:
             )
 
 
-def _check_watched(name: str, dataset: DatasetReader, sources: Iterable[str] = ()) -> None:
+def _check_watched(name: str, dataset: DatasetReader, sources: Iterable[str]) -> None:
     """Raise if the tool could not notice that files of a raster, or ``sources``, are incomplete or change."""
     names = name, *dataset.files, *sources
     if remote := next(filter(_IN_REMOTE.match, names), None):
@@ -280,14 +281,29 @@ def other_files(name: str) -> list[str]:
     InputError
         GDAL does not list all of them.
     """
-    return survey(name)[0]
+    return survey(name).files
 
 
-def survey(name: str) -> tuple[list[str], set[str], bool]:
-    """Return `other_files`, those of them that are sources of virtual rasters, and whether sources are resampled.
+class Survey(NamedTuple):
+    """What a raster is read from.
 
-    GDAL may read overviews of sources that are resampled. Raises as `other_files`.
+    Attributes
+    ----------
+    files
+        The `other_files`.
+    sources
+        Those of them that are sources of virtual rasters.
+    are_resampled
+        Whether a source is read at another resolution, so that GDAL may read its overviews.
     """
+
+    files: list[str]
+    sources: set[str]
+    are_resampled: bool
+
+
+def survey(name: str) -> Survey:
+    """Return what a raster is read from; raises as `other_files`."""
     seen: set[str] = set()
     asked: set[str] = set()
     named: set[str] = set()  # by virtual rasters
@@ -309,8 +325,7 @@ def survey(name: str) -> tuple[list[str], set[str], bool]:
         except gdal.GDAL_ERRORS as error:
             if path in named:
                 raise InputError(
-                    f"{path}, of which {name} is made, cannot be read: {gdal.reason(error)}: restore it or make {name} "
-                    "again"
+                    f"{path}, a source of {name}, cannot be read: {gdal.reason(error)}: restore it"
                 ) from error
             continue  # a sidecar file that is not a raster
         known = set(map(_place, files))
@@ -321,7 +336,7 @@ def survey(name: str) -> tuple[list[str], set[str], bool]:
         waiting += [*filter(_may_have_others, new | others), *sources.positions]
         of_virtual |= set(map(_place, sources.names))
         are_resampled |= sources.are_resampled
-    return sorted(seen), {file for file in seen if _place(file) in of_virtual}, are_resampled
+    return Survey(sorted(seen), {file for file in seen if _place(file) in of_virtual}, are_resampled)
 
 
 def _place(name: str) -> str:

@@ -19,7 +19,7 @@ _SEAL = re.compile(_LINE + rb"([0-9a-f]{8})\n")
 # Bytes of a file among which the line is.
 _BEGINNING = 1024
 # Endings, in any case, of files that GDAL reads with a raster: after its whole name, and instead of its own.
-_BESIDE, _OF_STEM = (".aux.xml", ".aux", ".msk", ".ovr"), (".aux", ".rpb", ".rpc", "_rpc.txt", ".imd")
+SIDECARS, _OF_STEM = (".aux.xml", ".aux", ".msk", ".ovr"), (".aux", ".rpb", ".rpc", "_rpc.txt", ".imd")
 # World files, which it reads with a raster without a transform of its own.
 _WORLD_FILES = ".wld", ".tab"
 # Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes. Names of bands are repeated.
@@ -103,7 +103,7 @@ def check_place(path: Path, *, has_transform: bool = True) -> None:
     """
     kind = path.suffix
     of_stem = _OF_STEM if has_transform else (*_OF_STEM, *_WORLD_FILES, f"{kind}w", f"{kind[:2]}{kind[-1:]}w")
-    names = [f"{path.name}{ending}" for ending in _BESIDE] + [f"{path.stem}{ending}" for ending in of_stem]
+    names = [f"{path.name}{ending}" for ending in SIDECARS] + [f"{path.stem}{ending}" for ending in of_stem]
     try:
         lowered = {name.lower() for name in names}
         there = [name for name in os.listdir(path.parent) if name.lower() in lowered]

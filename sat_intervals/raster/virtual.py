@@ -61,8 +61,8 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
             raise InputError(
                 f"{path} has sources relative to {element.text} (ROOT_PATH): convert it with gdal_translate"
             )
-        if element.get("key", "").upper() in _POSITIONS:
-            positions += [_beside(own, element.text or ""), element.text or ""]
+        if element.text and element.get("key", "").upper() in _POSITIONS:
+            positions += [_beside(own, element.text), element.text]
         if element.tag in _TAGS and element.text:
             if "relativetovrt" in element.text.lower().replace('relativetovrt="0"', ""):
                 raise InputError(f"{path} has a source that is a text with relative names: write that to a file")

@@ -14,13 +14,10 @@ from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.raster import Image, is_replaced, read_files, survey
 from sat_intervals.raster.identity import identity
-from sat_intervals.raster.seal import is_read
+from sat_intervals.raster.seal import SIDECARS, is_read
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
-
-# Endings, in any case, of files beside a raster that GDAL reads with it: masks, no-data values, and last overviews.
-_SIDECARS = ".msk", ".aux.xml", ".aux", ".ovr"
 
 
 def describe_inputs(
@@ -90,14 +87,14 @@ def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | 
     """
     for image in (left, right):
         for name in filter(None, (image.path, image.mask)):
-            own = {f"{name}{ending}".lower() for ending in _SIDECARS}
+            own = {f"{name}{ending}".lower() for ending in SIDECARS}
             if name == image.path and image.use_mask:
                 own.remove(f"{name}.msk".lower())
-            others, sources, are_resampled = survey(name)
-            endings = _SIDECARS if are_resampled else _SIDECARS[:-1]
-            for file in filter(is_read, others):
+            now = survey(name)
+            endings = tuple(ending for ending in SIDECARS if ending != ".ovr" or now.are_resampled)
+            for file in filter(is_read, now.files):
                 is_sidecar = file.lower().endswith(endings) and file.lower() not in own
-                if file not in files and (is_sidecar or file in sources):
+                if file not in files and (is_sidecar or file in now.sources):
                     return file
     return None
 

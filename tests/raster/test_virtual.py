@@ -170,11 +170,11 @@ REFUSED = {
     ),
     "a subdataset beside it": (
         virtual((1, "image.tif"), SOURCE.format(1, "GTIFF_DIR:1:mask.tif")),
-        r"GTIFF_DIR:1:mask.tif, of which .*image.vrt is made, cannot be read",
+        r"GTIFF_DIR:1:mask.tif, a source of .*image.vrt, cannot be read",
     ),
     "a lost mask": (
         virtual((1, "image.tif"), SOURCE.format(1, "gone.tif")),
-        r"gone.tif, of which .*image.vrt is made, cannot be read",
+        r"gone.tif, a source of .*image.vrt, cannot be read",
     ),
 }
 
@@ -270,8 +270,8 @@ def test_survey__says_whether_sources_of_virtual_rasters_of_virtual_ones_are_res
         "<SourceBand>1</SourceBand>", parts.replace(str(SIZE // 2), str(SIZE))
     )
     (folder / "outer.vrt").write_text(outer.replace("inner.vrt", str(folder / "inner.vrt")))
-    assert [survey(str(folder / name))[2] for name in ("inner.vrt", "outer.vrt")] == [is_other, is_other]
-    assert not survey(str(folder / "image.tif"))[2]
+    assert [survey(str(folder / name)).are_resampled for name in ("inner.vrt", "outer.vrt")] == [is_other, is_other]
+    assert not survey(str(folder / "image.tif")).are_resampled
 
 
 @pytest.mark.parametrize("spelling", ['relativeToVRT="1"', "relativetovrt='01'"])

@@ -1102,7 +1102,7 @@ def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its
 
 
 @pytest.mark.parametrize(
-    "ending", [".tif.aux.xml", ".tif.msk", ".tif.OVR", ".tif.aux", ".aux", ".RPB", ".rpc", "_rpc.txt"]
+    "ending", [".tif.aux.xml", ".tif.msk", ".tif.OVR", ".tif.aux", ".aux", ".RPB", ".rpc", "_rpc.txt", ".IMD"]
 )
 def test_match_pair__refuses_a_file_that_would_change_what_is_read_from_its_results(pair, ending):
     folder, settings = pair
