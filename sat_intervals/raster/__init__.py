@@ -3,22 +3,13 @@
 from sat_intervals.errors import InputError
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
 from sat_intervals.raster.cog import Part
+from sat_intervals.raster.dependencies import other_files, pixel_files, read_files, survey, watched_rasters
 from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
 from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.heightfield import GROUND, HeightRaster
-from sat_intervals.raster.images import (
-    Image,
-    check_pair,
-    is_replaced,
-    open_image,
-    other_files,
-    read_files,
-    survey,
-    watched_images,
-    watched_rasters,
-)
+from sat_intervals.raster.images import Image, check_pair, is_replaced, open_image, watched_images
 from sat_intervals.raster.layers import (
     MARK,
     check_alone,
@@ -95,6 +86,7 @@ __all__ = [
     "open_image",
     "other_files",
     "part_bytes",
+    "pixel_files",
     "put_back",
     "read_files",
     "read_heights",

@@ -22,11 +22,13 @@ _BEGINNING = 1024
 SIDECARS, _OF_STEM = (".aux.xml", ".aux", ".msk", ".ovr"), (".aux", ".rpb", ".rpc", "_rpc.txt", ".imd")
 # World files, which it reads with a raster without a transform of its own.
 _WORLD_FILES = ".wld", ".tab"
-# Elements of a file of GDAL beside a raster that has only its statistics, as QGIS writes. Names of bands are repeated.
+# Elements and keys of a file of GDAL beside a raster that has only statistics, as QGIS and ArcGIS write. Names of bands
+# are repeated.
 _STATISTICS = {
     *("PAMDataset", "PAMRasterBand", "Description", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax"),
     *("BucketCount", "IncludeOutOfRange", "Approximate", "HistCounts"),
 }
+_SHOWN = "STATISTICS_", "PyramidResamplingType"
 
 
 def with_room(ghost: bytes) -> bytes:
@@ -118,10 +120,10 @@ def is_read(file: str) -> bool:
 
 
 def has_statistics_only(file: Path) -> bool:
-    """Return whether an ``.aux.xml`` has nothing but statistics, as GDAL and QGIS write them for a raster they show."""
+    """Return whether an ``.aux.xml`` has nothing but statistics, as QGIS and ArcGIS write it for one they show."""
     try:
         elements = list(ElementTree.parse(file).iter())
     except (ElementTree.ParseError, OSError):
         return False
     keys = [element.get("key", "") for element in elements if element.tag == "MDI"]
-    return {element.tag for element in elements} <= _STATISTICS and all(key.startswith("STATISTICS_") for key in keys)
+    return {element.tag for element in elements} <= _STATISTICS and all(key.startswith(_SHOWN) for key in keys)

@@ -26,13 +26,13 @@ class Sources(NamedTuple):
         Sources of the bands and masks of a virtual raster, and heights to warp them.
     positions
         Where rasters with the positions of pixels may be.
-    are_resampled
-        Whether GDAL may read sources at another resolution, and thus their overviews.
+    uses_overviews
+        Whether GDAL may read overviews of sources, since it reads these at another resolution.
     """
 
     names: list[str]
     positions: list[str]
-    are_resampled: bool
+    uses_overviews: bool
 
 
 def sources_of(path: str, dataset: DatasetReader) -> Sources:
@@ -45,7 +45,7 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
     InputError
         A source has no name that can be watched.
     """
-    names, positions, are_resampled = [], [], False
+    names, positions, uses_overviews = [], [], False
     own = next(iter(dataset.files), path)  # "/vsicurl/http://" for "http://"
     if path.startswith(_SCHEME):
         names.append(path.removeprefix(_SCHEME).partition("?")[0])
@@ -67,8 +67,9 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
             if "relativetovrt" in element.text.lower().replace('relativetovrt="0"', ""):
                 raise InputError(f"{path} has a source that is a text with relative names: write that to a file")
             names.append(_resolved(own, element) if element.get("relativeToVRT") == "1" else element.text)
-        are_resampled |= element.find("SourceFilename") is not None and _is_resampled(element)
-    return Sources(names, positions, are_resampled)
+        is_level = element.get("key", "").upper() == "OVERVIEW_LEVEL"
+        uses_overviews |= is_level or (element.find("SourceFilename") is not None and _is_resampled(element))
+    return Sources(names, positions, uses_overviews)
 
 
 def _elements(path: str, dataset: DatasetReader) -> Iterator[ElementTree.Element]:

@@ -12,9 +12,9 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.raster import Image, is_replaced, read_files, survey
+from sat_intervals.raster import Image, is_replaced, pixel_files, survey
 from sat_intervals.raster.identity import identity
-from sat_intervals.raster.seal import SIDECARS, is_read
+from sat_intervals.raster.seal import SIDECARS
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
@@ -75,8 +75,8 @@ def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dic
 
 
 def _with_others(name: str, identified: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
-    """Return the identity of a raster and of the other files it is read from."""
-    return {**identified(name), "files": [identified(file) for file in read_files(name)[1:]]}
+    """Return the identity of a raster and of the other files that decide its pixels."""
+    return {**identified(name), "files": [identified(file) for file in pixel_files(name)[1:]]}
 
 
 def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | None:
@@ -91,9 +91,8 @@ def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | 
             if name == image.path and image.use_mask:
                 own.remove(f"{name}.msk".lower())
             now = survey(name)
-            endings = tuple(ending for ending in SIDECARS if ending != ".ovr" or now.are_resampled)
-            for file in filter(is_read, now.files):
-                is_sidecar = file.lower().endswith(endings) and file.lower() not in own
+            for file in now.of_pixels(name):
+                is_sidecar = file.lower().endswith(SIDECARS) and file.lower() not in own
                 if file not in files and (is_sidecar or file in now.sources):
                     return file
     return None

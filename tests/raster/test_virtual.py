@@ -13,7 +13,7 @@ from rasterio.crs import CRS
 from rasterio.rpc import RPC
 from rasterio.transform import from_origin
 
-from sat_intervals.raster import InputError, open_image, other_files, survey
+from sat_intervals.raster import InputError, open_image, other_files, pixel_files, survey
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -262,7 +262,7 @@ def test_open_image__names_a_virtual_raster_with_metadata_that_are_not_xml(folde
 
 
 @pytest.mark.parametrize(("size", "is_other"), [(SIZE, False), (SIZE // 2, True), (None, True)])
-def test_survey__says_whether_sources_of_virtual_rasters_of_virtual_ones_are_resampled(folder, size, is_other):
+def test_survey__says_whether_overviews_of_sources_are_read(folder, size, is_other):
     parts = f'<SrcRect xSize="{size}" ySize="{SIZE}"/><DstRect xSize="{SIZE}.0" ySize="{SIZE}"/>' if size else ""
     parts = f"<SourceBand>1</SourceBand>{parts}"
     (folder / "inner.vrt").write_text(virtual((1, "image.tif")).replace("<SourceBand>1</SourceBand>", parts))
@@ -270,8 +270,35 @@ def test_survey__says_whether_sources_of_virtual_rasters_of_virtual_ones_are_res
         "<SourceBand>1</SourceBand>", parts.replace(str(SIZE // 2), str(SIZE))
     )
     (folder / "outer.vrt").write_text(outer.replace("inner.vrt", str(folder / "inner.vrt")))
-    assert [survey(str(folder / name)).are_resampled for name in ("inner.vrt", "outer.vrt")] == [is_other, is_other]
-    assert not survey(str(folder / "image.tif")).are_resampled
+    assert [survey(str(folder / name)).uses_overviews for name in ("inner.vrt", "outer.vrt")] == [is_other, is_other]
+    assert not survey(str(folder / "image.tif")).uses_overviews
+
+
+LEVEL = '<OpenOptions><OOI key="{}">0</OOI></OpenOptions>'
+RECTANGLES = f'<SrcRect xSize="{SIZE}" ySize="{SIZE}"/><DstRect xSize="{SIZE}" ySize="{SIZE}"/>'
+WITHOUT_LEVEL = virtual((1, "image.tif")).replace("</SimpleSource>", f"{RECTANGLES}</SimpleSource>")
+WARPED_WITHOUT_LEVEL = WARPED.format(f"<SrcGeoTransform>{GRID}</SrcGeoTransform>")
+READ = {
+    "a.vrt": WITHOUT_LEVEL.replace("<SourceBand>", LEVEL.format("OVERVIEW_LEVEL") + "<SourceBand>"),
+    "b.vrt": WITHOUT_LEVEL.replace("<SourceBand>", LEVEL.format("overview_level") + "<SourceBand>"),
+    "warped.vrt": WARPED_WITHOUT_LEVEL.replace("<Transformer>", LEVEL.format("OVERVIEW_LEVEL") + "<Transformer>"),
+    **dict.fromkeys(["vrt://image.tif?ovr=0", "vrt://image.tif?oo=OVERVIEW_LEVEL=0", "vrt://image.tif?outsize=8,8"]),
+}
+NOT_READ = {"c.vrt": WITHOUT_LEVEL, "warped.vrt": WARPED_WITHOUT_LEVEL, "image.tif": None, "vrt://image.tif": None}
+
+
+@pytest.mark.parametrize("is_read", [True, False])
+def test_pixel_files__have_overviews_where_these_are_read(folder, monkeypatch, is_read):
+    monkeypatch.chdir(folder)
+    with rasterio.open("image.tif.ovr", "w", "GTiff", SIZE // 2, SIZE // 2, 1, dtype="uint16") as file:
+        file.write(np.full((1, SIZE // 2, SIZE // 2), 7, "uint16"))
+    for name, text in (READ if is_read else NOT_READ).items():
+        if text:
+            (folder / name).write_text(text)
+        with rasterio.open(name) as file:
+            assert np.any(file.read() == 7) == is_read, name
+        assert any(file.endswith("image.tif.ovr") for file in pixel_files(name)) == is_read, name
+    assert "image.tif.ovr" in pixel_files("GTIFF_DIR:1:image.tif.ovr")
 
 
 @pytest.mark.parametrize("spelling", ['relativeToVRT="1"', "relativetovrt='01'"])

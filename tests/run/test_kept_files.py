@@ -64,6 +64,7 @@ from sat_intervals.results import Run, open_results, open_run
 from sat_intervals.run import assemble as run_assemble
 from sat_intervals.run import copying, search_range, source, strips
 from sat_intervals.run.batch import match_batch
+from sat_intervals.run.before import report_before
 from sat_intervals.run.inputs import appeared_file, describe_inputs
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
@@ -484,7 +485,30 @@ def test_match_pair__goes_on_where_a_file_appears_that_changes_nothing(pair, mon
     assert (folder / "out" / "intervals.tif").exists()
 
 
-def test_match_pair__resumes_when_its_image_was_shown_meanwhile(pair):
+ARCGIS = (
+    '<PAMDataset><Metadata domain="Esri"><MDI key="PyramidResamplingType">NEAREST</MDI></Metadata>'
+    '<PAMRasterBand band="1"><Metadata><MDI key="STATISTICS_MEAN">7</MDI></Metadata></PAMRasterBand></PAMDataset>'
+)
+
+
+def _show_in_qgis(image):
+    with rasterio.open(image) as dataset, pytest.warns(RasterioDeprecationWarning):
+        dataset.statistics(1, approx=False)
+
+
+def _show_in_arcgis(image):
+    Path(f"{image}.aux.xml").write_text(ARCGIS)
+
+
+def _build_pyramids(image):
+    other = shutil.copy(image, image.with_name("other.tif"))
+    with rasterio.Env(TIFF_USE_OVR=True), rasterio.open(other, "r+") as dataset:
+        dataset.build_overviews([2, 4])
+    Path(f"{other}.ovr").rename(f"{image}.ovr")
+
+
+@pytest.mark.parametrize("show", [_show_in_qgis, _show_in_arcgis, _build_pyramids])
+def test_match_pair__resumes_when_its_image_was_shown_meanwhile(pair, show):
     folder, settings = pair
 
     def stop(stage, done, total):
@@ -494,13 +518,15 @@ def test_match_pair__resumes_when_its_image_was_shown_meanwhile(pair):
     images = folder / "left.tif", folder / "right.tif", folder / "out"
     with pytest.raises(KeyboardInterrupt):
         match_pair(*images, settings, progress=stop)
-    with rasterio.open(folder / "left.tif") as dataset, pytest.warns(RasterioDeprecationWarning):  # as QGIS
-        dataset.statistics(1, approx=False)
-    assert (folder / "left.tif.aux.xml").exists()
+    show(folder / "left.tif")
+    assert list(folder.glob("left.tif.*"))
     done = {file: file.stat().st_mtime_ns for file in folder.glob("out/tiles/records/*")}
     match_pair(*images, settings, keep_tiles=True)
     assert done
     assert all(file.stat().st_mtime_ns == time for file, time in done.items())
+    show(folder / "right.tif")
+    assert report_before(*map(open_image, images[:2]), images[2], load_config(settings), None)
+    assert open_results(images[2]).left.path == str(images[0])
 
 
 def test_match_pair__ends_where_a_memory_map_changes_an_input(pair, monkeypatch):
