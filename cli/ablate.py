@@ -5,11 +5,11 @@ from pathlib import Path
 import click
 
 from sat_intervals.cli.judging import Judging, judging_options, say_scenes, watched_arguments, watched_pairs
-from sat_intervals.cli.options import cost_option
+from sat_intervals.cli.options import FILE, cost_option
 
 
 @click.command(short_help="Compare parts of the method on pairs with known truth.")
-@click.argument("pairs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("pairs", nargs=-1, required=True, type=FILE)
 @cost_option
 @judging_options
 def ablate(pairs: tuple[Path, ...], cost: str | None, judging: Judging) -> None:

@@ -5,13 +5,13 @@ from pathlib import Path
 import click
 
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
-from sat_intervals.cli.options import json_option, path, say_json
+from sat_intervals.cli.options import FILE, json_option, say_json
 from sat_intervals.cli.triangulate import point_warnings
 
 
 @click.command(short_help="Match many pairs; a rerun matches the missing ones.")
-@click.argument("pairs", callback=path)
-@click.argument("out", callback=path)
+@click.argument("pairs", type=FILE)
+@click.argument("out", type=FILE)
 @json_option
 @settings_options
 @run_options

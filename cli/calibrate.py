@@ -13,10 +13,10 @@ from sat_intervals.cli.calibration_files import checked_folder, write
 from sat_intervals.cli.judging import named_by, tolerance_option, watched_arguments
 from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
+    FILE,
     SurfaceAndReference,
     json_option,
     log_options,
-    path,
     quiet_option,
     reference_options,
     say_json,
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from sat_intervals.config.pairs import Pair
     from sat_intervals.run.measure import Subject
 
-_FILE = click.Path(path_type=Path)
 _OPTIONS_OF_OTHERS = "--coverage applies only with --dsm, and --calibration is an option of match: leave them out."
 _CALIBRATION = """\
 # Calibration: levels of the cost curve that reach a coverage, found by sat-intervals calibrate.
@@ -42,9 +41,9 @@ _SETTINGS = """\
 
 
 @click.command(short_help="Find the levels that reach a coverage, on pairs with known truth.")
-@click.argument("pairs", nargs=-1, type=_FILE)
-@click.option("--output", callback=path, required=True, metavar="FILE", help="Calibration to write (YAML).")
-@click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order.")
+@click.argument("pairs", nargs=-1, type=FILE)
+@click.option("--output", type=FILE, required=True, help="Calibration to write (YAML).")
+@click.option("--truth", type=FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order.")
 @tolerance_option
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth of each pair to its truth.")
 @click.option(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.matching import RunArguments, SettingsArguments, local_option, run_options, settings_options
-from sat_intervals.cli.options import json_option, path, say_json
+from sat_intervals.cli.options import FILE, json_option, say_json
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Make a scene with exact truth, match it and compare.")
-@click.argument("out", callback=path)
+@click.argument("out", type=FILE)
 @click.option(
     "--size", type=int, nargs=2, metavar="ROWS COLUMNS", default=(1200, 1200), show_default=True, help="Size in pixels."
 )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import Command, json_option, log_options, path, quiet_option, say_json, with_options
+from sat_intervals.cli.options import FILE, Command, json_option, log_options, quiet_option, say_json, with_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -17,12 +17,10 @@ BOUNDS = ("envelope", "mean", "median", "nearest", "agreeing")
 
 _CELL_OPTIONS = (
     click.option("--resolution", type=float, metavar="METRES", help="Side of a cell; or give --grid-like."),
-    click.option(
-        "--grid-like", callback=path, metavar="FILE", help="North-up raster whose grid and CRS the surface takes."
-    ),
+    click.option("--grid-like", type=FILE, help="North-up raster whose grid and CRS the surface takes."),
     click.option("--crs", metavar="EPSG", help="A projected CRS in metres; default the UTM zone of the points."),
     click.option("--radius", type=float, metavar="METRES", help="Reach of a point; default the side of a cell."),
-    click.option("--geoid", callback=path, metavar="FILE", help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
+    click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to."),
     click.option(
         "--bounds",
         "--interval",
@@ -83,8 +81,7 @@ def calibration_option(*names: str) -> Callable[[Command], Command]:
     return click.option(
         *names,
         "height_calibration",
-        callback=path,
-        metavar="FILE",
+        type=FILE,
         help="Calibration written by calibrate --dsm: margins in metres that move the bounds.",
     )
 
@@ -117,13 +114,12 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 
 
 @click.command(short_help="Make a surface model with height intervals from one or several runs.")
-@click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=FILE)
 @cell_options
 @calibration_option("--calibration")
 @click.option(
     "--output",
-    callback=path,
-    metavar="FILE",
+    type=FILE,
     help="File to write; default dsm.tif in the first OUT. An existing surface model is replaced.",
 )
 @json_option

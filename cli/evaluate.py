@@ -12,14 +12,12 @@ import click
 
 from sat_intervals.cli.evaluate_dsm import Surface, surface_options
 from sat_intervals.cli.judging import Judging, judging_options, say_scenes, watched_arguments, watched_pairs
-from sat_intervals.cli.options import COSTS
+from sat_intervals.cli.options import COSTS, FILE
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
     from sat_intervals.config.pairs import Pair
     from sat_intervals.evaluate.paper import SceneMetrics
-
-_FILE = click.Path(path_type=Path)
 
 
 @dataclass(frozen=True)
@@ -34,9 +32,9 @@ class _Source:
 
 
 @click.command(short_help="Evaluate intervals against a known truth.")
-@click.argument("folders", metavar="OUT...", nargs=-1, type=_FILE)
-@click.option("--truth", type=_FILE, multiple=True, help="True disparity; one for each OUT, in that order.")
-@click.option("--mask", type=_FILE, multiple=True, help="Pixels to evaluate (not 0); one for each OUT, in that order.")
+@click.argument("folders", metavar="OUT...", nargs=-1, type=FILE)
+@click.option("--truth", type=FILE, multiple=True, help="True disparity; one for each OUT, in that order.")
+@click.option("--mask", type=FILE, multiple=True, help="Pixels to evaluate (not 0); one for each OUT, in that order.")
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
 @click.option("--group", metavar="LABEL", help="Put all scenes in this group; ignore meta.json.")
 @surface_options

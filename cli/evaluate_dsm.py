@@ -9,10 +9,9 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import Command, SurfaceAndReference, reference_options, say_json, with_options
+from sat_intervals.cli.options import FILE, Command, SurfaceAndReference, reference_options, say_json, with_options
 
 Line = tuple[float, float, float, float]
-_FILE = click.Path(path_type=Path)
 _SOFTWARE = "sat-intervals"
 # Files of --pictures: figures and pictures.
 _TEXTS = "dsm-accuracy.json", "dsm-accuracy.md"
@@ -61,10 +60,10 @@ class Surface:
 
 
 _OPTIONS = (
-    click.option("--classes", type=_FILE, help="With --dsm: raster of whole numbers, such as land cover, in any CRS."),
+    click.option("--classes", type=FILE, help="With --dsm: raster of whole numbers, such as land cover, in any CRS."),
     click.option(
         "--pictures",
-        type=_FILE,
+        type=FILE,
         metavar="FOLDER",
         help="With --dsm: write figures (JSON, Markdown) and pictures there.",
     ),

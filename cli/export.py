@@ -4,12 +4,12 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import log_options, path
+from sat_intervals.cli.options import FILE, log_options
 
 
 @click.command(short_help="Export a run to the files of CARS, OTB, ASP or s2p.")
-@click.argument("out", callback=path)
-@click.argument("target", callback=path)
+@click.argument("out", type=FILE)
+@click.argument("target", type=FILE)
 @click.option("--to", "form", type=click.Choice(["cars", "otb", "asp", "s2p"]), required=True, help="Target tool.")
 @log_options
 def export(out: Path, target: Path, form: str) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import Command, json_option, log_options, preset_option, say_json, with_options
+from sat_intervals.cli.options import FILE, Command, json_option, log_options, preset_option, say_json, with_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -77,9 +77,7 @@ def judging_options(command: Command) -> Command:
 
     return with_options(
         with_judging,
-        click.option(
-            "--config", "config_file", type=click.Path(path_type=Path), help="Settings to match pairs with (YAML)."
-        ),
+        click.option("--config", "config_file", type=FILE, help="Settings to match pairs with (YAML)."),
         preset_option,
         click.option(
             "--accurate",

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.options import (
+    FILE,
+    NAME,
     Command,
     cost_option,
     log_options,
-    named,
-    path,
     preset_option,
     quiet_option,
     store_option,
@@ -100,8 +100,8 @@ class RunArguments:
 
 
 _IMAGE_OPTIONS = (
-    click.option("--left-mask", callback=named, metavar="FILE", help="Mask of the left image: non-zero = masked."),
-    click.option("--right-mask", callback=named, metavar="FILE", help="Mask of the right image."),
+    click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
+    click.option("--right-mask", type=NAME, help="Mask of the right image."),
     click.option("--nodata", type=float, metavar="V", help="No-data value of both images, replaces that of the files."),
     click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image."),
     click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image."),
@@ -124,8 +124,8 @@ def pair_options(command: Command) -> Command:
 
     return with_options(
         with_pair,
-        click.argument("left", callback=named),
-        click.argument("right", callback=named),
+        click.argument("left", type=NAME),
+        click.argument("right", type=NAME),
         *_IMAGE_OPTIONS,
         click.option(
             "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
@@ -157,9 +157,7 @@ _SEARCH_OPTIONS = (
         help="Search range in pixels, both ends searched; default: found from the images.",
     ),
     local_option,
-    click.option(
-        "--range-grid", callback=named, metavar="FILE", help="Raster of two bands, minimum and maximum of each pixel."
-    ),
+    click.option("--range-grid", type=NAME, help="Raster of two bands, minimum and maximum of each pixel."),
 )
 _LEVEL_OPTIONS = (
     click.option(
@@ -168,14 +166,10 @@ _LEVEL_OPTIONS = (
         metavar="C",
         help="Share of true disparities to be inside, .5 to .99, instead of alpha.",
     ),
-    click.option(
-        "--calibration", callback=named, metavar="FILE", help="Calibration for --coverage; default the built-in one."
-    ),
+    click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
 )
 _FIRST_SETTINGS = (
-    click.option(
-        "--config", "config_file", callback=path, metavar="FILE", help="Settings (YAML); the command line wins."
-    ),
+    click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
     preset_option,
     cost_option,
 )

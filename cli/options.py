@@ -20,21 +20,29 @@ PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm"
 Command = Callable[..., Any]
 
 
-def named(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
-    """Raise if a file name is empty, as from an unset shell variable, or not UTF-8, which GDAL needs."""
-    if value == "":
-        raise click.BadParameter("it is empty: give a file or folder")
-    try:
-        (value or "").encode()
-    except UnicodeEncodeError as error:
-        raise click.BadParameter(f"{value!r} is not UTF-8: rename it") from error
-    return value
+class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """A name that GDAL can open: UTF-8, and not empty, as from an unset shell variable."""
+
+    name = "file"
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
+        if value == "":
+            self.fail("it is empty: give a file or folder", parameter, context)
+        try:
+            str(value).encode()
+        except UnicodeEncodeError:
+            self.fail(f"{value!r} is not UTF-8: rename it", parameter, context)
+        return value
 
 
-def path(context: click.Context, parameter: click.Parameter, value: str | None) -> Path | None:
-    """Convert a name to a path; an empty name, which would be the current folder, is refused."""
-    return None if value is None else Path(str(named(context, parameter, value)))
+class _File(_Name):
+    """The path of a file or folder."""
 
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
+        return Path(super().convert(value, parameter, context))
+
+
+NAME, FILE = _Name(), _File()
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
 preset_option = click.option(
@@ -44,11 +52,9 @@ preset_option = click.option(
     "dates or little texture, paper (default) for the paper's figures.",
 )
 cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost, with its default penalties.")
-store_option = click.option(
-    "--store", callback=named, metavar="URL", help="Folder or fsspec URL for tiles during the run."
-)
+store_option = click.option("--store", type=NAME, metavar="URL", help="Folder or fsspec URL for tiles during the run.")
 _SENSOR_OPTIONS = tuple(
-    click.option(f"--{side}-{kind}", required=True, callback=path, metavar="FILE", help=text.format(side))
+    click.option(f"--{side}-{kind}", required=True, type=FILE, help=text.format(side))
     for kind, text in (("model", "RPC model of the {} sensor image."), ("grid", "Epipolar grid of the {} image."))
     for side in ("left", "right")
 )
@@ -91,11 +97,10 @@ def reference_options(dsm_help: str) -> Callable[[Command], Command]:
 
         return with_options(
             with_reference,
-            click.option("--dsm", callback=path, metavar="FILE", help=dsm_help),
+            click.option("--dsm", type=FILE, help=dsm_help),
             click.option(
                 "--reference",
-                callback=path,
-                metavar="FILE",
+                type=FILE,
                 help="With --dsm: reference heights above the same datum, in any CRS.",
             ),
             click.option("--no-register", is_flag=True, help="With --dsm: do not move the reference to the surface."),
@@ -133,7 +138,7 @@ def log_options(command: Command) -> Command:
     return with_options(
         with_log,
         click.option("--debug", is_flag=True, help="Show the complete log, and tracebacks of errors."),
-        click.option("--log-file", callback=path, metavar="FILE", help="Append the complete log to FILE."),
+        click.option("--log-file", type=FILE, help="Append the complete log to FILE."),
     )
 
 

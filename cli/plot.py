@@ -7,24 +7,22 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.judging import finite
-from sat_intervals.cli.options import PICTURES, log_options
+from sat_intervals.cli.options import FILE, PICTURES, log_options
 
 if TYPE_CHECKING:
     from sat_intervals.results import Results
 
-_FILE = click.Path(path_type=Path)
-
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
-@click.argument("out", type=_FILE)
-@click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
+@click.argument("out", type=FILE)
+@click.option("--truth", type=FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
 @click.option("--row", type=int, metavar="R", help="Draw the profile of this row.")
 @click.option("--columns", type=int, nargs=2, metavar="A B", help="First and last column of the profile.")
 @click.option("--pixel", type=int, nargs=2, metavar="R C", help="Draw the cost curve of this pixel.")
 @click.option(
-    "--beside", type=_FILE, multiple=True, metavar="OUT", help="Run of the same pair at another coverage, to draw too."
+    "--beside", type=FILE, multiple=True, metavar="OUT", help="Run of the same pair at another coverage, to draw too."
 )
-@click.option("--mask", type=_FILE, help="Pixels that coverage.png counts (not 0).")
+@click.option("--mask", type=FILE, help="Pixels that coverage.png counts (not 0).")
 @click.option(
     "--tolerance", type=click.FloatRange(min=0), default=0.0, callback=finite, metavar="PX",
     help="In coverage.png, truth up to PX outside an interval counts as inside.",

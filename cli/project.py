@@ -4,11 +4,11 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import log_options, path
+from sat_intervals.cli.options import FILE, log_options
 
 
 @click.command(short_help="Write a QGIS project and styles of a finished run.")
-@click.argument("out", callback=path)
+@click.argument("out", type=FILE)
 @log_options
 def project(out: Path) -> None:
     """Write OUT/project.qgz, a QGIS project of the finished run in the folder OUT.

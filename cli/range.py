@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from sat_intervals.cli.matching import PairArguments, pair_options
-from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json
+from sat_intervals.cli.options import FILE, json_option, log_options, quiet_option, say_json
 
 # Bars of the histogram that are printed, each of several bins.
 _BARS = 8
@@ -14,7 +14,7 @@ _BARS = 8
 
 @click.command("range", short_help="Find the search range of a pair.")
 @pair_options
-@click.option("--output", callback=path, metavar="FILE", help="Write the local ranges, for --range-grid of match.")
+@click.option("--output", type=FILE, help="Write the local ranges, for --range-grid of match.")
 @json_option
 @quiet_option
 @log_options

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, sensor_options
+from sat_intervals.cli.options import FILE, json_option, log_options, quiet_option, say_json, sensor_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -15,14 +15,14 @@ _SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
 
 
 @click.command(short_help="Turn reference heights into true disparities of a run.")
-@click.argument("out", callback=path)
-@click.option("--heights", callback=path, metavar="FILE", help="Raster of heights, in any CRS.")
-@click.option("--points", callback=path, metavar="FILE", help="Points: CSV, LAS, LAZ, GeoPackage.")
+@click.argument("out", type=FILE)
+@click.option("--heights", type=FILE, help="Raster of heights, in any CRS.")
+@click.option("--points", type=FILE, help="Points: CSV, LAS, LAZ, GeoPackage.")
 @click.option("--ellipsoid", is_flag=True, help="Heights are above the ellipsoid of WGS 84.")
-@click.option("--geoid", callback=path, metavar="FILE", help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
+@click.option("--geoid", type=FILE, help="Geoid grid (GTX, GeoTIFF) that heights refer to.")
 @click.option("--crs", metavar="EPSG", help="CRS of the heights, in place of the file's.")
 @click.option("--no-register", is_flag=True, help="Do not move the reference to the points of the run.")
-@click.option("--output", callback=path, metavar="FILE", help="File to write; default truth.tif in OUT.")
+@click.option("--output", type=FILE, help="File to write; default truth.tif in OUT.")
 @sensor_options
 @json_option
 @quiet_option

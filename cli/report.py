@@ -4,14 +4,12 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import log_options
-
-_FILE = click.Path(path_type=Path)
+from sat_intervals.cli.options import FILE, log_options
 
 
 @click.command(short_help="Write an HTML page of a finished run.")
-@click.argument("out", type=_FILE)
-@click.option("--truth", type=_FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
+@click.argument("out", type=FILE)
+@click.option("--truth", type=FILE, help="True disparity; default truth.tif beside the left image, if it exists.")
 @log_options
 def report(out: Path, truth: Path | None) -> None:
     """Write OUT/report.html, one self-contained file for any browser.

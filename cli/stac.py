@@ -4,11 +4,11 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import log_options, path
+from sat_intervals.cli.options import FILE, log_options
 
 
 @click.command(short_help="Write a STAC item of a finished run.")
-@click.argument("out", callback=path)
+@click.argument("out", type=FILE)
 @click.option("--datetime", "taken", metavar="TIME", help="When the left image was taken; default: the end of the run.")
 @click.option("--id", "identifier", metavar="ID", help="Identifier of the item; default: the name of the folder.")
 @log_options

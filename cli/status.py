@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import json_option, say_json, store_option
+from sat_intervals.cli.options import FILE, json_option, say_json, store_option
 
 
 @click.command(short_help="Show the progress of a run or a batch.")
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", type=FILE)
 @store_option
 @json_option
 def status(out: Path, store: str | None, as_json: bool) -> None:

@@ -15,7 +15,7 @@ from sat_intervals.cli.matching import (
     run_options,
     search_options,
 )
-from sat_intervals.cli.options import json_option, path, say_json, sensor_options
+from sat_intervals.cli.options import FILE, json_option, say_json, sensor_options
 from sat_intervals.cli.triangulate import point_warnings, say_points
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _FILES = "points.tif", "points.json", "dsm.tif"
 @click.command(short_help="Match a pair, triangulate it and make a surface model.")
 @search_options
 @pair_options
-@click.argument("out", callback=path)
+@click.argument("out", type=FILE)
 @sensor_options
 @cell_options
 @calibration_option("--height-calibration")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import json_option, log_options, path, quiet_option, say_json, sensor_options
+from sat_intervals.cli.options import FILE, json_option, log_options, quiet_option, say_json, sensor_options
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -17,7 +17,7 @@ _MOST_BEYOND = 4
 
 
 @click.command(short_help="Compute points and height bounds of a run with sensor models.")
-@click.argument("out", callback=path)
+@click.argument("out", type=FILE)
 @sensor_options
 @json_option
 @quiet_option

@@ -214,6 +214,12 @@ def test_match__refuses_names_that_are_not_utf8(folder, tmp_path):
     assert_refused(invoke("match", name, folder / "right.tif", tmp_path), "is not UTF-8: rename it")
 
 
+@pytest.mark.parametrize("name", ["", os.fsdecode(b"out\xff")])
+@pytest.mark.parametrize("command", ["dsm", "evaluate", "plot", "report", "status"])
+def test_commands__refuse_folders_without_a_name_or_not_utf8(command, name):
+    assert_refused(invoke(command, name), "it is empty: give a" if name == "" else "is not UTF-8: rename it")
+
+
 def test_match__notices_swapped_arguments(folder, tmp_path):
     result = invoke("match", tmp_path / "out", folder / "left.tif", folder / "right.tif", "--disparity", "-9", "9")
     assert_refused(result, "out cannot be read: No such file or directory")
