@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from sat_intervals.cli.logs import logged
 
@@ -33,6 +34,11 @@ class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
         except UnicodeEncodeError:
             self.fail(f"{value!r} is not UTF-8: rename it", parameter, context)
         return value
+
+    def shell_complete(
+        self, context: click.Context, parameter: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        return [CompletionItem(incomplete, type="file")]
 
 
 class _File(_Name):

@@ -91,12 +91,13 @@ def watched_points(path: Path) -> Callable[[], None]:
             )
     beside = [file for file in path.parent.glob(f"{escape(path.stem)}.*") if file.suffix.lower() in _WITH]
     check_files = watched([path, *beside, *(path.with_suffix(ending) for ending in _WITH)])
-    journals = [path.name + ending for ending in ("-wal", "-journal")]
-    before = stamps(path.parent, journals)  # root's reading changes their other times
+    target = path.resolve()  # beside which SQLite keeps them
+    journals = [target.name + ending for ending in ("-wal", "-journal")]
+    before = stamps(target.parent, journals)  # root's reading changes their other times
 
     def check() -> None:
         check_files()
-        if stamps(path.parent, journals) != before:
+        if stamps(target.parent, journals) != before:
             raise ChangedInputError(f"{path} was changed while it was read: rerun the command")
 
     return check

@@ -42,21 +42,14 @@ class Survey(NamedTuple):
         Those of them that are sources of virtual rasters.
     uses_overviews
         Whether GDAL may read overviews of sources.
+    own_overviews
+        Those of the files that are overviews beside the raster itself, not read at full resolution.
     """
 
     files: list[str]
     sources: set[str]
     uses_overviews: bool
-
-    def of_pixels(self, name: str) -> list[str]:
-        """Return the files that decide the pixels of the raster of this name at full resolution: no overviews."""
-        whole = {name, *self.files}
-
-        def is_overview(file: str) -> bool:
-            base, ending = os.path.splitext(file)
-            return ending.lower() == ".ovr" and base in whole and file not in self.sources and not self.uses_overviews
-
-        return [file for file in self.files if is_read(file) and not is_overview(file)]
+    own_overviews: set[str]
 
 
 def survey(name: str) -> Survey:
@@ -67,6 +60,7 @@ def survey(name: str) -> Survey:
     listed: dict[str, list[str]] = {}
     waiting = [name]
     of_virtual: set[str] = set()
+    own_overviews: set[str] = set()
     uses_overviews = False
     while waiting:
         path = waiting.pop()
@@ -85,6 +79,8 @@ def survey(name: str) -> Survey:
                     f"{path}, a source of {name}, cannot be read: {gdal.reason(error)}: restore it"
                 ) from error
             continue  # a sidecar file that is not a raster
+        if path == name and dataset.driver != "VRT":
+            own_overviews = _overviews(name, files)
         known = set(map(_place, files))
         others = {source for source in sources.names if _place(source) not in known}
         new = {file for file in files if file not in seen and not _is_same(file, name)}
@@ -93,7 +89,8 @@ def survey(name: str) -> Survey:
         waiting += [*filter(_may_have_others, new | others), *sources.positions]
         of_virtual |= set(map(_place, sources.names))
         uses_overviews |= sources.uses_overviews
-    return Survey(sorted(seen), {file for file in seen if _place(file) in of_virtual}, uses_overviews)
+    sources_seen = {file for file in seen if _place(file) in of_virtual}
+    return Survey(sorted(seen), sources_seen, uses_overviews, own_overviews)
 
 
 def read_files(name: str) -> list[str]:
@@ -102,8 +99,9 @@ def read_files(name: str) -> list[str]:
 
 
 def pixel_files(name: str) -> list[str]:
-    """Return the `read_files` that decide the pixels of a raster at full resolution, see `Survey.of_pixels`."""
-    return [name, *survey(name).of_pixels(name)]
+    """Return the `read_files` that decide the pixels of a raster at full resolution: not its own overviews."""
+    found = survey(name)
+    return [name, *(file for file in found.files if is_read(file) and file not in found.own_overviews)]
 
 
 def watched_rasters(
@@ -165,6 +163,13 @@ def _check_watched(name: str, dataset: DatasetReader, sources: Iterable[str]) ->
 def _place(name: str) -> str:
     """Return a local file without links, and other names as they are."""
     return os.path.realpath(name) if os.path.exists(name) else name
+
+
+def _overviews(name: str, files: Iterable[str]) -> set[str]:
+    """Return the overviews of a raster and of its mask; ``files`` has the raster itself under GDAL's name."""
+    own = [name.lower(), *(file.lower() for file in files if _is_same(file, name))]
+    names = {f"{file}{ending}" for file in own for ending in (".ovr", ".msk.ovr")}
+    return {file for file in files if file.lower() in names}
 
 
 def _is_same(file: str, name: str) -> bool:

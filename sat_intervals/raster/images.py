@@ -54,7 +54,7 @@ class Image:
     beside
         Files with its mask or no-data value that have names of their own: ``.msk`` and ``.aux.xml``.
     stamps
-        `stamps_of` its files before it was opened.
+        `stamps_of` its files and those of the mask before they were opened.
     """
 
     path: str
@@ -113,7 +113,8 @@ def open_image(
         The file has no usable band, or the mask has another size.
     """
     name = _absolute(path)
-    stamps = stamps_of(name)
+    mask = None if mask is None else _absolute(mask)
+    stamps = stamps_of(name) | ({} if mask is None else stamps_of(mask))
     with opened(name) as dataset:
         check_seal(name, dataset.files)
         bands, alphas = _kinds(dataset)
@@ -129,7 +130,7 @@ def open_image(
             nodata=dataset.nodatavals[band - 1] if nodata is None else float(nodata),
             use_mask=dataset.mask_flag_enums[band - 1] not in _NO_MASK,
             alpha=alphas[0] if alphas else None,
-            mask=None if mask is None else _absolute(mask),
+            mask=mask,
             georeferencing=Georeferencing.of(dataset),
             beside=tuple(
                 file for file in dataset.files if file.lower().endswith((".msk", ".aux.xml")) and is_read(file)
@@ -252,11 +253,11 @@ def watched_images(images: Iterable[Image], *others: str | Path | None) -> Calla
 
 
 def is_replaced(image: Image) -> bool:
-    """Return whether a file of an image was made, replaced or changed since it was opened.
+    """Return whether a file of an image or its mask was made, replaced or changed since it was opened.
 
     A server that does not answer does not change a file.
     """
-    now = stamps_of(image.path)
+    now = stamps_of(image.path) | ({} if image.mask is None else stamps_of(image.mask))
     stamps = (
         (now[file] if file in now else stamp_of(file), image.stamps.get(file, "missing"))
         for file in now.keys() | image.stamps.keys()

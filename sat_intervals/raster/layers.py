@@ -68,7 +68,10 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
             yield new
             check_own(new)
             with new.open("rb") as file:
+                written = os.fstat(file.fileno())
                 os.fsync(file.fileno())  # after a power loss it could be empty
+                if os.fstat(file.fileno()).st_size != written.st_size:
+                    raise OutputError(f"{path} was truncated while it was written: rerun the command")
             if path.name in before and os.path.lexists(path):
                 replace_same(new, path, before[path.name])
             else:

@@ -85,6 +85,7 @@ def publish(
     names: Sequence[str],
     replaceable: Mapping[str, str],
     failing: Callable[[Path], AbstractContextManager[None]],
+    compared: Mapping[str, str],
 ) -> None:
     """Move files to another folder, all of them or none, the last of ``names`` last.
 
@@ -99,11 +100,13 @@ def publish(
         `stamps` of the files that may be replaced. A killed process may also have published some of the same files.
     failing
         Context for the work on a final name.
+    compared
+        `stamps` that files had when they were compared with their checksums.
 
     Raises
     ------
     OutputError
-        Names a file that must not be replaced.
+        Names a file that must not be replaced, or says that another program changed some.
     """
     own: dict[str, os.stat_result] = {}
     for name in names:
@@ -116,6 +119,8 @@ def publish(
         for name in names:
             with failing(folder / name):
                 rename_new(finished / name, folder / name)
+        if stamps(folder, compared) != compared:
+            raise OutputError(f"another program changed temporary files in {folder}: rerun the command")
     except BaseException:
         for name in names:
             with suppress(OSError):

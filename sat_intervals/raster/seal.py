@@ -28,7 +28,7 @@ _STATISTICS = {
     *("PAMDataset", "PAMRasterBand", "Description", "Metadata", "MDI", "Histograms", "HistItem", "HistMin", "HistMax"),
     *("BucketCount", "IncludeOutOfRange", "Approximate", "HistCounts"),
 }
-_SHOWN = "STATISTICS_", "PyramidResamplingType"
+_SHOWN = re.compile("STATISTICS_.*|PyramidResamplingType|DataType|RepresentationType")
 
 
 def with_room(ghost: bytes) -> bytes:
@@ -126,4 +126,4 @@ def has_statistics_only(file: Path) -> bool:
     except (ElementTree.ParseError, OSError):
         return False
     keys = [element.get("key", "") for element in elements if element.tag == "MDI"]
-    return {element.tag for element in elements} <= _STATISTICS and all(key.startswith(_SHOWN) for key in keys)
+    return {element.tag for element in elements} <= _STATISTICS and all(map(_SHOWN.fullmatch, keys))

@@ -13,6 +13,8 @@ from sat_intervals.errors import InputError
 # Names of GDAL that contain that of a file: ``vrt://file?bands=1``, ``GTIFF_DIR:1:file``, and texts of virtual rasters.
 _IN_ANOTHER = re.compile(r"vrt://|[A-Z0-9_]+:|\s*<|/vsisparse/")
 _SCHEME = "vrt://"
+# Without numbers, ``scale`` asks GDAL for the extremes of the source.
+_COMPUTED = re.compile(r"[?&]scale(_\d+)?=[^,&]*(&|$)", re.IGNORECASE)
 # Elements of a virtual raster that name a file, and the metadata that do so: positions of a warped one.
 _TAGS, _POSITIONS = ("SourceFilename", "SourceDataset", "DEMPath"), ("X_DATASET", "Y_DATASET")
 
@@ -51,7 +53,11 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
         names.append(path.removeprefix(_SCHEME).partition("?")[0])
     if path.lstrip().startswith(("<", _SCHEME)):
         own = ""  # sources are named as from the working directory
+    if path.startswith(_SCHEME) and _COMPUTED.search(path):
+        raise _computed(path)
     for element in _elements(path, dataset) if dataset.driver == "VRT" else ():
+        if element.find("Exponent") is not None and None in (element.find("SrcMin"), element.find("SrcMax")):
+            raise _computed(path)
         if (kind := element.get("subClass")) in ("VRTRawRasterBand", "VRTProcessedDataset"):
             raise InputError(
                 f"{path} has a {kind}, of which GDAL does not report missing data or changed files: convert it with "
@@ -70,6 +76,10 @@ def sources_of(path: str, dataset: DatasetReader) -> Sources:
         is_level = element.get("key", "").upper() == "OVERVIEW_LEVEL"
         uses_overviews |= is_level or (element.find("SourceFilename") is not None and _is_resampled(element))
     return Sources(names, positions, uses_overviews)
+
+
+def _computed(path: str) -> InputError:
+    return InputError(f"{path} is scaled by extremes that GDAL takes from statistics or overviews: name the extremes")
 
 
 def _elements(path: str, dataset: DatasetReader) -> Iterator[ElementTree.Element]:

@@ -259,6 +259,7 @@ class OutputWriter:
             Called before, with the `stamps` that the files will have, the report last.
         """
         made = self.build()
+        compared = stamps(self._pinned, made)
         for name, checksum in made.items():
             with self._failing(self._folder / name):
                 if checksum_of(self._pinned / name) != checksum:
@@ -276,7 +277,8 @@ class OutputWriter:
                     stream.write(text)
                 _flush(self._pinned / name)
         announce(list(stamps(self._pinned, names).values()))
-        publish(self._pinned, self._folder, names, self._there if replaceable is None else replaceable, self._failing)
+        may_go = self._there if replaceable is None else replaceable
+        publish(self._pinned, self._folder, names, may_go, self._failing, compared)
         self._is_published = True
 
     @contextmanager
@@ -285,16 +287,15 @@ class OutputWriter:
         try:
             yield
         except (*gdal.GDAL_ERRORS, OSError) as error:
+            why = f"{self._reason(error)}: {WAY_OUT}"
             if gdal.is_out_of_memory(error):
-                raise OutputError(
-                    f"{path} cannot be written: not enough memory ({gdal.reason(error)}): give the process more memory"
-                ) from error
-            raise OutputError(f"{path} cannot be written: {self._reason(error)}: {WAY_OUT}") from error
+                why = f"not enough memory ({gdal.reason(error)}): give the process more memory"
+            raise OutputError(f"{path} cannot be written: {why}") from error
 
     def _reason(self, error: Exception) -> str:
+        """Return the system's reason, which GDAL hides when the disk is full."""
         if isinstance(error, OSError) and error.strerror:
             return error.strerror
-        # GDAL hides the system's reason
         is_full = shutil.disk_usage(self._folder).free < file_bytes(self._files, *self._shape)
         return f"{os.strerror(errno.ENOSPC)}: {gdal.reason(error)}" if is_full else gdal.reason(error)
 

@@ -14,7 +14,7 @@ from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.raster import Image, is_replaced, pixel_files, survey
 from sat_intervals.raster.identity import identity
-from sat_intervals.raster.seal import SIDECARS
+from sat_intervals.raster.seal import SIDECARS, is_read
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window
@@ -53,12 +53,15 @@ def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dic
     Raises
     ------
     ChangedInputError
-        A file of the image was made or replaced after it was opened, so its band and no-data value may be wrong.
+        A file of the image or its mask was made or replaced after these were opened, so its band, no-data value or size
+        may be wrong.
     """
     files, crs = _with_others(image.path, identified), image.georeferencing.crs
+    mask = _with_others(image.mask, identified) if image.mask else None
     if is_replaced(image):
+        of_mask = f", {image.mask}" if image.mask else ""
         raise ChangedInputError(
-            f"{image.path} or a file beside it was replaced or changed since it was opened: rerun the command"
+            f"{image.path}{of_mask} or a file beside it was replaced or changed since it was opened: rerun the command"
         )
     return {
         **files,
@@ -70,7 +73,7 @@ def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dic
         "crs": crs.to_string() if crs else None,
         "use_mask": image.use_mask,
         "alpha": image.alpha,
-        "mask": _with_others(image.mask, identified) if image.mask else None,
+        "mask": mask,
     }
 
 
@@ -91,8 +94,9 @@ def appeared_file(left: Image, right: Image, files: Mapping[str, Any]) -> str | 
             if name == image.path and image.use_mask:
                 own.remove(f"{name}.msk".lower())
             now = survey(name)
-            for file in now.of_pixels(name):
-                is_sidecar = file.lower().endswith(SIDECARS) and file.lower() not in own
+            endings = tuple(ending for ending in SIDECARS if ending != ".ovr" or now.uses_overviews)
+            for file in filter(is_read, now.files):
+                is_sidecar = file.lower().endswith(endings) and file.lower() not in own
                 if file not in files and (is_sidecar or file in now.sources):
                     return file
     return None

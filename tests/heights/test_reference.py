@@ -474,11 +474,15 @@ def test_point_file__refuses_a_format_that_may_be_read_from_other_files(tmp_path
         point_files.PointFile(path, "EPSG:4326", Vertical(True, None))
 
 
-def test_watched_points__are_not_changed_by_reading_them(tmp_path):
+@pytest.mark.parametrize("is_link", [False, True])
+def test_watched_points__are_not_changed_by_reading_them(tmp_path, is_link):
     path, journal = tmp_path / "p.gpkg", tmp_path / "p.gpkg-wal"
     path.write_text("points")
     journal.write_text("more points")
-    check = point_files.watched_points(path)
+    if is_link:
+        (tmp_path / "links").mkdir()
+        (tmp_path / "links" / "p.gpkg").symlink_to(path)
+    check = point_files.watched_points(tmp_path / "links" / "p.gpkg" if is_link else path)
     journal.chmod(0o600)  # root's SQLite changes its owner
     (tmp_path / "p.gpkg-shm").touch()
     (tmp_path / "p.log").touch()

@@ -4,7 +4,9 @@ import gzip
 import html
 import os
 import re
+import shutil
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -284,7 +286,7 @@ READ = {
     "warped.vrt": WARPED_WITHOUT_LEVEL.replace("<Transformer>", LEVEL.format("OVERVIEW_LEVEL") + "<Transformer>"),
     **dict.fromkeys(["vrt://image.tif?ovr=0", "vrt://image.tif?oo=OVERVIEW_LEVEL=0", "vrt://image.tif?outsize=8,8"]),
 }
-NOT_READ = {"c.vrt": WITHOUT_LEVEL, "warped.vrt": WARPED_WITHOUT_LEVEL, "image.tif": None, "vrt://image.tif": None}
+NOT_READ = {"image.tif": None}
 
 
 @pytest.mark.parametrize("is_read", [True, False])
@@ -298,7 +300,39 @@ def test_pixel_files__have_overviews_where_these_are_read(folder, monkeypatch, i
         with rasterio.open(name) as file:
             assert np.any(file.read() == 7) == is_read, name
         assert any(file.endswith("image.tif.ovr") for file in pixel_files(name)) == is_read, name
+        assert survey(name).uses_overviews == is_read, name
     assert "image.tif.ovr" in pixel_files("GTIFF_DIR:1:image.tif.ovr")
+    Path("both.vrt").write_text(virtual((1, "image.tif"), SOURCE.format(0, "GTIFF_DIR:1:image.tif.ovr")))
+    assert any(file.endswith("image.tif.ovr") for file in pixel_files("both.vrt"))
+
+
+def test_pixel_files__have_no_overviews_of_the_mask_in_capitals(folder):
+    for name in ("image.tif.msk", "image.tif.MSK.OVR", "image.tif.OVR"):
+        shutil.copy(folder / "mask.tif", folder / name)
+    assert pixel_files(str(folder / "image.tif")) == [str(folder / name) for name in ("image.tif", "image.tif.msk")]
+
+
+SCALED = virtual((1, "image.tif")).replace("SimpleSource", "ComplexSource")
+EXPONENT = "<Exponent>0.5</Exponent><SrcMin>0</SrcMin>{}<DstMin>0</DstMin><DstMax>255</DstMax>"
+
+
+@pytest.mark.parametrize("name", ["?scale=true", "?ot=Byte&SCALE_1=true", "?scale=1&exponent=0.5", "scaled.vrt"])
+def test_pixel_files__refuse_a_raster_scaled_by_statistics(folder, monkeypatch, name):
+    monkeypatch.chdir(folder)
+    name = name if name == "scaled.vrt" else f"vrt://image.tif{name}"
+    (folder / "scaled.vrt").write_text(SCALED.replace("</ComplexSource>", EXPONENT.format("") + "</ComplexSource>"))
+    (folder / "outer.vrt").write_text(virtual((0, html.escape(name))))
+    for refused in (name, "outer.vrt"):
+        with pytest.raises(InputError, match=r"scaled by extremes that GDAL takes from .*: name the extremes"):
+            pixel_files(refused)
+
+
+def test_pixel_files__are_those_of_a_raster_scaled_by_numbers(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    with_numbers = EXPONENT.format("<SrcMax>9</SrcMax>")
+    (folder / "scaled.vrt").write_text(SCALED.replace("</ComplexSource>", with_numbers + "</ComplexSource>"))
+    for name in ("scaled.vrt", "vrt://image.tif?scale=0,9", "vrt://image.tif?ot=Byte&scale_1=0,9,0,255&exponent=0.5"):
+        assert any(file.endswith("image.tif") for file in pixel_files(name)), name
 
 
 @pytest.mark.parametrize("spelling", ['relativeToVRT="1"', "relativetovrt='01'"])

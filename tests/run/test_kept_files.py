@@ -1600,6 +1600,39 @@ def test_whole_file__publishes_no_link_that_takes_the_place_of_its_temporary_fil
     assert (mine.read_text(), (tmp_path / "page.html").exists()) == ("mine", False)
 
 
+def test_whole_file__publishes_no_file_that_is_truncated_while_it_is_flushed(tmp_path, monkeypatch):
+    def truncate(file):
+        os.truncate(next(tmp_path.glob(".page.html-*/files/*.html")), 1)
+
+    monkeypatch.setattr(layers.os, "fsync", truncate)
+    with (
+        pytest.raises(OutputError, match=r"page.html was truncated while it was written: rerun"),
+        layers.whole_file(tmp_path / "page.html") as new,
+    ):
+        new.write_text("new")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_output_writer__publishes_no_file_that_is_truncated_after_it_was_compared(tmp_path):
+    with writer(tmp_path) as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        made = tmp_path / ".unpublished-intervals.tif" / "files" / "intervals.tif"
+        with pytest.raises(OutputError, match=r"changed temporary files in .*: rerun the command"):
+            output.publish(("run.json", "{}"), announce=lambda stamps: os.truncate(made, 100))
+    assert not list(tmp_path.glob("*.*"))
+
+
+@pytest.mark.parametrize("name", ["other.tif", "larger.tif"])
+def test_describe_inputs__of_a_mask_that_is_replaced_when_it_is_open(pair, name):
+    folder, settings = pair
+    write_layer(folder / "larger.tif", np.zeros((200, 300), np.uint8), 0, PLACE)
+    images = open_image(folder / "left.tif", mask=folder / "mask.tif"), open_image(folder / "right.tif")
+    describe_inputs(*images, load_config(settings), {})
+    os.replace(folder / name, folder / "mask.tif")
+    with pytest.raises(ChangedInputError, match=r"mask\.tif or a file beside it was replaced or changed since it was"):
+        describe_inputs(*images, load_config(settings), {})
+
+
 def test_whole_file__is_written_where_a_link_takes_the_place_of_its_temporary_folder(tmp_path):
     (tmp_path / "user").mkdir()
     mine = tmp_path / "user" / "page.html"
