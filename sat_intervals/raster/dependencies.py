@@ -73,14 +73,14 @@ def survey(name: str) -> Survey:
             with gdal.reading(path) as dataset:
                 files, sources = dataset.files, sources_of(path, dataset)
                 _check_watched(path, dataset, sources.names)
+                if path == name and dataset.driver != "VRT":
+                    own_overviews = _overviews(name, files)
         except gdal.GDAL_ERRORS as error:
             if path in named:
                 raise InputError(
                     f"{path}, a source of {name}, cannot be read: {gdal.reason(error)}: restore it"
                 ) from error
             continue  # a sidecar file that is not a raster
-        if path == name and dataset.driver != "VRT":
-            own_overviews = _overviews(name, files)
         known = set(map(_place, files))
         others = {source for source in sources.names if _place(source) not in known}
         new = {file for file in files if file not in seen and not _is_same(file, name)}
@@ -121,9 +121,9 @@ def watched_rasters(
     return check
 
 
-def stamps_of(name: str) -> dict[str, str | None]:
-    """Return the stamps of the `pixel_files` of a raster by name, see `stamp_of`; None for one that has none."""
-    return {file: stamp_of(file) for file in pixel_files(name)}
+def stamps_of(*names: str | None) -> dict[str, str | None]:
+    """Return the stamps of the `pixel_files` of rasters by name, see `stamp_of`; None for one that has none."""
+    return {file: stamp_of(file) for name in names if name is not None for file in pixel_files(name)}
 
 
 def check_pipes_beside(path: str, listed: dict[str, list[str]] | None = None) -> None:

@@ -114,7 +114,7 @@ def open_image(
     """
     name = _absolute(path)
     mask = None if mask is None else _absolute(mask)
-    stamps = stamps_of(name) | ({} if mask is None else stamps_of(mask))
+    stamps = stamps_of(name, mask)
     with opened(name) as dataset:
         check_seal(name, dataset.files)
         bands, alphas = _kinds(dataset)
@@ -257,7 +257,7 @@ def is_replaced(image: Image) -> bool:
 
     A server that does not answer does not change a file.
     """
-    now = stamps_of(image.path) | ({} if image.mask is None else stamps_of(image.mask))
+    now = stamps_of(image.path, image.mask)
     stamps = (
         (now[file] if file in now else stamp_of(file), image.stamps.get(file, "missing"))
         for file in now.keys() | image.stamps.keys()

@@ -211,9 +211,9 @@ def opened(name):
 
 
 def test_open_image__counts_each_file_on_a_server_once(web_server, images):
-    put({**images, "left.tif.msk": mask_of(SIDE)}, web_server.folder)
+    put({**images, "left.tif.msk": mask_of(SIDE), "left.tif.ovr": images["right.tif"]}, web_server.folder)
     name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
-    assert opened(name) == [True, name, f"/vsicurl/{name}.msk"]
+    assert opened(name) == [True, name, f"/vsicurl/{name}.msk"]  # overviews are no input
 
 
 def test_open_image__of_a_virtual_raster_on_a_server_asks_as_much_with_either_name(web_server, images):
