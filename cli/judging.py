@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from sat_intervals.cli.matching import watched_settings
 from sat_intervals.cli.options import FILE, Command, json_option, log_options, preset_option, say_json, with_options
 
 if TYPE_CHECKING:
@@ -96,26 +97,17 @@ def watched_arguments(pairs: Iterable[Path], settings: Path | None) -> Callable[
 
     Call this before they are read. Of a pair, its CSV file or meta.json is meant, not its images; of a run, its files.
     """
-    from sat_intervals.raster import watched_rasters
     from sat_intervals.raster.identity import watched
     from sat_intervals.run.output import OUTPUTS
 
-    files = [pair / name if pair.is_dir() else pair for pair in pairs for name in ("meta.json", *OUTPUTS)]
-    check_files = watched([settings, *files])
-    check_named = watched_rasters(named_by(settings))  # one of ranges may be virtual
+    check_files = watched(pair / name if pair.is_dir() else pair for pair in pairs for name in ("meta.json", *OUTPUTS))
+    check_settings = watched_settings(settings)
 
     def check() -> None:
         check_files()
-        check_named()
+        check_settings()
 
     return check
-
-
-def named_by(settings: Path | None) -> list[str]:
-    """Return the files that a file of settings names, which are read with it or later."""
-    from sat_intervals.config import named_files, read_yaml
-
-    return named_files(read_yaml(settings)) if settings and settings.is_file() else []
 
 
 def watched_pairs(pairs: "Iterable[Pair]", *others: Path | None) -> Callable[[], None]:

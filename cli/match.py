@@ -11,6 +11,7 @@ from sat_intervals.cli.matching import (
     pair_options,
     run_options,
     search_options,
+    watched_settings,
 )
 from sat_intervals.cli.options import FILE, json_option, say_json
 
@@ -36,9 +37,9 @@ def match(
     rerun the same command.
     """  # noqa: D301 (click's mark of a preformatted paragraph)
     from sat_intervals.cli.console import Console
-    from sat_intervals.raster.identity import check_not_replaced, watched
+    from sat_intervals.raster.identity import check_not_replaced
 
-    check_settings = watched([settings.file])
+    check_settings = watched_settings(settings.file, settings.sections)
     config = settings.load()
     if dry_run:
         from sat_intervals.run.batch_system import job_script

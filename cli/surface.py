@@ -14,6 +14,7 @@ from sat_intervals.cli.matching import (
     pair_options,
     run_options,
     search_options,
+    watched_settings,
 )
 from sat_intervals.cli.options import FILE, json_option, say_json, sensor_options
 from sat_intervals.cli.triangulate import point_warnings, say_points
@@ -53,9 +54,8 @@ def surface(
     finished match with these images and settings is kept, points and surface are made again.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.raster.identity import watched
 
-    check_settings = watched([settings.file])
+    check_settings = watched_settings(settings.file, settings.sections)
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved

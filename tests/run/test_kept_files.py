@@ -20,9 +20,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
+import yaml
 from cameras import cameras, sensor_words
 from finished import random_bands, write_run
-from helpers import COMMAND, OUTPUTS, PLACE, hashes, invoke, write_pair
+from helpers import COMMAND, OUTPUTS, PLACE, calibration, hashes, invoke, write_pair
 from matplotlib.figure import Figure
 from rasterio.errors import RasterioDeprecationWarning
 from rasterio.shutil import copy
@@ -1214,22 +1215,31 @@ def test_match_pair__resumes_after_a_file_that_appeared_beside_its_results(pair,
     match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
 
 
+@pytest.mark.parametrize("named", ["settings.yaml", "of settings", "given"])
 @pytest.mark.parametrize("command", ["match", pytest.param("surface", marks=pytest.mark.peer("shareloc"))])
-def test_commands__end_where_settings_are_replaced_before_the_images_are_opened(pair, monkeypatch, command):
+def test_commands__end_where_settings_are_replaced_before_the_images_are_opened(pair, monkeypatch, command, named):
     """Else old settings and new images would be mixed, where a whole folder is exchanged."""
     folder, _ = pair
-    settings, opened = folder / "settings.yaml", PairArguments.open
+    settings, levels, opened = folder / "settings.yaml", folder / "levels.yaml", PairArguments.open
+    replaced, words = settings, ["--config", settings]
+    if named != "settings.yaml":
+        replaced, interval = levels, {"coverage": 0.8, "calibration": str(levels)}
+        levels.write_text(yaml.safe_dump(calibration(load_config(settings), 50, 5, 0.9)))
+        if named == "given":
+            words += ["--coverage", interval["coverage"], "--calibration", levels]
+        else:
+            settings.write_text(yaml.safe_dump(yaml.safe_load(settings.read_text()) | {"interval": interval}))
 
     def replaced_before(arguments):
-        shutil.copy(settings, folder / "new")
-        (folder / "new").replace(settings)
+        shutil.copy(replaced, folder / "new")
+        (folder / "new").replace(replaced)
         return opened(arguments)
 
     monkeypatch.setattr(PairArguments, "open", replaced_before)
     images = folder / "left.tif", folder / "right.tif", folder / "out"
     sensors = [*sensor_words(cameras(folder, 80, 100)), "--resolution", 1] if command == "surface" else []
-    result = invoke(command, *images, *sensors, "--config", settings)
-    assert (result.exit_code, "settings.yaml was replaced or changed" in result.stderr) == (1, True), result.output
+    result = invoke(command, *images, *sensors, *words)
+    assert (result.exit_code, f"{replaced.name} was replaced or changed" in result.stderr) == (1, True), result.output
     assert not (folder / "out" / "intervals.tif").exists()
 
 
