@@ -39,13 +39,13 @@ def match(
     from sat_intervals.cli.console import Console
     from sat_intervals.raster.identity import check_not_replaced
 
-    check_settings = watched_settings(settings.file, settings.sections)
-    config = settings.load()
     if dry_run:
         from sat_intervals.run.batch_system import job_script
 
-        click.echo(job_script(config.cluster, out))
+        click.echo(job_script(settings.load().cluster, out))
         return
+    check_settings = watched_settings(settings.file, settings.sections)
+    config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.run.output import OUTPUTS
 

@@ -1,5 +1,6 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
@@ -71,7 +72,7 @@ def named_by(settings: Path | None) -> list[str]:
     """Return the files that a file of settings names, which are read with it or later."""
     from sat_intervals.config import named_files, read_yaml
 
-    return named_files(read_yaml(settings)) if settings and settings.is_file() else []
+    return named_files(read_yaml(settings)) if settings and os.path.isfile(settings) else []
 
 
 def watched_settings(file: Path | None, sections: Mapping[str, Any] | None = None) -> Callable[[], None]:

@@ -1243,6 +1243,14 @@ def test_commands__end_where_settings_are_replaced_before_the_images_are_opened(
     assert not (folder / "out" / "intervals.tif").exists()
 
 
+@pytest.mark.parametrize("dry_run", [[], ["--dry-run"]])
+def test_match__names_settings_that_cannot_be_looked_for(pair, dry_run):
+    folder, _ = pair
+    name = f"{'a' * 300}.yaml"
+    images = folder / "left.tif", folder / "right.tif"
+    refused(["match", *images, folder / "out", "--config", name, *dry_run], name, "File name too long")
+
+
 def test_match_pair__keeps_a_result_that_is_the_source_of_ranges(pair):
     folder, settings = pair
     images, out = (folder / "left.tif", folder / "right.tif"), folder / "out"
