@@ -164,6 +164,8 @@ def _explained(error: Exception) -> tuple[int, str]:
         return FAILED, f"a library failed without a reason, probably for lack of memory: {_NO_MEMORY} ({line})"
     if isinstance(error, RuntimeError) and line.startswith("can't start new thread"):
         return FAILED, f"no more threads can be started: {_NO_MEMORY}, or allow it more processes (ulimit -u)"
+    if isinstance(error, RuntimeError) and line.startswith("cannot cache function"):  # of another library
+        return FAILED, f"{line}: set NUMBA_CACHE_DIR to a folder that can be written"
     if isinstance(error, RuntimeError) and line.startswith("Symlink loop"):
         return USER_ERROR, f"{line}: it is a link to itself, choose another path"
     if isinstance(error, ValueError) and line.startswith("A dask config file"):

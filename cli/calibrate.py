@@ -233,12 +233,13 @@ def _tune(
     from sat_intervals.cli.tables import show_tuned
     from sat_intervals.config.weights import INSTALL_MCCNN
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.raster import watched_rasters
+    from sat_intervals.raster import watched_images
     from sat_intervals.run.tune import OF_ALL, best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
         console.say(f"MC-CNN is left out: to include it, {INSTALL_MCCNN}")
-    check_rasters = watched_rasters(_inputs(subjects, ()))  # one that cannot be read would leave out settings
+    # one that cannot be read would leave out settings
+    check_images = watched_images(image for one in subjects for image in (one.left, one.right, one.truth.image))
     found = []
     for label, changes in candidates(subjects[0].config, with_network=has_network()):
         console.say(f"calibrating {label}")
@@ -248,7 +249,7 @@ def _tune(
             raise
         except SatIntervalsError as error:
             console.say(f"{label} is left out: {error}")
-    check_rasters()
+    check_images()
     check_arguments()
     best = best_of(found)
     if as_json:

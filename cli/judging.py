@@ -112,9 +112,10 @@ def watched_arguments(pairs: Iterable[Path], settings: Path | None) -> Callable[
 
 def watched_pairs(pairs: "Iterable[Pair]", *others: Path | None) -> Callable[[], None]:
     """Return a function that raises if an image, a truth or another raster was replaced since."""
-    from sat_intervals.raster import watched_rasters
+    from sat_intervals.raster import pixel_files, watched_rasters
 
-    return watched_rasters([*(file for pair in pairs for file in (pair.left, pair.right, pair.truth)), *others])
+    files = [*(file for pair in pairs for file in (pair.left, pair.right, pair.truth)), *others]
+    return watched_rasters(files, pixel_files)
 
 
 def say_scenes(scenes: "list[SceneMetrics]") -> None:

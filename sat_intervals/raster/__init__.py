@@ -9,7 +9,7 @@ from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.heightfield import GROUND, HeightRaster
-from sat_intervals.raster.images import Image, check_pair, is_replaced, open_image, watched_images
+from sat_intervals.raster.images import Image, check_as_opened, check_pair, open_image, watched_images
 from sat_intervals.raster.layers import (
     MARK,
     check_alone,
@@ -65,6 +65,7 @@ __all__ = [
     "Vertical",
     "check_alone",
     "check_as_made",
+    "check_as_opened",
     "check_made_by",
     "check_marked",
     "check_pair",
@@ -80,7 +81,6 @@ __all__ = [
     "geoid_grid",
     "grid_mapping",
     "is_marked",
-    "is_replaced",
     "is_surface",
     "north_up",
     "open_image",

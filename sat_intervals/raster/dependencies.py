@@ -42,14 +42,14 @@ class Survey(NamedTuple):
         Those of them that are sources of virtual rasters.
     uses_overviews
         Whether GDAL may read overviews of sources.
-    own_overviews
-        Those of the files that are overviews beside the raster itself, not read at full resolution.
+    unread
+        Those of the files that are overviews of which full resolution needs none.
     """
 
     files: list[str]
     sources: set[str]
     uses_overviews: bool
-    own_overviews: set[str]
+    unread: set[str]
 
 
 def survey(name: str) -> Survey:
@@ -60,7 +60,7 @@ def survey(name: str) -> Survey:
     listed: dict[str, list[str]] = {}
     waiting = [name]
     of_virtual: set[str] = set()
-    own_overviews: set[str] = set()
+    overviews: dict[str, set[str]] = {}
     uses_overviews = False
     while waiting:
         path = waiting.pop()
@@ -73,8 +73,7 @@ def survey(name: str) -> Survey:
             with gdal.reading(path) as dataset:
                 files, sources = dataset.files, sources_of(path, dataset)
                 _check_watched(path, dataset, sources.names)
-                if path == name and dataset.driver != "VRT":
-                    own_overviews = _overviews(name, files)
+                overviews[path] = _overviews(path, files)
         except gdal.GDAL_ERRORS as error:
             if path in named:
                 raise InputError(
@@ -90,7 +89,8 @@ def survey(name: str) -> Survey:
         of_virtual |= set(map(_place, sources.names))
         uses_overviews |= sources.uses_overviews
     sources_seen = {file for file in seen if _place(file) in of_virtual}
-    return Survey(sorted(seen), sources_seen, uses_overviews, own_overviews)
+    unread = overviews.get(name, set()) if uses_overviews else set().union(*overviews.values())
+    return Survey(sorted(seen), sources_seen, uses_overviews, unread - sources_seen)
 
 
 def read_files(name: str) -> list[str]:
@@ -99,9 +99,9 @@ def read_files(name: str) -> list[str]:
 
 
 def pixel_files(name: str) -> list[str]:
-    """Return the `read_files` that decide the pixels of a raster at full resolution: not its own overviews."""
+    """Return the `read_files` that decide the pixels of a raster at full resolution: no overviews, if it needs none."""
     found = survey(name)
-    return [name, *(file for file in found.files if is_read(file) and file not in found.own_overviews)]
+    return [name, *(file for file in found.files if is_read(file) and file not in found.unread)]
 
 
 def watched_rasters(

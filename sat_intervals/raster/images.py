@@ -241,25 +241,28 @@ def watched_images(images: Iterable[Image], *others: str | Path | None) -> Calla
     Raises
     ------
     ChangedInputError
-        A file of an image was replaced or changed since it was opened.
+        See `check_as_opened`.
     """
     images = list(images)
     names = [*others, *(file for image in images for file in (image.path, image.mask))]
     check = watched_rasters(names, pixel_files)
     for image in images:
-        if is_replaced(image):
-            raise ChangedInputError(f"{image.path} was replaced or changed since it was opened: rerun the command")
+        check_as_opened(image)
     return check
 
 
-def is_replaced(image: Image) -> bool:
-    """Return whether a file of an image or its mask was made, replaced or changed since it was opened.
+def check_as_opened(image: Image) -> None:
+    """Raise if a file of an image or its mask was made, replaced or changed since the image was opened.
 
-    A server that does not answer does not change a file.
+    Its band, no-data value or size may be wrong. A server that does not answer does not change a file.
+
+    Raises
+    ------
+    ChangedInputError
+        Names the first such file.
     """
     now = stamps_of(image.path, image.mask)
-    stamps = (
-        (now[file] if file in now else stamp_of(file), image.stamps.get(file, "missing"))
-        for file in now.keys() | image.stamps.keys()
-    )
-    return any(None not in (after, before) and after != before for after, before in stamps)
+    for file in sorted(now.keys() | image.stamps.keys()):
+        before, after = image.stamps.get(file, "missing"), now[file] if file in now else stamp_of(file)
+        if None not in (before, after) and before != after:
+            raise ChangedInputError(f"{file} was replaced or changed since {image.path} was opened: rerun the command")

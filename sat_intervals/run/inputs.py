@@ -12,7 +12,7 @@ from sat_intervals.config import Config, Mccnn, load_config
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.raster import Image, is_replaced, pixel_files, survey
+from sat_intervals.raster import Image, check_as_opened, pixel_files, survey
 from sat_intervals.raster.identity import identity
 from sat_intervals.raster.seal import SIDECARS, is_read
 from sat_intervals.run.local_ranges import read_ranges
@@ -53,16 +53,11 @@ def _described(image: Image, identified: Callable[[str], dict[str, Any]]) -> dic
     Raises
     ------
     ChangedInputError
-        A file of the image or its mask was made or replaced after these were opened, so its band, no-data value or size
-        may be wrong.
+        See `check_as_opened`.
     """
     files, crs = _with_others(image.path, identified), image.georeferencing.crs
     mask = _with_others(image.mask, identified) if image.mask else None
-    if is_replaced(image):
-        of_mask = f", {image.mask}" if image.mask else ""
-        raise ChangedInputError(
-            f"{image.path}{of_mask} or a file beside it was replaced or changed since it was opened: rerun the command"
-        )
+    check_as_opened(image)
     return {
         **files,
         "height": image.height,

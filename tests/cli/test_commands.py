@@ -339,6 +339,7 @@ def test_match__shows_a_traceback_only_when_asked(folder, tmp_path):
         (OSError(28, "No space left on device"), 1, "sat-intervals: No space left on device"),
         (MemoryError("9 GB"), 1, "not enough memory: choose a smaller --tile-size or fewer --workers (9 GB)"),
         (RuntimeError("can't start new thread"), 1, "no more threads can be started: not enough memory: choose"),
+        (RuntimeError("cannot cache function 'f': no locator"), 1, "no locator: set NUMBA_CACHE_DIR to a folder that"),
         (ZeroDivisionError("by zero"), 1, "ZeroDivisionError: by zero (this should not happen; --debug shows where)"),
     ],
 )

@@ -184,6 +184,22 @@ def test_commands__end_where_a_pair_is_replaced_after_they_began(folder, tmp_pat
     assert (result.exit_code, "truth.tif was replaced or changed while it was read" in result.stderr) == (1, True)
 
 
+@pytest.mark.parametrize("command", ["evaluate", "ablate"])
+def test_commands__go_on_where_a_pyramid_of_an_image_appears(folder, tmp_path, monkeypatch, command):
+    shutil.copytree(folder, tmp_path / "pair")
+    name = "match_pair" if command == "evaluate" else "ablate_pair"
+    module = run_pair if command == "evaluate" else ablation
+    work = getattr(module, name)
+
+    def and_appears(*arguments, **named):
+        result = work(*arguments, **named)
+        shutil.copy(tmp_path / "pair" / "truth.tif", tmp_path / "pair" / "left.tif.ovr")
+        return result
+
+    monkeypatch.setattr(module, name, and_appears)
+    assert invoke(command, tmp_path / "pair", "--quiet").exit_code == 0
+
+
 def written_again(file, work):
     """A function that does the same, but writes a file anew before it."""
 

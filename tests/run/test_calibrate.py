@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import json
 import os
-from shutil import copytree
+from shutil import copyfile, copytree
 
 import numpy as np
 import pytest
@@ -418,6 +418,22 @@ def test_tune__ends_where_a_truth_is_replaced_while_the_last_settings_are_tried(
     result = invoke("calibrate", pair, "--tune", "--output", tmp_path / "tuned.yaml", "--quiet")
     assert (result.exit_code, "truth.tif was replaced or changed" in result.stderr) == (1, True), result.output
     assert not (tmp_path / "tuned.yaml").exists()
+
+
+def test_tune__goes_on_where_a_pyramid_of_an_image_appears(scene, tmp_path, monkeypatch):
+    (tmp_path / "pair").mkdir()
+    with rasterio.open(scene / "truth.tif") as file:
+        pair = with_truth(scene, tmp_path / "pair", file.read(1))
+    monkeypatch.setattr(tune, "candidates", lambda own, with_network: [("own settings", None)])
+    monkeypatch.setattr(measurement, "_RUNGS", 5)
+    tuned = tune.tuned
+
+    def and_appears(*arguments):
+        copyfile(pair / "truth.tif", pair / "left.tif.ovr")
+        return tuned(*arguments)
+
+    monkeypatch.setattr(tune, "tuned", and_appears)
+    assert calibrated(pair, tmp_path / "tuned.yaml", "--tune")
 
 
 @pytest.mark.parametrize("error", [StoreError, OutputError])
