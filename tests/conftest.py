@@ -6,14 +6,17 @@ import subprocess
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import hypothesis
+import numpy as np
 import pytest
-from helpers import wait_until, write_pair
+from helpers import PLACE, VRT, wait_until, write_pair
 
 from sat_intervals import load_config, match_pair
-from sat_intervals.demo import make_scene
+from sat_intervals.demo import Scene, make_scene
 from sat_intervals.match.warm_up import compile_kernels
+from sat_intervals.raster import write_layer
 
 pytest_plugins = ["services.browser", "services.s3", "services.slurm", "services.web"]
 
@@ -103,6 +106,22 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     whole = settings | {"tiles": {"size": 512}}
     match_pair(folder / "left.tif", folder / "right.tif", folder / "undisturbed", whole)
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_scene() -> Scene:
+    return make_scene(80, 100, seed=2)
+
+
+@pytest.fixture
+def small_pair(small_scene: Scene, tmp_path: Path) -> tuple[Path, dict[str, Any]]:
+    """A folder with left.tif, right.tif, mask.tif, mask.vrt of it, and other.tif; and settings of four tiles."""
+    write_layer(tmp_path / "other.tif", small_scene.right[::-1].copy(), 0, PLACE)
+    write_layer(tmp_path / "mask.tif", np.zeros(small_scene.left.shape, np.uint8), 0, PLACE)
+    (tmp_path / "mask.vrt").write_text(VRT)
+    tiles, cluster = {"size": 64, "overlap": 20}, {"workers": 1, "retries": 0}
+    disparity = {"minimum": -18, "maximum": 40}
+    return tmp_path, write_pair(tmp_path, small_scene, disparity=disparity, tiles=tiles, cluster=cluster)
 
 
 @pytest.fixture

@@ -29,6 +29,13 @@ COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
 PLACE = north_up(32631, 300_000, 4_800_000, 0.5)
 PATIENCE = 150.0
+VRT = """<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
+<SourceFilename relativeToVRT="1">mask.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
+NODATA = '<PAMDataset><PAMRasterBand band="1"><NoDataValue>7</NoDataValue></PAMRasterBand></PAMDataset>'
+STATISTICS = (
+    '<PAMDataset><PAMRasterBand band="1"><Metadata><MDI key="STATISTICS_MEAN">7</MDI></Metadata></PAMRasterBand>'
+    "</PAMDataset>"
+)
 
 
 def write_pair(folder: Path, scene: Scene, *, group: str = "all", **sections: Any) -> dict[str, Any]:
@@ -107,3 +114,26 @@ def late_file(file: Path) -> Callable[..., Any]:
         return whole_file(path, *arguments)
 
     return late
+
+
+def refused(arguments, *parts):
+    """Run a command that must end with status 2 and one line."""
+    result = invoke(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.count("\n") == 1
+    for part in parts:
+        assert part in result.stderr
+
+
+def contents(folder):
+    return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def exchanged_for_link(file, mine, way="symlink_to"):
+    """What a hostile process does as soon as it sees a temporary file."""
+    file.rename(mine.with_name("moved"))
+    getattr(file, way)(mine)
+
+
+def fail(*arguments, **options):
+    raise OSError(5, "Input/output error")

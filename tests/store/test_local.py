@@ -1,13 +1,17 @@
-"""A folder on a local disk that the machine cannot list."""
+"""A local folder of tiles: one that cannot be listed, its lock, and temporary files of killed processes."""
 
 import errno
 import os
 import resource
+import shutil
 from contextlib import contextmanager
 
 import pytest
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.local import LocalFolder
+
+LOCK = ".sat-intervals.lock"
 
 
 @contextmanager
@@ -50,3 +54,76 @@ def denied(place):
 def test_a_folder_that_was_deleted_has_no_files(tmp_path):
     folder = LocalFolder(tmp_path / "deleted")
     assert (folder.sizes(), folder.read_all("records")) == ({}, {})
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "folder", "pipe"])
+def test_locked__keeps_what_is_not_its_lock(tmp_path, kind):
+    precious, folder = tmp_path / "precious", tmp_path / "folder"
+    folder.mkdir()
+    precious.write_text("mine")
+    lock = folder / LOCK
+    if kind == "link":
+        lock.symlink_to(precious)
+    elif kind == "folder":
+        lock.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(lock)
+    else:
+        lock.write_text("mine")
+    (folder / ".lock").write_text("mine")
+
+    def work():
+        with LocalFolder(folder).locked():
+            assert kind == "file"
+
+    if kind == "file":
+        work()
+        assert lock.read_text() == "mine"
+    else:
+        with pytest.raises(
+            SatIntervalsError, match=r"cannot be written: (.*symbolic link|Is a dir|.*not a regular file)"
+        ):
+            work()
+    assert os.path.lexists(lock)
+    assert (precious.read_text(), (folder / ".lock").read_text()) == ("mine", "mine")
+
+
+def test_scratch__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
+    elsewhere, foreign, link = tmp_path / "elsewhere", tmp_path / ".work-mine", tmp_path / ".work-link"
+    with LocalFolder(tmp_path).scratch("work", "tiles") as used:
+        (used / "tiles").mkdir()
+        (used / "tiles" / "file").write_text("half")
+        left = shutil.copytree(used.parent, tmp_path / ".work-left")
+        shutil.copytree(used.parent, elsewhere)
+        (used.parent / "link").symlink_to(elsewhere)
+        link.symlink_to(elsewhere)
+        foreign.mkdir()
+        (foreign / "files").write_text("mine")
+        with LocalFolder(tmp_path).scratch("work", "tiles") as new:
+            assert (list(new.iterdir()), new.parent.parent) == ([], tmp_path)
+        assert not left.exists()
+        assert (used / "tiles" / "file").exists()
+        (used.parent / "link").unlink()
+    assert sorted(tmp_path.iterdir()) == [link, foreign, elsewhere]
+    assert sorted(path.name for path in elsewhere.rglob("*")) == [LOCK, "file", "files", "tiles"]
+
+
+def test_scratch__deletes_nothing_behind_a_link_that_took_its_place(tmp_path):
+    (tmp_path / "mine" / "files").mkdir(parents=True)
+    (tmp_path / "mine" / "files" / "precious").write_text("mine")
+    with LocalFolder(tmp_path).scratch("work", "precious") as used:
+        used.parent.rename(tmp_path / "moved")
+        used.parent.symlink_to(tmp_path / "mine")
+    assert (tmp_path / "mine" / "files" / "precious").read_text() == "mine"
+
+
+def test_scratch__keeps_what_is_put_beside_its_files(tmp_path):
+    with LocalFolder(tmp_path).scratch("work", r"\d+|table.*") as used:
+        for name in ("1/notes.txt", "table.tif.aux.xml", "table.tif"):
+            (used / name).parent.mkdir(exist_ok=True)
+            (used / name).write_text("half")
+        (used / "2").symlink_to(tmp_path)
+        os.mkfifo(used / "3")
+        (used / "notes.txt").write_text("mine")
+        (used / "dir").mkdir()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [used.parent.name, "dir", "files", "notes.txt"]

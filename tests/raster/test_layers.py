@@ -1,0 +1,100 @@
+"""Files that are written whole: on the disk before they get their names, and over no file of the user."""
+
+import os
+
+import pytest
+from helpers import contents
+
+from sat_intervals.raster import OutputError, layers, put_back, stamps
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_whole_file__may_have_a_name_as_long_as_the_system_allows(tmp_path):
+    with layers.whole_file(tmp_path / f"{240 * 'a'}.txt") as new:
+        new.write_text("content")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["content"]
+
+
+def test_whole_file__keeps_what_came_after_its_stamps_and_writes_where_the_file_is_gone(tmp_path):
+    path = tmp_path / "page.html"
+
+    def write(before):
+        with layers.whole_file(path, before) as new:
+            new.write_text("new")
+
+    path.write_text("of another run")
+    with pytest.raises(OutputError, match=r"page\.html was written by another process meanwhile: move it away"):
+        write({})
+    assert path.read_text() == "of another run"
+    before = stamps(tmp_path, ["page.html"])
+    path.unlink()
+    write(before)
+    assert contents(tmp_path) == {str(path): b"new"}
+
+
+@pytest.mark.parametrize("way", ["symlink_to", "hardlink_to"])
+def test_whole_file__publishes_no_link_that_takes_the_place_of_its_temporary_file(tmp_path, way):
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+
+    def write():
+        with layers.whole_file(tmp_path / "page.html") as new:
+            new.write_text("new")
+            new.rename(tmp_path / "moved")
+            getattr(new, way)(mine)
+
+    with pytest.raises(OutputError, match=r"its temporary file .*\.html was replaced"):
+        write()
+    assert (mine.read_text(), (tmp_path / "page.html").exists()) == ("mine", False)
+
+
+def test_whole_file__publishes_no_file_that_is_truncated_while_it_is_flushed(tmp_path, monkeypatch):
+    def truncate(file):
+        os.truncate(next(tmp_path.glob(".page.html-*/files/*.html")), 1)
+
+    monkeypatch.setattr(layers.os, "fsync", truncate)
+    with (
+        pytest.raises(OutputError, match=r"page.html was truncated while it was written: rerun"),
+        layers.whole_file(tmp_path / "page.html") as new,
+    ):
+        new.write_text("new")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_whole_file__is_written_where_a_link_takes_the_place_of_its_temporary_folder(tmp_path):
+    (tmp_path / "user").mkdir()
+    mine = tmp_path / "user" / "page.html"
+    mine.write_text("mine")
+    with layers.whole_file(tmp_path / "page.html") as new:
+        (files,) = tmp_path.glob(".page.html-*/files")
+        files.rename(tmp_path / "moved")
+        files.symlink_to(mine.parent)
+        new.write_text("new")
+    assert ((tmp_path / "page.html").read_text(), mine.read_text()) == ("new", "mine")
+
+
+def test_put_back__leaves_what_is_published(tmp_path):
+    file, report = tmp_path / "left.tif", tmp_path / "run.json"
+    file.write_text("before")
+    report.write_text("before")
+
+    def interrupted():
+        with put_back([file], report):
+            file.unlink()
+            file.write_text("new")
+            (tmp_path / "new").write_text("new")
+            os.replace(tmp_path / "new", report)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert contents(tmp_path) == {str(file): b"new", str(report): b"new"}
+
+
+def test_whole_file__is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):
+    written, path = [], tmp_path / "file"
+    monkeypatch.setattr(layers.os, "fsync", lambda file: written.append((os.pread(file, 9, 0), path.exists())))
+    with layers.whole_file(path) as new:
+        new.write_text("content")
+    assert (written, path.read_text()) == ([(b"content", False)], "content")

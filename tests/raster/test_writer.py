@@ -1,0 +1,323 @@
+"""The writer of a run's files replaces none of the user's, and publishes none that is not its own."""
+
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import OUTPUTS, PLACE, STATISTICS, contents, exchanged_for_link
+
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.products import BANDS
+from sat_intervals.raster import (
+    MARK,
+    RUN_FILES,
+    Georeferencing,
+    OutputError,
+    OutputWriter,
+    layers,
+    put_back,
+    remove_scratch,
+    replaceable,
+    restore,
+    stamps,
+    write_layer,
+)
+from sat_intervals.raster import writer as raster_writer
+from sat_intervals.raster.files import File
+from sat_intervals.run.pair import match_pair
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.mark.parametrize("inner", ["", "files", "files/replaced"])
+def test_output_writer__adopts_no_folder_through_a_link(tmp_path, inner):
+    precious = tmp_path / "precious"
+    (precious / "files" / "replaced").mkdir(parents=True)
+    (precious / "files" / "strips-intervals.tif").write_text("mine")
+    (precious / "files" / "replaced" / "intervals.tif").write_text("mine")
+    link = tmp_path / "out" / ".unpublished-intervals.tif" / inner
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if inner == "":
+        link.rmdir() if link.exists() else None
+    (tmp_path / "out" / ".unpublished-intervals.tif" / inner).symlink_to(precious / inner)
+    before = contents(precious)
+    for look in (replaceable, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
+        with pytest.raises(OutputError, match="is a symbolic link"):
+            look(tmp_path / "out", RUN_FILES)
+        assert contents(precious) == before
+
+
+def writer(out):
+    return OutputWriter(out, RUN_FILES, 4, 5, Georeferencing(), {})
+
+
+def test_output_writer__deletes_no_files_that_no_process_made(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files" / "replaced"
+    place.mkdir(parents=True)
+    for file in (place / "intervals.tif", place.parent / "run.json"):
+        file.write_text("mine")
+        before = contents(tmp_path)
+        for look in (replaceable, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
+            with pytest.raises(OutputError, match=f"{file.name} was not written by sat-intervals: move .* away"):
+                look(tmp_path, RUN_FILES)
+            assert contents(tmp_path) == before
+        file.unlink()
+
+
+def test_output_writer__does_not_follow_a_link_that_appears_meanwhile(tmp_path):
+    (tmp_path / "user").mkdir()
+    (tmp_path / "user" / "intervals.tif").write_text("mine")
+    hidden = tmp_path / "out" / ".unpublished-intervals.tif"
+
+    def write():
+        with writer(tmp_path / "out") as output:
+            output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+            (hidden / "files").rename(hidden / "aside")
+            (hidden / "files").symlink_to(tmp_path / "user")
+            output.publish()
+
+    with pytest.raises(OutputError, match="files is a symbolic link"):
+        write()
+    assert contents(tmp_path / "user") == {str(tmp_path / "user" / "intervals.tif"): b"mine"}
+
+
+@pytest.mark.parametrize("inner", ["", "files", "files/replaced"])
+def test_output_writer__deletes_nothing_in_a_folder_that_took_the_place_of_its_own(tmp_path, inner):
+    hidden = tmp_path / "out" / ".unpublished-intervals.tif"
+    place = hidden / inner
+    names = {"": ".sat-intervals.files", "files": "strips-intervals.tif", "files/replaced": "intervals.tif"}
+
+    def exchange():
+        place.rename(tmp_path / "moved")
+        place.mkdir()
+        (place / names[inner]).write_text("mine")
+
+    for before in (True, False):
+        with writer(tmp_path / "out") as output:
+            output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+            if before:
+                output.build()
+                exchange()
+                with pytest.raises(
+                    OutputError, match=f"{place}, a folder of temporary files, was replaced: move it away"
+                ):
+                    output.publish()
+            else:
+                output.publish()
+                exchange()
+        assert (place / names[inner]).read_text() == "mine"
+        shutil.rmtree(hidden)
+        shutil.rmtree(tmp_path / "moved")
+
+
+def written(output, *rasters):
+    output.write(0, *rasters)
+    output.publish(("run.json", "{}"))
+
+
+def test_output_writer__names_a_file_where_a_folder_of_temporary_ones_must_be(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files" / "replaced"
+    place.parent.mkdir(parents=True)
+    place.write_text("mine")
+    with pytest.raises(OutputError, match=f"{place} is not a folder, but temporary files go there: move it away"):
+        writer(tmp_path).__enter__()
+    assert place.read_text() == "mine"
+
+
+def test_output_writer__writes_nothing_behind_a_link_with_a_temporary_name(tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    with writer(tmp_path / "out") as output:
+        (tmp_path / "out" / ".unpublished-intervals.tif" / "files" / "run.json").symlink_to(tmp_path / "mine")
+        with pytest.raises(OutputError, match="cannot be written: File exists"):
+            written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+    assert contents(tmp_path) == {str(tmp_path / "mine"): b"mine"}
+
+
+@pytest.mark.parametrize("way", ["symlink_to", "hardlink_to"])
+@pytest.mark.parametrize("name", ["intervals.tif", "run.json"])
+def test_output_writer__writes_nothing_behind_a_link_that_takes_the_place_of_a_temporary_file(tmp_path, name, way):
+    (tmp_path / "mine").write_text("mine")
+    temporary = tmp_path / "out" / ".unpublished-intervals.tif" / "files" / name
+    with writer(tmp_path / "out") as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        assert not any(file.is_file() for file in temporary.parent.rglob("*"))  # those of rows have no names
+
+        def announce(_):
+            if temporary.exists() and not temporary.is_symlink():
+                exchanged_for_link(temporary, tmp_path / "mine", way)
+
+        with suppress(OutputError):
+            output.publish(("run.json", "{}"), announce=announce)
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert not any(file.is_symlink() or file.stat().st_nlink > 1 for file in (tmp_path / "out").glob("*.*"))
+
+
+def test_output_writer__draws_nothing_behind_a_link_with_the_name_of_its_picture(tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    file = File("disparity.png", "uint8", None, BANDS[:1], driver="PNG")
+    with OutputWriter(tmp_path / "out", [file], 4, 5, Georeferencing(), {}) as output:
+        (tmp_path / "out" / ".unpublished-disparity.png" / "files" / "disparity.png").symlink_to(tmp_path / "mine")
+        written(output, np.zeros((1, 4, 5), np.uint8))
+    assert ((tmp_path / "mine").read_text(), (tmp_path / "out" / "disparity.png").is_symlink()) == ("mine", False)
+
+
+def exchanged_for_run(monkeypatch, step, out, user):
+    """Before a step of the writer, put a link to the folder of another run into the place of its finished files."""
+    work = getattr(raster_writer, step)
+
+    def exchanged(*arguments, **named):
+        files = out / ".unpublished-intervals.tif" / "files"
+        if not files.is_symlink():
+            files.rename(out.with_name("moved"))
+            files.symlink_to(user)
+        return work(*arguments, **named)
+
+    monkeypatch.setattr(raster_writer, step, exchanged)
+
+
+def test_output_writer__publishes_no_files_of_a_folder_that_took_the_place_of_its_own(tmp_path, monkeypatch):
+    user, out = tmp_path / "user", tmp_path / "out"
+    user.mkdir()
+    for name in OUTPUTS:
+        (user / name).write_text("of another run")
+    before = contents(user)
+    exchanged_for_run(monkeypatch, "publish", out, user)
+    with writer(out) as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        with suppress(OutputError):
+            output.publish(("run.json", "{}"))
+    assert contents(user) == before
+    assert b"of another run" not in {path.read_bytes() for path in out.glob("*.*") if path.is_file()}
+
+
+def test_match_pair__writes_no_files_of_a_folder_that_took_the_place_of_its_own(small_pair, monkeypatch):
+    folder, settings = small_pair
+    user, out, images = folder / "user", folder / "out", (folder / "left.tif", folder / "right.tif")
+    match_pair(folder / "other.tif", folder / "right.tif", user, settings)
+    before = contents(user)
+    exchanged_for_run(monkeypatch, "template", out, user)
+    with suppress(SatIntervalsError):
+        match_pair(*images, out, settings)
+    assert {name: content for name, content in contents(user).items() if name in before} == before
+    assert not {content for path, content in contents(out).items() if path.endswith(tuple(OUTPUTS))} & {
+        *before.values()
+    }
+
+
+def test_output_writer__publishes_nothing_in_a_folder_that_took_the_place_of_its_own(tmp_path):
+    out, other = tmp_path / "out", tmp_path / "other"
+    other.mkdir()
+    for name in OUTPUTS:
+        (other / name).write_text("of another run")
+    before = {file.name: file.read_bytes() for file in other.iterdir()}
+
+    def publish():
+        with writer(out) as output:
+            output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+            output.build()
+            out.rename(tmp_path / "away")
+            other.rename(out)
+            output.publish(("run.json", "{}"), replaceable=stamps(out, OUTPUTS))
+
+    with pytest.raises(
+        OutputError, match=r"\.unpublished-intervals\.tif/files, a folder of temporary files, is gone: rerun"
+    ):
+        publish()
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+def test_output_writer__leaves_statistics_beside_its_place(tmp_path):
+    (tmp_path / "intervals.tif.aux.xml").write_text(STATISTICS)
+    with writer(tmp_path):
+        pass
+    (tmp_path / "intervals.tif.ovr").write_text("of an earlier one")
+    with pytest.raises(OutputError, match=r"\.ovr changes what is read from"), writer(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("name", ["intervals.tfw", "intervals.tifW", "intervals.WLD", "intervals.tab"])
+def test_output_writer__refuses_a_world_file_beside_a_raster_without_a_place(tmp_path, name):
+    (tmp_path / name).write_text("2\n0\n0\n-2\n9\n9\n")
+    with pytest.raises(OutputError, match=f"{name} changes what is read from .*intervals.tif"), writer(tmp_path):
+        pass
+    with OutputWriter(tmp_path, RUN_FILES, 4, 5, PLACE, {}):
+        pass  # GDAL ignores it
+
+
+def test_output_writer__finds_files_beside_its_place_in_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
+    def fail(folder):
+        raise PermissionError
+
+    (tmp_path / "intervals.tif.msk").write_text("mine")
+    monkeypatch.setattr("sat_intervals.raster.seal.os.listdir", fail)
+    with pytest.raises(OutputError, match=r"intervals\.tif\.msk changes what is read from"), writer(tmp_path):
+        pass
+
+
+def test_output_writer__publishes_no_file_beside_a_mask_that_appears_meanwhile(tmp_path):
+    with writer(tmp_path) as output:
+        output.write(0, *(np.zeros((len(file.bands), 4, 5), file.dtype) for file in RUN_FILES))
+        (tmp_path / "intervals.tif.msk").write_text("mine")
+        with pytest.raises(OutputError, match=r"intervals\.tif\.msk changes what is read from .*: move it away"):
+            output.publish()
+    assert sorted(file.name for file in tmp_path.glob("[!.]*")) == ["intervals.tif.msk"]
+
+
+def test_output_writer__refuses_a_mask_beside_a_picture(tmp_path):
+    (tmp_path / "mask.png.MSK").write_text("of an earlier one")
+    picture = replace(RUN_FILES[1], name="mask.png", driver="PNG")
+    with (
+        pytest.raises(OutputError, match=r"mask\.png\.MSK changes what is read from"),
+        OutputWriter(tmp_path, [picture], 4, 5, PLACE, {}),
+    ):
+        pass
+
+
+def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files"
+    (place / "replaced").mkdir(parents=True)
+    for file in (place / "mine.txt", place / "replaced" / "mine.txt", place / "strips-intervals.tif"):
+        file.write_text("mine")
+    (place.parent / ".sat-intervals.files").touch()  # as a killed process leaves it
+    with OutputWriter(tmp_path, RUN_FILES, 4, 5, Georeferencing(), {}) as writer:
+        writer.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        writer.publish()
+    names = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
+    hidden = ".unpublished-intervals.tif/files"
+    assert names == [f"{hidden}/mine.txt", f"{hidden}/replaced/mine.txt", "intervals.tif", "validity.tif"]
+
+
+def test_output_writer__publishes_no_file_that_is_truncated_after_it_was_compared(tmp_path):
+    with writer(tmp_path) as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        made = tmp_path / ".unpublished-intervals.tif" / "files" / "intervals.tif"
+        with pytest.raises(OutputError, match=r"changed temporary files in .*: rerun the command"):
+            output.publish(("run.json", "{}"), announce=lambda stamps: os.truncate(made, 100))
+    assert not list(tmp_path.glob("*.*"))
+
+
+def test_put_back__of_a_killed_process_keeps_a_file_that_came_after_it(tmp_path):
+    file, report = tmp_path / "left.tif", tmp_path / "run.json"
+    write_layer(file, np.ones((9, 9), np.uint16), 0, PLACE, MARK)
+    report.write_text("before")
+    os.rename(file, layers._aside(file, report))  # as a killed process leaves it
+    file.write_text("mine")
+    with pytest.raises(SatIntervalsError, match=r"left\.tif exists and was not made by"), put_back([file], report):
+        pass
+    assert file.read_text() == "mine"
+
+
+def test_output_writer__deletes_no_file_with_a_name_like_that_of_its_own(tmp_path):
+    place = tmp_path / ".unpublished-intervals.tif" / "files"
+    (place / "replaced").mkdir(parents=True)
+    mine = [place / "intervals.tif.old", place / "run.json~", place / "replaced" / "validity.tif.backup"]
+    ours = [place / "strips-intervals.tif", place / "intervals.tif.ovr.tmp", place / "validity.tif.aux.xml"]
+    for file in (*mine, *ours):
+        file.write_text("content")
+    (place.parent / ".sat-intervals.files").touch()
+    with OutputWriter(tmp_path, RUN_FILES, 4, 5, Georeferencing(), {}):
+        pass
+    assert contents(tmp_path) == {str(file): b"content" for file in mine}
