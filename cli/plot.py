@@ -54,9 +54,9 @@ def plot(
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.raster import watched_images
     from sat_intervals.results import open_results
+    from sat_intervals.show.canvas import published_together
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
@@ -65,13 +65,10 @@ def plot(
     from sat_intervals.show.search_range import draw_range, has_range
 
     results = open_results(out, truth)
-    _check(results, row, columns, pixel)
-    is_judged = None not in (results.truth, results.config.interval)
-    if beside and not is_judged:
-        raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
+    _check(results, row, columns, pixel, beside)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
-    if is_judged:
+    if _is_judged(results):
         drawings["errors"] = lambda path: draw_errors(results, path, dpi)
         drawings["coverage"] = lambda path: draw_coverage([out, *beside], path, dpi, truth=truth, **judging)
     if has_range(results):
@@ -80,21 +77,37 @@ def plot(
         drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
     if pixel:
         drawings["curve"] = lambda path: draw_curve(results, path, *pixel, dpi)
-    if _is_current(surface := out / "dsm.tif", results.report["finished"]):
-        drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
-    check_made_here(out / f"{name}.png" for name in drawings)
     check_unchanged = watched_images(results.images, judging["mask"])
-    with results.unchanged("dsm.tif"):
+    with published_together(out) as drawn, results.unchanged("dsm.tif"):
+        if _is_current(surface := out / "dsm.tif", results.report["finished"]):
+            drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
+        check_made_here(out / f"{name}.png" for name in drawings)
         for name, draw in drawings.items():
-            draw(out / f"{name}.png")
-            click.echo(out / f"{name}.png")
+            draw(drawn / f"{name}.png")
         check_unchanged()
+    for name in drawings:
+        click.echo(out / f"{name}.png")
 
 
-def _check(results: "Results", row: int | None, columns: tuple[int, int] | None, pixel: tuple[int, int] | None) -> None:
-    """Raise if a profile or a pixel is outside the results."""
+def _is_judged(results: "Results") -> bool:
+    """Return whether there are intervals, and a truth to compare them with."""
+    return None not in (results.truth, results.config.interval)
+
+
+def _check(
+    results: "Results",
+    row: int | None,
+    columns: tuple[int, int] | None,
+    pixel: tuple[int, int] | None,
+    beside: tuple[Path, ...],
+) -> None:
+    """Raise if a profile or a pixel is outside the results, or these cannot be compared with other runs."""
     from sat_intervals.errors import SatIntervalsError
 
+    if beside and not _is_judged(results):
+        raise SatIntervalsError(
+            f"--beside compares coverages, but {results.out} has no truth or no intervals: give --truth"
+        )
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
     if row is not None:

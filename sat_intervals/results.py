@@ -19,10 +19,9 @@ from sat_intervals.raster import (
     Georeferencing,
     Image,
     Layer,
-    check_alone,
     open_image,
+    read_alone,
     read_layers,
-    read_shape,
     read_small_image,
     read_small_layers,
     read_tags,
@@ -97,6 +96,8 @@ class Run:
         The pixels of the left image that were matched. Rows and columns of the results count from its first pixel.
     which
         Stamps of ``run.json`` and the rasters, which change when they are replaced.
+    georeferencing
+        Georeferencing of the results.
     """
 
     out: Path
@@ -104,16 +105,12 @@ class Run:
     config: Config
     region: Window
     which: tuple[str | None, ...]
+    georeferencing: Georeferencing
 
     @property
     def shape(self) -> tuple[int, int]:
         """Return the rows and columns of the results."""
         return self.region.height, self.region.width
-
-    @property
-    def georeferencing(self) -> Georeferencing:
-        """Return the georeferencing of the results."""
-        return open_image(self.out / "validity.tif").georeferencing
 
     @property
     def left_georeferencing(self) -> Georeferencing:
@@ -130,7 +127,15 @@ class Run:
 
     @contextmanager
     def unchanged(self, *others: str) -> Iterator[None]:
-        """Raise RunError at the end of the block if the run, or one of ``others`` in its folder, was replaced."""
+        """Raise at the end of the block if the run, or one of ``others`` in its folder, was replaced.
+
+        Raises
+        ------
+        RunError
+            One was replaced.
+        SatIntervalsError
+            A file appeared beside a raster of the run that changes what is read from it.
+        """
         check_files = watched(self.out / name for name in (*others, "run.json", *_BANDS))
         try:
             yield
@@ -138,6 +143,8 @@ class Run:
             if _which(self.out) != self.which:
                 raise RunError(f"the run in {self.out} was replaced while it was read: rerun the command")
         check_files()
+        for name in _BANDS:
+            read_alone(self.out / name)
 
     def windows(self) -> Iterator[Window]:
         """Yield full-width windows of the results from the top."""
@@ -285,9 +292,8 @@ def open_run(out: str | Path) -> Run:
         raise SatIntervalsError(
             f"{file} is not the report of a run{where}: move it away and match again with --overwrite"
         ) from error
-    for name, bands in _BANDS.items():
-        _check_raster(out / name, bands, region, files.get(name))
-    return Run(out, report, config, region, which)
+    places = [_checked_place(out / name, bands, region, files.get(name)) for name, bands in _BANDS.items()]
+    return Run(out, report, config, region, which, places[-1])
 
 
 def _which(out: Path) -> tuple[str | None, ...]:
@@ -314,8 +320,8 @@ def _nodata(record: dict[str, Any]) -> float | None:
     return None if record["nodata"] is None else float(record["nodata"])
 
 
-def _check_raster(file: Path, bands: int, region: Window, published: dict[str, int] | None) -> None:
-    """Raise if a raster is missing, or differs in shape or bytes from the report of its run.
+def _checked_place(file: Path, bands: int, region: Window, published: dict[str, int] | None) -> Georeferencing:
+    """Return the georeferencing of a raster; raise if it is missing, or not as the report of its run says.
 
     GDAL decodes most flipped bits of a compressed block without an error. Earlier versions wrote no checksums.
     """
@@ -326,13 +332,14 @@ def _check_raster(file: Path, bands: int, region: Window, published: dict[str, i
             f"{file} is not what the run published; it is damaged or was changed: move it away and match again with "
             "--overwrite"
         )
-    check_alone(file)
-    found, needed = read_shape(file), (bands, region.height, region.width)
+    found, place = read_alone(file)
+    needed = bands, region.height, region.width
     if found != needed:
         raise SatIntervalsError(
             f"{file} has {found[0]} bands of {found[1]} x {found[2]} pixels, but run.json says {needed[0]} of "
             f"{needed[1]} x {needed[2]}: move it away and match again with --overwrite"
         )
+    return place
 
 
 def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
@@ -355,7 +362,7 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
     left, right = (_opened(run.report["inputs"][side]) for side in ("left", "right"))
     truth = truth or (run.truth_beside if run.truth_beside.exists() else None)
     layer = None if truth is None else run.layer(truth)
-    return Results(run.out, run.report, run.config, run.region, run.which, left, right, layer)
+    return Results(**vars(run), left=left, right=right, truth=layer)
 
 
 def _opened(record: dict[str, Any]) -> Image:

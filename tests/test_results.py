@@ -1,10 +1,12 @@
-"""A run.json that was edited by hand: one line that names it, whatever reads it."""
+"""A run.json that was edited by hand, and files that appear beside a run: one line that names them."""
 
 import json
 
 import pytest
 from finished import random_bands, write_run
 from helpers import invoke
+
+from sat_intervals import results
 
 EDITS = {
     "finished": 7,
@@ -53,3 +55,24 @@ def test_commands__name_an_image_of_the_run_that_is_missing(tmp_path, command):
     )
     (tmp_path / "left.tif").symlink_to("moved.tif")
     assert invoke(command, out).exit_code == 0
+
+
+FOREIGN = "<PAMDataset><SRS>EPSG:32640</SRS><GeoTransform>10, 1, 0, 20, 0, -1</GeoTransform></PAMDataset>"
+
+
+@pytest.mark.parametrize("command", [["stac"], ["project"], ["export", "--to", "otb"]])
+def test_commands__end_where_a_file_with_another_place_appears_beside_the_run(tmp_path, monkeypatch, command):
+    out, checked = write_run(tmp_path, *random_bands(20, 30)), results._checked_place
+
+    def and_appears(file, *arguments):
+        found = checked(file, *arguments)
+        if file.name == "validity.tif":  # the last that is checked
+            (out / "validity.tif.aux.xml").write_text(FOREIGN)
+        return found
+
+    monkeypatch.setattr(results, "_checked_place", and_appears)
+    arguments = [out, tmp_path / "to"] if command[0] == "export" else [out]
+    done = invoke(command[0], *arguments, *command[1:])
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert "validity.tif.aux.xml changes what is read from" in done.stderr
+    assert not [*out.glob("*.qgz"), *out.glob("stac*"), *tmp_path.glob("to/*.tif")]

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_regular
 from sat_intervals.raster import GROUND, Frame, Vertical, stamps
 from sat_intervals.raster.identity import watched
 
 # Bytes in which GDAL looks for what a file is.
 _HEAD = 4096
-# Endings of files that are read with a Shapefile.
-_WITH = ".dbf", ".shx", ".prj", ".cpg"
+# Endings of files that are read with a Shapefile or a table.
+_WITH = ".dbf", ".shx", ".prj", ".cpg", ".csvt"
 # Formats of vectors in one file, or in those with `_WITH`.
 _DRIVERS = {
     "CSV", "ESRI Shapefile", "ESRIJSON", "FlatGeobuf", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "JSONFG", "KML",
@@ -61,6 +61,7 @@ class PointFile:
 
     def parts(self) -> Iterator[np.ndarray]:
         """Yield ``(n, 3)`` float64 x, y and height in the frame, of points that have all and are on the ground."""
+        check_regular(self._path)  # again: a pipe may have taken its place
         try:
             for part in self._parts(self._path):
                 metres = part[:, 2] * self.frame.unit

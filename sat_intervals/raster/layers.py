@@ -273,10 +273,17 @@ def check_made_by(path: Path, command: str, tag: str, value: str | None = None) 
             )
 
 
-def check_alone(path: str | os.PathLike[str]) -> None:
-    """Raise if files beside one of our rasters change what GDAL reads from it, see `check_beside`."""
+def read_alone(path: str | os.PathLike[str]) -> tuple[tuple[int, int, int], Georeferencing]:
+    """Return bands, rows and columns of one of our rasters, and its georeferencing.
+
+    Raises
+    ------
+    SatIntervalsError
+        Files beside it change what GDAL reads from it, see `check_beside`.
+    """
     with opened(str(path)) as dataset:
         check_beside(os.fspath(path), dataset.files)
+        return (dataset.count, dataset.height, dataset.width), Georeferencing.of(dataset)
 
 
 def read_tags(path: str | os.PathLike[str]) -> dict[str, str]:

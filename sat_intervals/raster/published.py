@@ -7,7 +7,7 @@ from pathlib import Path
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of
-from sat_intervals.raster.layers import check_alone
+from sat_intervals.raster.layers import read_alone
 
 POINTS_FILE, POINTS_REPORT = POINT_FILES[0].name, "points.json"
 
@@ -20,7 +20,7 @@ def check_points(out: Path) -> None:
     SatIntervalsError
         Names the damaged file, or one beside it that GDAL reads too.
     """
-    check_alone(out / POINTS_FILE)
+    read_alone(out / POINTS_FILE)
     published = published_points(out)
     if published and published != checksum_of(out / POINTS_FILE):
         raise SatIntervalsError(

@@ -3,9 +3,12 @@
 Every picture imports this module, so it reports a missing matplotlib (the extra ``plot``).
 """
 
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -44,6 +47,19 @@ def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterato
         with whole_file(path, there) as new, new.open("xb") as stream:
             figure.savefig(stream, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
             check_made_here([path])  # again: a file may have appeared meanwhile
+
+
+@contextmanager
+def published_together(folder: Path) -> Iterator[Path]:
+    """Give the block another folder for pictures, and write them to ``folder`` at its end; foreign files are kept."""
+    there = stamps(folder, os.listdir(folder))
+    with TemporaryDirectory() as drawn:
+        yield Path(drawn)
+        for picture in sorted(Path(drawn).iterdir()):
+            place = folder / picture.name
+            with whole_file(place, there) as new:
+                shutil.copyfile(picture, new)
+                check_made_here([place])  # again: a file may have appeared meanwhile
 
 
 def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:

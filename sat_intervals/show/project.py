@@ -100,15 +100,15 @@ def write_project(out: str | Path) -> Written:
     check_made_here([file])
     _check_places(run)
     written = Written([], [])
-    with run.unchanged("points.tif", "dsm.tif"):
-        layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
-        _write_defaults(run, layers, written)
-        layers += _images(run, written)
-        with whole_file(file) as new, zipfile.ZipFile(new, "w") as archive:
-            # stored, so that the mark is in the first bytes
-            archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(_project(run, layers), _HEAD))
-            check_made_here([file])  # again: files may have appeared meanwhile
-            _check_places(run)
+    with whole_file(file) as new:
+        with run.unchanged("points.tif", "dsm.tif"):
+            layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
+            _write_defaults(run, layers, written)
+            layers += _images(run, written)
+            with zipfile.ZipFile(new, "w") as archive:  # stored, so that the mark is in the first bytes
+                archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(_project(run, layers), _HEAD))
+        check_made_here([file])  # again: files may have appeared meanwhile
+        _check_places(run)
     return Written([*written.files, file], written.notes)
 
 

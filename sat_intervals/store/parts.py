@@ -5,6 +5,7 @@ record is intact and its contents have these sizes. The names of parts have a di
 such as the median and the versions of the codecs: parts made with other settings do not belong to the run.
 """
 
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,6 @@ from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, digest, sealed, unsealed
 from sat_intervals.store.removal import PARTS, final_name, is_part
 from sat_intervals.store.tiles import DamagedTilesError, Store
-from sat_intervals.store.zarr_arrays import checksum
 
 PartKey = tuple[int, int]
 """Level of a file, 0 for its pixels, and row of blocks from the top."""
@@ -87,9 +87,9 @@ class Parts:
         return unsealed(self.folder.read(f"{PARTS}/{name}.json"), name)
 
     def write(self, key: PartKey, kind: str, content: bytes) -> list[int]:
-        """Write a content of a part; return its size and checksum."""
+        """Write a content of a part; return its size and CRC-32."""
         self.folder.write_bytes(f"{PARTS}/{self._name(key)}_{kind}", content)
-        return checksum(content)
+        return _checksum(content)
 
     def write_record(self, key: PartKey, record: Mapping[str, Any]) -> None:
         """Write the record of a part, with the checksums of its contents in ``files``; the part is then done."""
@@ -116,7 +116,7 @@ class Parts:
                 f"the part {name}_{kind} in {self.folder} cannot be read: {error.strerror or error}; rerun the same "
                 "command: it resumes"
             ) from error
-        if content is None or checksum(content) != list(file):
+        if content is None or _checksum(content) != list(file):
             self.folder.delete(f"{PARTS}/{name}.json")
             return None
         return content
@@ -145,3 +145,8 @@ def parts_in(store: Store, made_by: str = "") -> Parts:
     """Return the parts of a run with these tiles."""
     is_shared = store.folder != folder_at(store.home)
     return Parts(store.folder, str(store.home.absolute()) if is_shared else "", made_by)
+
+
+def _checksum(content: bytes) -> list[int]:
+    """Return size in bytes and CRC-32 of a content; that of a file is combined from those of its parts."""
+    return [len(content), zlib.crc32(content)]

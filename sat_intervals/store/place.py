@@ -7,7 +7,7 @@ names too, and only folders named after their own manifest are deleted there.
 import json
 from pathlib import Path
 
-from sat_intervals.store.folder import Folder, folder_at
+from sat_intervals.store.folder import MADE, Folder, folder_at, mark
 from sat_intervals.store.manifest import MANIFEST, StoreError, digest, parsed
 
 # File in the folder of a run that names the location of its tiles, if they are elsewhere.
@@ -56,9 +56,15 @@ def place_of(home: Path, store: str | None) -> Folder:
 
 
 def is_own(folder: Folder) -> bool:
-    """Return whether a run made a folder of a store: its name ends with the digest of its manifest."""
+    """Return whether a run made a folder of a store: its name ends with the digest of its manifest.
+
+    If a removal was interrupted, which deletes the manifest first, the mark of the folder has that digest.
+    """
     text = folder.read(MANIFEST)
+    if text is None:
+        made_by = folder.read(MADE) or ""
+        return made_by == mark(made_by[:-8]) and str(folder).endswith(made_by[:-8])
     try:
-        return text is not None and str(folder).endswith(digest(parsed(text, folder)))
+        return str(folder).endswith(digest(parsed(text, folder)))
     except StoreError:
         return False

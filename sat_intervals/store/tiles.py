@@ -50,7 +50,7 @@ _WAY_OUT = (
 )
 
 # Increase when arrays or records change: older tiles cannot be resumed.
-LAYOUT = 11
+LAYOUT = 12
 
 
 class DamagedTilesError(RunError):
@@ -326,8 +326,9 @@ class Store:
             yield from self._arrays.strips(rows, _checksums(records), first, last)
 
     def check_intact(self, records: Records) -> None:
-        """Compare the files of all tiles with their checksums; errors as in `strips`."""
+        """Compare the files of all tiles with their checksums, and restore the arrays' metadata; raises as `strips`."""
         with self._damage_handled():
+            self._arrays.create()
             if not self._arrays.are_intact(_checksums(records)):
                 raise DamagedFileError
 
@@ -368,8 +369,7 @@ class Store:
 def remove_tiles(home: Folder, place: Folder) -> None:
     """Delete a run's tiles in ``place``, and its marker files in ``home``."""
     drop(place)
-    names = PLACE, REPLACING, FINISHED
-    home.delete_all([name for name in home.sizes() if final_name(name) in names])
+    home.delete_all([name for name in home.sizes() if final_name(name) in (PLACE, REPLACING, FINISHED)])
 
 
 def has_begun(home: Path) -> bool:

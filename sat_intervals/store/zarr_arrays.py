@@ -7,7 +7,6 @@ each file.
 
 import math
 import struct
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -133,7 +132,7 @@ class TileArrays:
         shards[_RIGHT] = self._pieces(rank, self._reach)
         checksums = {}
         for name, pieces in shards.items():
-            of_pieces = (number for piece in pieces for number in checksum(piece))
+            of_pieces = (number for piece in pieces for number in _checksum(piece))
             checksums[self._file(name, tile)] = [*self._write(self._file(name, tile), b"".join(pieces)), *of_pieces]
         for name in self._tables:
             file = self._file(name, tile)
@@ -146,7 +145,7 @@ class TileArrays:
         except FileNotFoundError:
             self.folder.make(file.rpartition("/")[0])
             self.folder.write_bytes(file, content)
-        return checksum(content)
+        return _checksum(content)
 
     def _pieces(self, array: np.ndarray, width: int) -> list[bytes]:
         """Encode an array ``(..., rows, columns)`` as zarr's codec ``sharding_indexed`` does: pieces of rows, index.
@@ -174,7 +173,7 @@ class TileArrays:
 
     def are_intact(self, checksums: Checksums) -> bool:
         """Return whether files have these checksums."""
-        return all(checksum(self.folder.read_bytes(name) or b"") == list(file[:2]) for name, file in checksums.items())
+        return all(_checksum(self.folder.read_bytes(name) or b"") == list(file[:2]) for name, file in checksums.items())
 
     def histogram(self, checksums: Checksums) -> np.ndarray:
         """Return the ambiguity histogram of the region, int64 ``(ambiguities + 1,)``; errors as in `strips`."""
@@ -266,7 +265,7 @@ class TileArrays:
         for file, content, sums in zip(files, self.folder.read_parts(parts), expected, strict=True):
             view, found = memoryview(content or b""), []
             for size, crc in sums:
-                if checksum(view[:size]) != [size, crc]:
+                if _checksum(view[:size]) != [size, crc]:
                     raise DamagedFileError(file)
                 found.append(np.frombuffer(blosc.decompress(view[:size]), dtype))
                 view = view[size:]
@@ -345,9 +344,9 @@ def _compressed(chunk: np.ndarray) -> bytes:
     return bytes(blosc.compress(chunk, b"lz4", 1, blosc.SHUFFLE, 0, chunk.itemsize))
 
 
-def checksum(content: bytes | memoryview) -> list[int]:
-    """Return size in bytes and CRC-32 of a file."""
-    return [len(content), zlib.crc32(content)]
+def _checksum(content: bytes | memoryview) -> list[int]:
+    """Return size in bytes and CRC-32C of a file: processors have an instruction for it (26 GB/s, zlib's CRC-32 4)."""
+    return [len(content), google_crc32c.value(bytes(content))]
 
 
 def _rank(cost: np.ndarray, winner: np.ndarray) -> np.ndarray:

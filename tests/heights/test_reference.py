@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shutil
 from contextlib import suppress
 
@@ -405,11 +406,11 @@ def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_
     assert not (tmp_path / "truth.tif").exists()
 
 
-@pytest.mark.parametrize("name", ["p.dbf", "p.gpkg-wal"])
+@pytest.mark.parametrize("name", ["p.dbf", "p.csvt", "p.gpkg-wal"])
 def test_make_truth__ends_where_another_file_of_the_points_is_replaced_meanwhile(relief, tmp_path, monkeypatch, name):
     """Else the truth would mix two sets of heights."""
     out, files, _ = relief
-    points = tmp_path / {"p.dbf": "p.shp", "p.gpkg-wal": "p.gpkg"}[name]
+    points = tmp_path / {"p.dbf": "p.shp", "p.csvt": "p.tsv", "p.gpkg-wal": "p.gpkg"}[name]
     write_csv(points, places(hills, 1500))
     (tmp_path / name).write_text("before")
     monkeypatch.setattr(point_files, "_crs_of_vectors", point_files._crs_of_table)
@@ -437,6 +438,15 @@ def test_make_truth__keeps_its_points_where_nobody_can_exchange_them(relief, tmp
     monkeypatch.setattr(point_sight.PointSight, "strips", looked_at)
     make_truth(out, SensorFiles(*files), points, path=tmp_path / "truth.tif", registers=False)
     assert sorted(there) == [".sat-intervals.files", ".sat-intervals.lock", "p.csv"]
+
+
+def test_point_file__does_not_wait_for_a_pipe_that_took_its_place(tmp_path):
+    path = write_csv(tmp_path / "p.csv", places(hills, 15))
+    points = point_files.PointFile(path, None, Vertical(True, None))
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(SatIntervalsError, match=r"p\.csv is a named pipe: give a regular file"):
+        next(points.parts())
 
 
 @pytest.mark.parametrize("name", ["p.vrt", "p.xml"])

@@ -417,6 +417,23 @@ def test_triangulate__ends_where_a_raster_of_the_run_is_replaced_meanwhile(level
     assert not (out / "points.tif").exists()
 
 
+def test_triangulate__ends_where_a_file_beside_the_run_appears_meanwhile(level_run, monkeypatch):
+    """Such files may have another place, which decides what grids of OTB mean."""
+    out, files = level_run
+    load = Sensors.load
+
+    def appears(*arguments, **options):
+        (out / "validity.tif.aux.xml").write_text(
+            "<PAMDataset><GeoTransform>10,1,0,20,0,-1</GeoTransform></PAMDataset>"
+        )
+        return load(*arguments, **options)
+
+    monkeypatch.setattr(Sensors, "load", appears)
+    with pytest.raises(SatIntervalsError, match=r"validity\.tif\.aux\.xml changes what is read from .*: move it away"):
+        triangulate(out, *files)
+    assert not (out / "points.tif").exists()
+
+
 def test_triangulate_command__needs_a_run(tmp_path):
     files = cameras(tmp_path, 40, 50)
     result = invoke("triangulate", tmp_path, *sensor_words(files))

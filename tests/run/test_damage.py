@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+import zarr
 from helpers import OUTPUTS, hashes, invoke, write_pair
 from networks import random_weights, write_network
 
@@ -477,6 +478,43 @@ def test_delete_all__looks_before_each_file_whose_folder_it_is_in(tmp_path):
     with pytest.raises(OSError, match="ours has become the folder of another run"):
         LocalFolder(tmp_path / "ours").of_run("ours").delete_all(names())
     assert {file.name: content for file, content in contents(tmp_path / "ours").items()} == before
+
+
+@pytest.mark.parametrize("command", ["match", "batch"])
+def test_commands__remove_the_tiles_whose_removal_was_interrupted(scene, tmp_path, command):
+    """The manifest is deleted first: what is left has the mark of its run."""
+    pair, store = tmp_path / "out" / "pair", tmp_path / "store"
+    (tmp_path / "pairs.csv").write_text(f"name,left,right\npair,{scene / 'left.tif'},{scene / 'right.tif'}\n")
+    words = ["batch", tmp_path / "pairs.csv", tmp_path / "out", "--config", scene / "settings.yaml", "--store", store]
+    if command == "match":
+        match(scene, pair, "--store", store, "--keep-tiles")
+        words = ["match", scene / "left.tif", scene / "right.tif", pair, "--config", scene / "settings.yaml"]
+        words += ["--store", store, "--overwrite", "--coverage", "0.9"]
+    else:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Store, "remove", lambda store: None)
+            assert invoke(*words).exit_code == 0
+    (left,) = (folder for folder in store.iterdir() if folder.is_dir())
+    (left / "manifest.json").unlink()
+    assert (left / MADE).exists()
+    assert invoke(*words).exit_code == 0
+    assert [path.name for path in store.rglob("*") if path.is_file()] == []
+    assert sorted(path.name for path in pair.iterdir()) == OUTPUTS
+
+
+@pytest.mark.parametrize("how", ["empty", "gone"])
+def test_match__keeps_tiles_whose_arrays_can_be_opened(scene, tmp_path, monkeypatch, how):
+    """Nothing but those who read the tiles later needs the metadata, which may be damaged during the run."""
+    out = tmp_path / "out"
+    file = out / "tiles" / "arrays.zarr" / "int16" / "zarr.json"
+
+    def damage_and_assemble(*arguments, **named):
+        file.unlink() if how == "gone" else damage(file, how)
+        return assemble(*arguments, **named)
+
+    monkeypatch.setattr(run, "assemble", damage_and_assemble)
+    match(scene, out, "--keep-tiles")
+    assert zarr.open(out / "tiles" / "arrays.zarr", mode="r")["int16"].ndim
 
 
 @pytest.mark.parametrize("options", [[], ["--overwrite"]])

@@ -385,6 +385,7 @@ def test_plot__ends_where_a_surface_is_replaced_meanwhile(tmp_path, monkeypatch,
     done = invoke("plot", out, "--dpi", "40")
     assert done.exit_code == 1
     assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
+    assert not [*out.glob("*.png")]  # the one of the surface may show both
 
 
 def test_draw_surface__without_bounds(tmp_path, words):

@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from selenium.webdriver.support.wait import WebDriverWait
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
-from sat_intervals.raster import read_layers
+from sat_intervals.raster import read_layers, whole_file
 from sat_intervals.results import open_results
 from sat_intervals.show.legend import classify
 from sat_intervals.show.report import contents, write_report
@@ -86,6 +87,21 @@ def test_write_report__ends_where_its_run_is_replaced_meanwhile(tmp_path, monkey
         return judged(*arguments)
 
     monkeypatch.setattr(report_page, "evaluate_run", replaced_before)
+    with pytest.raises(SatIntervalsError, match="was replaced while it was read: rerun the command"):
+        write_report(results)
+    assert not (results.out / "report.html").exists()
+
+
+def test_write_report__ends_where_another_run_comes_before_the_page_is_written(tmp_path, monkeypatch):
+    """Else the page of one run is in the folder of another."""
+    results = open_results(write_run(tmp_path, *random_bands(40, 50)))
+
+    def late(path, *arguments):
+        shutil.copy(path.parent / "run.json", path.parent / "new")
+        (path.parent / "new").replace(path.parent / "run.json")
+        return whole_file(path, *arguments)
+
+    monkeypatch.setattr(report_page, "whole_file", late)
     with pytest.raises(SatIntervalsError, match="was replaced while it was read: rerun the command"):
         write_report(results)
     assert not (results.out / "report.html").exists()

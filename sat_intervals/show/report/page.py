@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+from collections.abc import Mapping
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -33,19 +34,20 @@ def write_report(results: Results) -> Path:
     there = stamps(path.parent, [path.name])
     check_made_here([path])
     check_images = watched_images(results.images)
-    with results.unchanged():  # over all that is read from the run
-        contents = _contents(results)
-    check_images()
-    # A "<" in the contents could end the script element.
-    data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
-    page = _asset("report.html")
-    script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
-    parts = {"summary": _summary(contents), "style": _asset("report.css"), "script": script, "contents": data}
-    page = re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], page)
     with whole_file(path, there) as new:
-        new.write_text(page, encoding="utf-8")
+        with results.unchanged():  # over all that is read from the run
+            new.write_text(_page(_contents(results)), encoding="utf-8")
+        check_images()
         check_made_here([path])  # again: a file may have appeared meanwhile
     return path
+
+
+def _page(contents: Mapping[str, Any]) -> str:
+    # A "<" in the contents could end the script element.
+    data = json.dumps(contents, separators=(",", ":")).replace("<", "\\u003c")
+    script = "".join(map(_asset, ("draw.js", "explore.js", "tables.js")))
+    parts = {"summary": _summary(contents), "style": _asset("report.css"), "script": script, "contents": data}
+    return re.sub(rf"/\* ({'|'.join(parts)}) \*/", lambda found: parts[found[1]], _asset("report.html"))
 
 
 def _asset(name: str) -> str:
@@ -71,7 +73,7 @@ def _contents(results: Results) -> dict[str, Any]:
     }
 
 
-def _summary(contents: dict[str, Any]) -> str:
+def _summary(contents: Mapping[str, Any]) -> str:
     """Return the main figures of a run as rows of an HTML table, for browsers without scripts."""
     run, counts = contents["run"], contents["run"]["counts"]
     region, search, width = run["tiles"]["region"], run["settings"]["disparity"], counts["median_interval_width"]
