@@ -38,14 +38,15 @@ _STRIP = 1 << 22
 # Multihash code and length of SHA-256.
 _SHA256 = "1220"
 _DIGITS = 7  # of degrees: 1 cm
+_BEGINNING = 1024  # bytes of a picture, with its notes
 
 
 def write_item(out: str | Path, *, taken: str | None = None, identifier: str | None = None) -> Path:
     """Write ``stac.json`` to the folder of a finished run: a STAC 1.1 item with its rasters as assets.
 
     The item has the footprint, the projection of each raster, statistics of its bands, sizes and SHA-256 of all files,
-    versions and settings of the run, and links to its images. ``points.tif`` and ``dsm.tif`` are assets if they belong
-    to this run.
+    versions and settings of the run, and links to its images. ``points.tif``, ``dsm.tif`` and ``overview.png`` are
+    assets if they belong to this run.
 
     Parameters
     ----------
@@ -158,12 +159,20 @@ def _assets(run: Run, place: Georeferencing) -> Iterator[tuple[str, dict[str, An
         yield "dsm", _raster(surface, "Surface model with intervals", SURFACE, read_place(surface)[1])
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
     yield "report", report | _file(run.out / "run.json")
-    if (picture := run.out / "overview.png").exists():
+    if _is_of_run(picture := run.out / "overview.png", finished):
         yield "overview", {"title": "Maps", "type": "image/png", "roles": ["overview"]} | _file(picture)
 
 
 def _has_tag(path: Path, name: str, finished: str) -> bool:
     return path.exists() and finished in read_tags(path).get(name, "").split()
+
+
+def _is_of_run(picture: Path, finished: str) -> bool:
+    """Return whether a picture notes that it is of a run; a user's, or one of an earlier run, does not."""
+    if not picture.is_file():
+        return False
+    with picture.open("rb") as stream:
+        return b"Comment\0" + finished.encode() in stream.read(_BEGINNING)
 
 
 def _file(path: Path) -> dict[str, Any]:

@@ -204,3 +204,9 @@ def _exchange(new: Path, place: Path) -> None:
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
     if rename is None or rename(_HERE, os.fsencode(new), _HERE, os.fsencode(place), _EXCHANGE):
         os.replace(new, place)
+
+
+def flush(path: Path) -> None:
+    """Flush a file to the disk; raises if that fails."""
+    with open(path, "rb") as stream:
+        os.fsync(stream.fileno())

@@ -121,6 +121,8 @@ def is_read(file: str) -> bool:
 
 def has_statistics_only(file: Path) -> bool:
     """Return whether an ``.aux.xml`` has nothing but statistics, as QGIS and ArcGIS write it for one they show."""
+    if not file.is_file():  # a pipe would block
+        return False
     try:
         elements = list(ElementTree.parse(file).iter())
     except (ElementTree.ParseError, OSError):

@@ -24,7 +24,7 @@ from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
-from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, pinned, publish, put_back, stamps
+from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, flush, pinned, publish, put_back, stamps
 from sat_intervals.raster.seal import check_place
 from sat_intervals.raster.space import WAY_OUT, check_space, file_bytes
 from sat_intervals.raster.streaming import Stream
@@ -135,7 +135,7 @@ class OutputWriter:
         """Raise if folders of temporary files are links, or have files of their names that no killed process left."""
         self._check_folders()
         is_ours = (self._hidden / _MADE).exists() or LocalFolder(self._hidden).has_lock()
-        if not is_ours and (foreign := next(self._unfinished(), None)):
+        if not is_ours and (foreign := next(self._unfinished(self._replaced, self._scratch), None)):
             raise OutputError(f"{foreign} was not written by sat-intervals: move {self._hidden} away")
 
     def _check_places(self) -> None:
@@ -163,10 +163,10 @@ class OutputWriter:
             if place.exists() and not os.path.samestat(made, place.lstat()):
                 raise OutputError(f"{place}, a folder of temporary files, was replaced: move it away and rerun")
 
-    def _unfinished(self) -> Iterator[Path]:
-        """Yield files with names of temporary ones, the replaced ones first."""
+    def _unfinished(self, *folders: Path) -> Iterator[Path]:
+        """Yield files with names of temporary ones in some folders."""
         ours = re.compile(_UNFINISHED.format("|".join(map(re.escape, self._names))))
-        for folder in (self._replaced, self._scratch):
+        for folder in folders:
             with suppress(OSError):
                 yield from (file for file in folder.iterdir() if ours.fullmatch(file.name) and not file.is_dir())
 
@@ -228,7 +228,7 @@ class OutputWriter:
                 strips.close()
                 place = self._new(name)
                 copy(strips.name, str(place), driver="PNG", **_PNG)
-                _flush(place)
+                flush(place)
                 with gdal.reading(str(place)) as dataset:
                     if (sum_of_bits(dataset.read()) - expected) % SUM_WRAPS:
                         raise OSError(errno.EIO, "the content read back differs from that written")
@@ -275,7 +275,7 @@ class OutputWriter:
             with self._failing(self._folder / name):
                 with (self._pinned / name).open("x", encoding="utf-8") as stream:
                     stream.write(text)
-                _flush(self._pinned / name)
+                flush(self._pinned / name)
         announce(list(stamps(self._pinned, names).values()))
         may_go = self._there if replaceable is None else replaceable
         publish(self._pinned, self._folder, names, may_go, self._failing, compared)
@@ -312,22 +312,31 @@ class OutputWriter:
         self._locked.close()
 
     def _remove_scratch(self) -> None:
-        """Delete temporary files of this or a killed process, and the replaced ones after publishing; no others."""
-        with suppress(OutputError):
-            self._check_folders()
-            self._delete()
+        """Delete temporary files of this or a killed process, and the replaced ones after publishing; no others.
 
-    def _delete(self) -> None:
-        for file in [*self._unfinished()]:
-            if file.parent == self._scratch or self._is_published:
+        They are deleted in open folders, so that a link that takes the place of one leads to no others.
+        """
+        with suppress(OutputError, OSError):
+            self._check_folders()
+            with pinned(self._hidden) as hidden:
+                with suppress(OSError), pinned(hidden / self._scratch.name) as scratch:
+                    with suppress(OSError), pinned(scratch / self._replaced.name) as replaced:
+                        if self._is_published:
+                            self._delete(hidden, scratch, replaced)
+                        (scratch / self._replaced.name).rmdir()
+                    self._delete(hidden, scratch)
                 with suppress(OSError):
-                    file.unlink()
-        for folder in (self._replaced, self._scratch):
+                    (hidden / self._scratch.name).rmdir()
+                if not any(self._unfinished(self._replaced, self._scratch)):
+                    (hidden / _MADE).unlink()
+
+    def _delete(self, *opened: Path) -> None:
+        """Delete the files of the last of some open folders, unless one of them is not the one that was made."""
+        pairs = zip(self._folders.values(), map(Path.stat, opened), strict=False)  # those of a killed one are unknown
+        are_own = all(os.path.samestat(made, there) for made, there in pairs)
+        for file in [*self._unfinished(opened[-1])] if are_own else []:
             with suppress(OSError):
-                folder.rmdir()
-        if not any(self._unfinished()):
-            with suppress(OSError):
-                (self._hidden / _MADE).unlink()
+                file.unlink()
 
 
 def remove_scratch(folder: Path, files: Sequence[File]) -> None:
@@ -359,9 +368,3 @@ def _killed(folder: Path, files: Sequence[File]) -> Iterator[OutputWriter]:
             writer._remove_scratch()
     else:
         yield writer
-
-
-def _flush(path: Path) -> None:
-    """Flush a file to the disk; raises if that fails."""
-    with open(path, "rb") as stream:
-        os.fsync(stream.fileno())

@@ -37,15 +37,18 @@ _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 
 
 
 @contextmanager
-def page(path: Path, size: tuple[float, float], dpi: int, title: str) -> Iterator[Figure]:
-    """Yield a figure of ``size`` inches and write it as a PNG file at the end; a foreign file is kept."""
+def page(path: Path, size: tuple[float, float], dpi: int, title: str, run: str = "") -> Iterator[Figure]:
+    """Yield a figure of ``size`` inches and write it as a PNG file at the end; a foreign file is kept.
+
+    The file notes the ``finished`` of its ``run``.
+    """
     there = stamps(path.parent, [path.name])
     with rc_context(_STYLE):
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
         with whole_file(path, there) as new, new.open("xb") as stream:
-            figure.savefig(stream, dpi=dpi, format="png", metadata={"Software": "sat-intervals"})
+            figure.savefig(stream, dpi=dpi, format="png", metadata={"Software": "sat-intervals", "Comment": run})
             check_made_here([path])  # again: a file may have appeared meanwhile
 
 

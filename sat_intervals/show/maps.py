@@ -46,7 +46,7 @@ def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
     search = results.config.disparity
     thinned = shape if shape != results.shape else None
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
-    with page(path, size, dpi, _caption(results, thinned)) as figure:
+    with page(path, size, dpi, _caption(results, thinned), results.report["finished"]) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         _draw_grey(panels[0], results, bands.image, limits(bands.image, (0, 1)))
         fitted = limits(disparity, (search.minimum, search.maximum))

@@ -130,7 +130,8 @@ class LocalFolder:
         file = self._own(name)
         temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
         try:
-            temporary.write_bytes(content)
+            with temporary.open("xb") as stream:
+                stream.write(content)
             yield temporary, file
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(file)) from error
@@ -204,7 +205,7 @@ class LocalFolder:
             yield
         finally:
             # a process that opened it meanwhile notices the deletion, see _lock
-            with suppress(FileNotFoundError):
+            with suppress(FileNotFoundError, NotADirectoryError):
                 ours, there = os.fstat(lock), (self.path / _LOCK).lstat()
                 if os.path.samestat(ours, there) and not ours.st_size:
                     (self.path / _LOCK).unlink()

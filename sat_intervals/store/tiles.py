@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import RemovedTilesError, RunError
+from sat_intervals.errors import RemovedTilesError, RunError, SatIntervalsError
 from sat_intervals.store.folder import MADE, Folder, folder_at, mark
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.marks import FINISHED, REPLACING, check_replacing
@@ -156,7 +156,7 @@ class Store:
             if self.elsewhere and (there := unsealed(folder.read(MANIFEST))) and digest(there) != self.run:
                 raise StoreError(f"{folder} has the tiles of another run, which were moved there: move them away")
             self._place.make("")  # fails before anything is deleted
-            with suppress(OSError):  # an unreachable store is kept
+            with suppress(*([] if before == home else [OSError])):  # an unreachable store is kept
                 if before is not None and text is None and (before == home or (overwrite and is_own(before))):
                     drop(before)
             if overwrite or (text is None and not self.elsewhere):
@@ -269,7 +269,7 @@ class Store:
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Write why a tile failed, for `failures`; a later record replaces it."""
-        with suppress(OSError):  # a full disk must not end the run
+        with suppress(OSError, SatIntervalsError):  # a full disk must not end the run
             if self.folder.read(MANIFEST) is not None:  # otherwise it would never be deleted
                 self.folder.write(f"{FAILURES}/{tile}.json", json.dumps(reason))
 

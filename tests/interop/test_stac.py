@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose
 
 from sat_intervals.interop import stac
 from sat_intervals.raster import north_up, read_layers
+from sat_intervals.show.canvas import page
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +137,24 @@ def test_write_item__refuses_damaged_points(made, tmp_path):
     done = invoke("stac", out)
     assert (done.exit_code, (out / "stac.json").read_bytes()) == (2, before)
     assert "points.tif is not what triangulate published; " in done.stderr
+
+
+def test_write_item__has_no_picture_of_a_user_or_of_an_earlier_run(made, tmp_path):
+    out = shutil.copytree(made[0], tmp_path / "out")
+
+    def assets():
+        assert invoke("stac", out).exit_code == 0
+        return json.loads((out / "stac.json").read_text())["assets"].keys()
+
+    with page(out / "overview.png", (1, 1), 50, "", "an earlier time"):
+        pass
+    assert "overview" not in assets()
+    (out / "overview.png").write_text("mine")
+    assert "overview" not in assets()
+    with page(out / "own.png", (1, 1), 50, "", json.loads((out / "run.json").read_text())["finished"]):
+        pass
+    (out / "own.png").replace(out / "overview.png")
+    assert "overview" in assets()
 
 
 def test_write_item__ends_where_a_surface_is_replaced_meanwhile(made, tmp_path, monkeypatch):

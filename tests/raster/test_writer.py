@@ -321,3 +321,26 @@ def test_output_writer__deletes_no_file_with_a_name_like_that_of_its_own(tmp_pat
     with OutputWriter(tmp_path, RUN_FILES, 4, 5, Georeferencing(), {}):
         pass
     assert contents(tmp_path) == {str(file): b"content" for file in mine}
+
+
+@pytest.mark.parametrize("inner", ["files", "files/replaced"])
+def test_output_writer__deletes_nothing_behind_a_link_that_comes_before_it_cleans_up(tmp_path, monkeypatch, inner):
+    out, user, check = tmp_path / "out", tmp_path / "user", OutputWriter._check_folders
+    (user / "replaced").mkdir(parents=True)
+    for name in OUTPUTS:
+        (user / name).write_text("mine")
+        (user / "replaced" / name).write_text("mine")
+    before = contents(user)
+
+    def and_exchanged(output):
+        check(output)
+        folder = out / ".unpublished-intervals.tif" / inner
+        if output._is_published and not folder.is_symlink():
+            folder.rename(tmp_path / "moved")
+            folder.symlink_to(user)
+
+    monkeypatch.setattr(OutputWriter, "_check_folders", and_exchanged)
+    with writer(out) as output:
+        written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+    assert contents(user) == before
+    assert sorted(file.name for file in out.glob("*.*") if file.is_file()) == OUTPUTS

@@ -28,6 +28,7 @@ from sat_intervals.run.assemble import assemble
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_block
+from sat_intervals.store import tiles
 from sat_intervals.store.local import MADE, LocalFolder, mark
 from sat_intervals.store.tiles import DamagedTilesError, Store
 
@@ -500,6 +501,33 @@ def test_commands__remove_the_tiles_whose_removal_was_interrupted(scene, tmp_pat
     assert invoke(*words).exit_code == 0
     assert [path.name for path in store.rglob("*") if path.is_file()] == []
     assert sorted(path.name for path in pair.iterdir()) == OUTPUTS
+
+
+def test_match__ends_before_its_work_where_tiles_of_the_earlier_run_cannot_be_removed(scene, tmp_path, monkeypatch):
+    """With a store, too: later it could not mark its end in their folder."""
+    out, removed = tmp_path / "out", tiles.drop
+    words = ["--store", tmp_path / "store", "--overwrite", "--coverage", "0.9"]
+    match(scene, out, "--keep-tiles")
+
+    def denied(folder):
+        if folder == LocalFolder(out / "tiles"):
+            raise PermissionError(13, "Permission denied")
+        removed(folder)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tiles, "drop", denied)
+        assert "cannot be used: Permission denied" in match(scene, out, *words, status=2)
+    match(scene, out, *words)
+    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+
+
+def test_write_failure__of_a_store_whose_manifest_is_a_pipe_does_not_end_a_batch(scene, tmp_path):
+    job = begun(scene, tmp_path / "out")
+    (tmp_path / "out" / "tiles" / "manifest.json").unlink()
+    os.mkfifo(tmp_path / "out" / "tiles" / "manifest.json")
+    job.store.write_failure("0_0", "a reason")
+    with pytest.raises(SatIntervalsError, match="is a named pipe"):
+        job.store.check(job.manifest)
 
 
 @pytest.mark.parametrize("how", ["empty", "gone"])

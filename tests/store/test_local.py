@@ -127,3 +127,15 @@ def test_scratch__keeps_what_is_put_beside_its_files(tmp_path):
         (used / "notes.txt").write_text("mine")
         (used / "dir").mkdir()
     assert sorted(path.name for path in tmp_path.rglob("*")) == [used.parent.name, "dir", "files", "notes.txt"]
+
+
+def test_locked__raises_what_the_block_raises_where_a_file_takes_its_place(tmp_path):
+    def work():
+        with LocalFolder(tmp_path / "tiles").locked():
+            (tmp_path / "tiles").rename(tmp_path / "aside")
+            (tmp_path / "tiles").write_text("mine")
+            raise ValueError("the cause")
+
+    with pytest.raises(ValueError, match="the cause"):
+        work()
+    assert (tmp_path / "tiles").read_text() == "mine"
