@@ -6,7 +6,6 @@ import signal
 import socket
 import threading
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -144,30 +143,27 @@ class _Nanny(Nanny):
 def _local(settings: Cluster) -> LocalCluster:
     workers, start = settings.workers or usable_cores(), time.monotonic()
     _check_loopback()
-    with warnings.catch_warnings():
-        # no network is needed
-        warnings.filterwarnings("ignore", "Couldn't detect a suitable IP address", RuntimeWarning)
-        try:
-            return LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1 + readers(settings),
-                worker_class=_Nanny,
-                host=LOOPBACK,
-                dashboard_address=f"{LOOPBACK}:0",
-                worker_dashboard_address=f"{LOOPBACK}:0",
-                silence_logs=logging.CRITICAL,
-                death_timeout=STARTING,
-            )
-        except Exception as error:  # any error at the start, such as a full /dev/shm
-            cause: BaseException = error
-            while cause.__cause__ is not None:
-                cause = cause.__cause__
-            late = f"not within {STARTING:.0f} s" if time.monotonic() - start > STARTING else ""
-            why = late or " ".join(str(cause).split()) or type(cause).__name__
-            raise RunError(
-                f"the {workers} worker processes did not start ({why}): give fewer --workers, more room in "
-                "/dev/shm or another DASK_TEMPORARY_DIRECTORY, or use --cluster threads"
-            ) from error
+    try:
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1 + readers(settings),
+            worker_class=_Nanny,
+            host=LOOPBACK,
+            dashboard_address=f"{LOOPBACK}:0",
+            worker_dashboard_address=f"{LOOPBACK}:0",
+            silence_logs=logging.CRITICAL,
+            death_timeout=STARTING,
+        )
+    except Exception as error:  # any error at the start, such as a full /dev/shm
+        cause: BaseException = error
+        while earlier := cause.__cause__ or cause.__context__:  # dask may fail again as it cleans up
+            cause = earlier
+        late = f"not within {STARTING:.0f} s" if time.monotonic() - start > STARTING else ""
+        why = late or " ".join(str(cause).split()) or type(cause).__name__
+        raise RunError(
+            f"the {workers} worker processes did not start ({why}): give fewer --workers, more room in "
+            "/dev/shm or another DASK_TEMPORARY_DIRECTORY, or use --cluster threads"
+        ) from error
 
 
 def _check_loopback() -> None:

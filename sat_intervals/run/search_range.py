@@ -9,7 +9,8 @@ import numpy as np
 
 from sat_intervals.config import Cluster
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
-from sat_intervals.match.normalization import blocks
+from sat_intervals.match.memory import check_memory
+from sat_intervals.match.normalization import BLOCK, blocks
 from sat_intervals.match.sampling import Look, Sample, coarse_rows, look, samples, summary
 from sat_intervals.match.search_range import (
     Found,
@@ -27,11 +28,13 @@ from sat_intervals.raster import Image, read_window, watched_images
 from sat_intervals.raster.identity import read_unchanged
 from sat_intervals.run.quality import COLLAR, is_plain
 from sat_intervals.run.workers import Connection, Task, Workers, reason
-from sat_intervals.tiling import Window
+from sat_intervals.tiling import Grid, Window
 
 _Files = dict[str, dict[str, Any]]
 _Result = TypeVar("_Result")
 _RETRIES = 2
+# Bytes of the window and the task of a block.
+_TASK = 500
 
 
 class _Block(NamedTuple):
@@ -91,7 +94,11 @@ def search_range(client: Workers, left: Image, right: Image, files: _Files, prog
         The images have too few consistent matches.
     RunError
         An image cannot be read.
+    SatIntervalsError
+        An image is too large for a list of its blocks.
     """
+    for image in (left, right):
+        _check_size(image)
     progress("kernels", 0, 1)
     compile_kernels(settings(0, 3))
     step = finest_step(left.height, max(left.width, right.width))
@@ -122,6 +129,12 @@ def find_here(left: Image, right: Image, progress: Progress) -> Found:
         found = search_range(connection.client(), left, right, {}, progress)
     check_unchanged()
     return found
+
+
+def _check_size(image: Image) -> None:
+    number = len(Grid(Window(0, 0, image.height, image.width), BLOCK))
+    size = f"{image.height} x {image.width}"
+    check_memory(_TASK * number, f"{image.path}: {number} blocks of {size} pixels", "is it the right file?")
 
 
 def _reduced(client: Workers, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:

@@ -4,6 +4,7 @@ import logging
 import os
 import resource
 import subprocess
+import sys
 from functools import partial
 from types import SimpleNamespace
 
@@ -83,13 +84,38 @@ def test_main__names_a_malformed_dask_configuration(tmp_path):
     assert line.endswith("fix it, or set DASK_CONFIG to another")
 
 
+ALONE = """
+import fcntl, os, socket, struct, sys
+socket.sethostname("nowhere.invalid")
+with socket.socket() as any_socket:
+    fcntl.ioctl(any_socket, 0x8914, struct.pack("16sh14x", b"lo", 1))  # SIOCSIFFLAGS, IFF_UP
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
 @pytest.mark.process
 @pytest.mark.skipif(os.geteuid() != 0, reason="a network of its own needs root")
-def test_main__needs_no_network(tmp_path):
+@pytest.mark.parametrize(("before", "cluster"), [([], "threads"), ([sys.executable, "-c", ALONE], "processes")])
+def test_main__needs_no_network(tmp_path, before, cluster):
     image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
-    command = ["unshare", "-n", COMMAND, "match", image, image, tmp_path / "out", "--disparity", "-2", "2", "--quiet"]
+    command = [COMMAND, "match", image, image, tmp_path / "out", "--disparity", "-2", "2", "--quiet"]
+    command = ["unshare", "--net", "--uts", *before, *command, "--cluster", cluster, "--workers", "1"]
     result = subprocess.run(command, capture_output=True, check=False, timeout=300)  # kernels may have to be compiled
     assert (result.returncode, result.stderr) == (0, b"")
+
+
+@pytest.mark.process
+@pytest.mark.skipif(os.geteuid() != 0, reason="a file system of its own needs root")
+def test_main__names_the_cause_when_shared_memory_is_full(tmp_path):
+    image = write(tmp_path / "image.tif", np.random.default_rng(0).integers(1, 255, (64, 64), np.uint8))
+    command = [COMMAND, "match", image, image, tmp_path / "out", "--disparity", "-2", "2", "--cluster", "processes"]
+    small = 'mount -t tmpfs -o size=16k tmpfs /dev/shm && exec "$@"'
+    command = ["unshare", "--mount", "sh", "-c", small, "sh", *command, "--workers", "1"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1].startswith(
+        "sat-intervals: the 1 worker processes did not start ([Errno 28] No space left on device): give fewer"
+    )
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import signal
+import subprocess
 import threading
 from itertools import count
 
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 from finished import write_file, write_run
-from helpers import invoke
+from helpers import COMMAND, invoke, wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -549,6 +551,22 @@ def test_make_surface__ends_at_once_when_it_is_interrupted(tmp_path, monkeypatch
     with pytest.raises(KeyboardInterrupt):
         surface_of([out], tmp_path)
     assert seen[0].is_set()
+
+
+@pytest.mark.process
+def test_dsm__ends_within_seconds_of_an_interrupt(tmp_path):
+    y, x = np.mgrid[:1000, :1000] * 4.0  # a surface of 16 million cells takes a minute
+    out = write_points(tmp_path / "a", x, -y, np.full_like(x, 10.0))
+    command = [COMMAND, "dsm", out, "--output", tmp_path / "dsm.tif", "--resolution", "1", "--radius", "32"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            wait_until(lambda: list(tmp_path.glob(".unpublished-*/files/*")), "a temporary file")
+            process.send_signal(signal.SIGINT)
+            said = process.communicate(timeout=20)[1]
+        finally:
+            process.kill()
+    assert (process.returncode, said.splitlines()[-1].split(";")[0]) == (130, "sat-intervals: interrupted")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 def test_make_surface__a_wide_radius_leaves_no_cell_without_height(tmp_path):

@@ -476,6 +476,25 @@ def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, t
     assert hashes(tmp_path / "pair1") == before
 
 
+def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged_before_its_images_are_measured(
+    images, tmp_path, monkeypatch
+):
+    pairs, measure_images = read_batch(rows(images)), batch.measure_images
+
+    def damaged(client, job, progress):
+        if job.out.name == "pair1":
+            manifest = job.store.home / "manifest.json"
+            manifest.unlink(missing_ok=True)
+            os.mkfifo(manifest)
+            job.store.check(job.manifest)
+        return measure_images(client, job, progress)
+
+    monkeypatch.setattr(batch, "measure_images", damaged)
+    report = match_batch(pairs, tmp_path, {"tiles": {"size": 64, "overlap": 20}})
+    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done"}
+    assert "manifest.json is a named pipe" in report["pair1"]["error"]
+
+
 def test_match_batch__removes_tiles_that_a_death_left_beside_a_result_and_none_that_were_kept(images, tmp_path):
     pairs = read_batch(rows(images))
     first = match_batch(pairs, tmp_path, keep_tiles=True)

@@ -5,6 +5,7 @@ import logging
 import os
 import signal
 import socket
+import subprocess
 import threading
 import time
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from helpers import invoke
+from helpers import COMMAND, invoke
 
 from sat_intervals import load_config, open_image
 from sat_intervals.config import Cluster, ConfigError, Mccnn
@@ -187,7 +188,9 @@ def test_weights_file__refuses_a_large_file_before_it_is_read(tmp_path):
     assert time.monotonic() - began < 1
 
 
-def test_plan__of_an_endless_image_ends(tmp_path):
+@pytest.mark.parametrize("disparity", [(), ("--disparity", "0", "4")])
+@pytest.mark.parametrize("command", ["plan", "match", "range"])
+def test_endless_image__is_refused(tmp_path, command, disparity):
     source = write(tmp_path / "small.tif")
     side = 2 * 10**9
     vrt = tmp_path / "endless.vrt"
@@ -196,10 +199,13 @@ def test_plan__of_an_endless_image_ends(tmp_path):
         f"<SimpleSource><SourceFilename>{source}</SourceFilename><SourceBand>1</SourceBand></SimpleSource>"
         "</VRTRasterBand></VRTDataset>"
     )
-    began = time.monotonic()
-    result = invoke("plan", vrt, vrt, "--disparity", "0", "4", "--tile-size", "64")
-    assert result.exit_code in (0, 2), result.output
-    assert time.monotonic() - began < 30
+    given = {"match": [tmp_path / "out", *disparity], "plan": disparity, "range": []}[command]
+    # a process of its own: an endless list of blocks could not be interrupted here
+    run = [COMMAND, command, vrt, vrt, *given]
+    result = subprocess.run(run, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert "GB" in result.stderr
 
 
 # ---- Workers that say nothing ------------------------------------------------------------------------------------
@@ -254,6 +260,34 @@ def test_heartbeats__do_not_count_a_time_in_which_this_process_was_stopped(monke
     now[0] += 1
     with pytest.raises(RunError, match="no worker has answered for 600 s"):
         heartbeats.check(worker)
+
+
+def test_heartbeats__name_a_silent_worker_after_half_a_minute(monkeypatch):
+    now, messages = [0.0], heard(monkeypatch)
+    monkeypatch.setattr(submit.time, "monotonic", lambda: now[0])
+    worker = SimpleNamespace(cluster=None, scheduler_info=lambda n_workers: {"workers": {"one": {"last_seen": 1.0}}})
+    heartbeats = submit._Heartbeats()
+    for now[0] in (0.0, 30.0):
+        heartbeats.check(worker)
+        assert not messages
+    now[0] = 31.0
+    heartbeats.check(worker)
+    assert messages == ["waiting for one, silent for 30 s"]
+
+
+@pytest.mark.process
+def test_submission__goes_on_without_a_worker_that_is_stopped(tmp_path, monkeypatch):
+    warned = heard(monkeypatch)
+    monkeypatch.setattr(submit, "SILENT", 2.0)
+    with (
+        dask.config.set({"distributed.scheduler.worker-ttl": "6s"}),
+        connected(Cluster(kind="processes", workers=2), tmp_path) as client,
+    ):
+        address, process = min(client.run(os.getpid).items())
+        psutil.Process(process).send_signal(signal.SIGSTOP)
+        outcomes = [end for end in Submission(client, iter([Task(i, abs, (-i,), 2) for i in range(9)])) if end]
+    assert sorted((end.label, end.result) for end in outcomes) == [(i, i) for i in range(9)]
+    assert f"waiting for {address}, silent for 2 s" in warned
 
 
 @pytest.mark.process
