@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import os
 import re
 from collections.abc import Iterator
@@ -39,6 +40,8 @@ _STRIP = 1 << 22
 _SHA256 = "1220"
 _DIGITS = 7  # of degrees: 1 cm
 _BEGINNING = 1024  # bytes of a picture, with its notes
+
+_LOG = logging.getLogger(__name__)
 
 
 def write_item(out: str | Path, *, taken: str | None = None, identifier: str | None = None) -> Path:
@@ -152,15 +155,23 @@ def _assets(run: Run, place: Georeferencing) -> Iterator[tuple[str, dict[str, An
     yield "intervals", _raster(run.out / "intervals.tif", "Disparity, its interval, confidence", BANDS, place)
     yield "validity", _raster(run.out / "validity.tif", "Validity flags", (_VALIDITY,), place)
     finished = run.report["finished"]
-    if _has_tag(points := run.out / "points.tif", "RUN", finished):
+    points, surface, picture = (run.out / name for name in ("points.tif", "dsm.tif", "overview.png"))
+    if _is_taken(points, _has_tag(points, "RUN", finished), "triangulate"):
         check_points(run.out)
         yield "points", _raster(points, "Longitude, latitude and height of every pixel", POINTS, place)
-    if _has_tag(surface := run.out / "dsm.tif", "RUNS", finished):
+    if _is_taken(surface, _has_tag(surface, "RUNS", finished), "dsm"):
         yield "dsm", _raster(surface, "Surface model with intervals", SURFACE, read_place(surface)[1])
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
     yield "report", report | _file(run.out / "run.json")
-    if _is_of_run(picture := run.out / "overview.png", finished):
+    if _is_taken(picture, _is_of_run(picture, finished), "plot"):
         yield "overview", {"title": "Maps", "type": "image/png", "roles": ["overview"]} | _file(picture)
+
+
+def _is_taken(file: Path, is_of_run: bool, command: str) -> bool:
+    """Return whether a file becomes an asset, and say so if it is left out."""
+    if file.exists() and not is_of_run:
+        _LOG.warning("%s is not of this run and is left out: rerun sat-intervals %s", file, command)
+    return is_of_run
 
 
 def _has_tag(path: Path, name: str, finished: str) -> bool:

@@ -143,8 +143,12 @@ def test_write_item__has_no_picture_of_a_user_or_of_an_earlier_run(made, tmp_pat
     out = shutil.copytree(made[0], tmp_path / "out")
 
     def assets():
-        assert invoke("stac", out).exit_code == 0
-        return json.loads((out / "stac.json").read_text())["assets"].keys()
+        done = invoke("stac", out)
+        assert done.exit_code == 0
+        keys = json.loads((out / "stac.json").read_text())["assets"].keys()
+        said = f"{out / 'overview.png'} is not of this run and is left out: rerun sat-intervals plot\n"
+        assert ("overview" in keys) == (said not in done.stderr)
+        return keys
 
     with page(out / "overview.png", (1, 1), 50, "", "an earlier time"):
         pass
