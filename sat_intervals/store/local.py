@@ -32,6 +32,8 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 _TIMEOUT = 0.2
 # Empty folders deleted at once.
 _AT_ONCE = 16
+# Status of the folders that this process has locked, by path.
+_LOCKED: dict[Path, os.stat_result] = {}
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,8 @@ class LocalFolder:
     """See `Folder`. Files are renamed when complete; runs exclude each other with ``flock``.
 
     Nothing is written or deleted behind a link that is the folder or in it, nor in the folder of another run that took
-    its place: files there are those of somebody else.
+    its place, nor in any that took the place of one that this process has locked: files there are those of somebody
+    else.
 
     Attributes
     ----------
@@ -149,6 +152,9 @@ class LocalFolder:
             if folder.is_symlink():
                 raise OSError(errno.ELOOP, f"{folder} has become a symbolic link", str(place))
         top = (self.path, *self.path.parents)[self.depth]
+        with suppress(FileNotFoundError):
+            if (locked := _LOCKED.get(top.absolute())) and not os.path.samestat(locked, top.stat()):
+                raise OSError(errno.ESTALE, f"{top} has been replaced by another folder", str(place))
         made_by = LocalFolder(top).read(MADE) if self.run else None
         if made_by and made_by != mark(self.run) and made_by == mark(made_by[:-8]):  # otherwise it is damaged
             raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
@@ -200,10 +206,12 @@ class LocalFolder:
         SatIntervalsError
             Another run is active there, or the folder cannot be locked.
         """
-        lock = self._lock()
+        lock, path = self._lock(), self.path.absolute()
         try:
+            _LOCKED[path] = path.stat()
             yield
         finally:
+            _LOCKED.pop(path, None)
             # a process that opened it meanwhile notices the deletion, see _lock
             with suppress(FileNotFoundError, NotADirectoryError):
                 ours, there = os.fstat(lock), (self.path / _LOCK).lstat()

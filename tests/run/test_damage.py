@@ -720,3 +720,22 @@ def test_commands__refuse_a_result_of_which_a_bit_flipped(scene, tmp_path, comma
     assert f"{tmp_path}/OUT/intervals.tif is not what the run published; it is damaged" in result.stderr
     assert result.exit_code == 2
     assert not (tmp_path / "TARGET").exists()
+
+
+@pytest.mark.parametrize("options", [("--overwrite",), ()])
+def test_match__deletes_no_tiles_of_a_run_that_took_the_place_of_its_folder(scene, tmp_path, monkeypatch, options):
+    out, other, drop = tmp_path / "out", tmp_path / "other", tiles.drop
+    shutil.copytree(scene / "kept", other)
+    if options:
+        shutil.copytree(scene / "kept", out)
+    before = sorted(contents(other).values())
+
+    def exchanged(folder):
+        if other.exists():
+            out.rename(tmp_path / "aside")
+            other.rename(out)
+        drop(folder)
+
+    monkeypatch.setattr(tiles, "drop", exchanged)
+    assert "has been replaced by another folder: move it away" in match(scene, out, *options, status=2)
+    assert sorted(contents(out).values()) == before

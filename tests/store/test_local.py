@@ -7,6 +7,7 @@ import shutil
 from contextlib import contextmanager
 
 import pytest
+from helpers import contents
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.local import LocalFolder
@@ -139,3 +140,24 @@ def test_locked__raises_what_the_block_raises_where_a_file_takes_its_place(tmp_p
     with pytest.raises(ValueError, match="the cause"):
         work()
     assert (tmp_path / "tiles").read_text() == "mine"
+
+
+def test_locked__nothing_is_changed_in_a_folder_that_took_the_place(tmp_path):
+    folder = LocalFolder(tmp_path / "tiles")
+    (tmp_path / "other" / "records").mkdir(parents=True)
+    (tmp_path / "other" / "records" / "mine.json").write_text("mine")
+    with folder.locked():
+        folder.write("manifest.json", "own")
+        (tmp_path / "tiles").rename(tmp_path / "aside")
+        (tmp_path / "other").rename(tmp_path / "tiles")
+        before = contents(tmp_path / "tiles")
+        for change in (
+            lambda: folder.write("manifest.json", "text"),
+            lambda: folder.inside("records").write("mine.json", "text"),
+            lambda: folder.delete_all(["records/mine.json"], ["records"]),
+            lambda: folder.make("records"),
+        ):
+            with pytest.raises(OSError, match="tiles has been replaced by another folder"):
+                change()
+        assert contents(tmp_path / "tiles") == before
+    folder.write("manifest.json", "text")
