@@ -258,7 +258,7 @@ def _matched(
                 with job.store.needed(job.manifest):
                     measure_images(client, job, progress)
                 measured[name] = job
-            except SatIntervalsError as error:
+            except Exception as error:  # one pair's failure must not stop the others
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
         for matched in match_jobs(client, list(measured.values()), progress):

@@ -156,8 +156,8 @@ def _local(settings: Cluster) -> LocalCluster:
         )
     except Exception as error:  # any error at the start, such as a full /dev/shm
         cause: BaseException = error
-        while earlier := cause.__cause__ or cause.__context__:  # dask may fail again as it cleans up
-            cause = earlier
+        while earlier := cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__):
+            cause = earlier  # dask may fail again as it cleans up
         late = f"not within {STARTING:.0f} s" if time.monotonic() - start > STARTING else ""
         why = late or " ".join(str(cause).split()) or type(cause).__name__
         raise RunError(

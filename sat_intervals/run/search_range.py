@@ -134,7 +134,7 @@ def find_here(left: Image, right: Image, progress: Progress) -> Found:
 def _check_size(image: Image) -> None:
     number = len(Grid(Window(0, 0, image.height, image.width), BLOCK))
     size = f"{image.height} x {image.width}"
-    check_memory(_TASK * number, f"{image.path}: {number} blocks of {size} pixels", "is it the right file?")
+    check_memory(_TASK * number, f"{image.path}: {size} pixels in {number} blocks", "is it the right file?")
 
 
 def _reduced(client: Workers, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:

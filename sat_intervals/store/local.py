@@ -213,7 +213,7 @@ class LocalFolder:
         finally:
             _LOCKED.pop(path, None)
             # a process that opened it meanwhile notices the deletion, see _lock
-            with suppress(FileNotFoundError, NotADirectoryError):
+            with suppress(OSError):
                 ours, there = os.fstat(lock), (self.path / _LOCK).lstat()
                 if os.path.samestat(ours, there) and not ours.st_size:
                     (self.path / _LOCK).unlink()

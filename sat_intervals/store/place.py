@@ -1,7 +1,7 @@
 """Location of a run's tiles: in its folder, or in a store named by a file there.
 
 The folder of a run, and so that file, may come from someone else. It is followed only into the store that the user
-names too, and only folders named after their own manifest are deleted there.
+names too, and only folders named after their own manifest or mark are deleted there.
 """
 
 import json
@@ -63,7 +63,8 @@ def is_own(folder: Folder) -> bool:
     text = folder.read(MANIFEST)
     if text is None:
         made_by = folder.read(MADE) or ""
-        return made_by == mark(made_by[:-8]) and str(folder).endswith(made_by[:-8])
+        run = made_by[:-8]
+        return bool(run) and made_by == mark(run) and str(folder).endswith(run)
     try:
         return str(folder).endswith(digest(parsed(text, folder)))
     except StoreError:

@@ -1,10 +1,15 @@
 """Recognise and delete the files of a run's tiles in a folder; other files are kept."""
 
+import errno
 import re
 from contextlib import suppress
 
 from sat_intervals.store.folder import MADE, Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed
+from sat_intervals.store.place import is_own
+
+# Errors that mean that a link or another folder took the place of one.
+REPLACED = errno.ELOOP, errno.ESTALE
 
 ARRAYS, RECORDS, FAILURES = "arrays.zarr", "records", "failures"
 BORDERS, PIXELS, COSTS, PARTS = "borders", "pixels", "costs", "parts"
@@ -40,6 +45,28 @@ def drop(folder: Folder) -> None:
         folder.delete_all(names - {MANIFEST, MADE}, [*FOLDERS, ARRAYS])
         folder.delete(MADE)
     folder.delete_if_empty()
+
+
+def drop_earlier(folder: Folder | None, *, is_at_home: bool, overwrite: bool) -> None:
+    """Delete the tiles of an earlier run, if there are any; those in a store that cannot be reached are kept.
+
+    Raises
+    ------
+    StoreError
+        Those in the folder of the run cannot be deleted.
+    """
+    if folder is None:
+        return
+    if not is_at_home:
+        with suppress(OSError):
+            if overwrite and is_own(folder):
+                drop(folder)
+        return
+    try:
+        drop(folder)
+    except OSError as error:
+        way_out = "move it away" if error.errno in REPLACED else "check its rights"
+        raise StoreError(f"{folder} cannot be removed: {error.strerror or error}: {way_out}") from error
 
 
 def check_not_foreign(folder: Folder) -> None:

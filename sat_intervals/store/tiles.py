@@ -23,16 +23,18 @@ from sat_intervals.errors import RemovedTilesError, RunError, SatIntervalsError
 from sat_intervals.store.folder import MADE, Folder, folder_at, mark
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.marks import FINISHED, REPLACING, check_replacing
-from sat_intervals.store.place import PLACE, ElsewhereError, is_own, place_of
+from sat_intervals.store.place import PLACE, ElsewhereError, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
     FAILURES,
     FOLDERS,
     NORMALIZATION,
     RECORDS,
+    REPLACED,
     SEARCH,
     check_not_foreign,
     drop,
+    drop_earlier,
     final_name,
     is_of_run,
 )
@@ -156,9 +158,7 @@ class Store:
             if self.elsewhere and (there := unsealed(folder.read(MANIFEST))) and digest(there) != self.run:
                 raise StoreError(f"{folder} has the tiles of another run, which were moved there: move them away")
             self._place.make("")  # fails before anything is deleted
-            with suppress(*([] if before == home else [OSError])):  # an unreachable store is kept
-                if before is not None and text is None and (before == home or (overwrite and is_own(before))):
-                    drop(before)
+            drop_earlier(None if text else before, is_at_home=before == home, overwrite=overwrite)
             if overwrite or (text is None and not self.elsewhere):
                 drop(self._place)
             self._place.make("")
@@ -179,7 +179,7 @@ class Store:
             if not folder.create(MANIFEST, sealed(manifest)):
                 self.check(manifest)
         except OSError as error:
-            way_out = "move it away" if error.errno in (errno.ELOOP, errno.ESTALE) else _WAY_OUT
+            way_out = "move it away" if error.errno in REPLACED else _WAY_OUT
             raise StoreError(f"{folder} cannot be used: {error.strerror or error}: {way_out}") from error
 
     def _place_before(self, overwrite: bool) -> Folder | None:
@@ -269,7 +269,7 @@ class Store:
 
     def write_failure(self, tile: str, reason: str) -> None:
         """Write why a tile failed, for `failures`; a later record replaces it."""
-        with suppress(OSError, SatIntervalsError):  # a full disk must not end the run
+        with suppress(OSError, SatIntervalsError):  # a full disk or a damaged store must not end the run
             if self.folder.read(MANIFEST) is not None:  # otherwise it would never be deleted
                 self.folder.write(f"{FAILURES}/{tile}.json", json.dumps(reason))
 

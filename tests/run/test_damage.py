@@ -28,7 +28,7 @@ from sat_intervals.run.assemble import assemble
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_block
-from sat_intervals.store import tiles
+from sat_intervals.store import removal
 from sat_intervals.store.local import MADE, LocalFolder, mark
 from sat_intervals.store.tiles import DamagedTilesError, Store
 
@@ -500,7 +500,7 @@ def test_commands__remove_the_tiles_whose_removal_was_interrupted(scene, tmp_pat
 
 def test_match__ends_before_its_work_where_tiles_of_the_earlier_run_cannot_be_removed(scene, tmp_path, monkeypatch):
     """With a store, too: later it could not mark its end in their folder."""
-    out, removed = tmp_path / "out", tiles.drop
+    out, removed = tmp_path / "out", removal.drop
     words = ["--store", tmp_path / "store", "--overwrite", "--coverage", "0.9"]
     match(scene, out, "--keep-tiles")
 
@@ -510,8 +510,10 @@ def test_match__ends_before_its_work_where_tiles_of_the_earlier_run_cannot_be_re
         removed(folder)
 
     with monkeypatch.context() as patch:
-        patch.setattr(tiles, "drop", denied)
-        assert "cannot be used: Permission denied" in match(scene, out, *words, status=2)
+        patch.setattr(removal, "drop", denied)
+        assert f"{out}/tiles cannot be removed: Permission denied: check its rights" in match(
+            scene, out, *words, status=2
+        )
     match(scene, out, *words)
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
@@ -724,7 +726,7 @@ def test_commands__refuse_a_result_of_which_a_bit_flipped(scene, tmp_path, comma
 
 @pytest.mark.parametrize("options", [("--overwrite",), ()])
 def test_match__deletes_no_tiles_of_a_run_that_took_the_place_of_its_folder(scene, tmp_path, monkeypatch, options):
-    out, other, drop = tmp_path / "out", tmp_path / "other", tiles.drop
+    out, other, drop = tmp_path / "out", tmp_path / "other", removal.drop
     shutil.copytree(scene / "kept", other)
     if options:
         shutil.copytree(scene / "kept", out)
@@ -736,6 +738,6 @@ def test_match__deletes_no_tiles_of_a_run_that_took_the_place_of_its_folder(scen
             other.rename(out)
         drop(folder)
 
-    monkeypatch.setattr(tiles, "drop", exchanged)
+    monkeypatch.setattr(removal, "drop", exchanged)
     assert "has been replaced by another folder: move it away" in match(scene, out, *options, status=2)
     assert sorted(contents(out).values()) == before
