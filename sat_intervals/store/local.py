@@ -3,7 +3,6 @@
 import errno
 import fcntl
 import os
-import re
 import shutil
 import stat
 import tempfile
@@ -19,6 +18,7 @@ from itertools import groupby
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.store.open_folder import empty, opened
 
 # File with the `mark` of the run that made a folder. Its name outlasts a power loss, which empties files.
 MADE = ".sat-intervals.tiles"
@@ -26,8 +26,6 @@ MADE = ".sat-intervals.tiles"
 _LOCK = ".sat-intervals.lock"
 # Folder of the files of `LocalFolder.scratch`, beside the lock.
 _FILES = "files"
-# Flags to open a folder that is not a link.
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 # Seconds to wait for a lock.
 _TIMEOUT = 0.2
 # Empty folders deleted at once.
@@ -143,7 +141,15 @@ class LocalFolder:
 
     def delete(self, name: str) -> None:
         """See `Folder`."""
-        self._own(name).unlink(missing_ok=True)
+        place, top = self._own(name), self._top
+        with suppress(FileNotFoundError), opened(top) as folder:
+            _check_locked(top, os.fstat(folder))
+            os.unlink(place.relative_to(top), dir_fd=folder)
+
+    @property
+    def _top(self) -> Path:
+        """Return the folder of the store."""
+        return (self.path, *self.path.parents)[self.depth]
 
     def _own(self, name: str) -> Path:
         """Return the path of what is written or deleted; raise if that would be somebody else's."""
@@ -151,10 +157,9 @@ class LocalFolder:
         for folder in place.parents[: self.depth + len(Path(name).parts)]:
             if folder.is_symlink():
                 raise OSError(errno.ELOOP, f"{folder} has become a symbolic link", str(place))
-        top = (self.path, *self.path.parents)[self.depth]
+        top = self._top
         with suppress(FileNotFoundError):
-            if (locked := _LOCKED.get(top.absolute())) and not os.path.samestat(locked, top.stat()):
-                raise OSError(errno.ESTALE, f"{top} has been replaced by another folder", str(place))
+            _check_locked(top, top.stat())
         made_by = LocalFolder(top).read(MADE) if self.run else None
         if made_by and made_by != mark(self.run) and made_by == mark(made_by[:-8]):  # otherwise it is damaged
             raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
@@ -296,18 +301,15 @@ class LocalFolder:
 
         They are deleted in this folder, even if a link has taken its place.
         """
-        with self.locked():
-            folder = os.open(self.path, _FOLDER)
+        with self.locked(), opened(self.path) as folder:
             try:
                 yield self.path / _FILES
             finally:
                 try:
-                    _empty(folder, pattern)
+                    empty(folder, _FILES, pattern)
                 except BaseException:  # a signal: without the lock file nobody would delete the rest
-                    _empty(folder, pattern)
+                    empty(folder, _FILES, pattern)
                     raise
-                finally:
-                    os.close(folder)
 
 
 def _raise_unless_missing(error: OSError) -> None:
@@ -316,24 +318,15 @@ def _raise_unless_missing(error: OSError) -> None:
         raise error
 
 
+def _check_locked(folder: Path, status: os.stat_result) -> None:
+    """Raise if this process has locked a folder of this path, and it is another one."""
+    if (locked := _LOCKED.get(folder.absolute())) and not os.path.samestat(locked, status):
+        raise OSError(errno.ESTALE, f"{folder} has been replaced by another folder", str(folder))
+
+
 def mark(run: str) -> str:
     """Return the content of MADE: the digest of a run and its CRC-32, eight digits."""
     return f"{run}{zlib.crc32(run.encode()):08x}"
-
-
-def _empty(folder: int, pattern: str) -> None:
-    """Delete what has names of this pattern in the temporary files of a folder, and their folder if it gets empty."""
-    with suppress(OSError):
-        files = os.open(_FILES, _FOLDER, dir_fd=folder)
-        try:
-            for name in filter(re.compile(pattern).fullmatch, os.listdir(files)):
-                try:
-                    os.unlink(name, dir_fd=files)
-                except OSError:
-                    shutil.rmtree(name, ignore_errors=True, dir_fd=files)
-        finally:
-            os.close(files)
-        os.rmdir(_FILES, dir_fd=folder)
 
 
 def _depth(folder: LocalFolder) -> int:
