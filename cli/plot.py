@@ -1,6 +1,7 @@
 """``sat-intervals plot``: draw pictures of a finished run."""
 
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,9 +55,9 @@ def plot(
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.raster import watched_images
+    from sat_intervals.raster import stamps, watched_images
     from sat_intervals.results import open_results
-    from sat_intervals.show.canvas import published_together
+    from sat_intervals.show.canvas import write_pictures
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
@@ -67,26 +68,29 @@ def plot(
     results = open_results(out, truth)
     _check(results, row, columns, pixel, beside)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
-    drawings: dict[str, Callable[[Path], None]] = {"overview": lambda path: draw_overview(results, path, dpi)}
+    drawings: dict[str, Callable[[BytesIO], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
     if _is_judged(results):
-        drawings["errors"] = lambda path: draw_errors(results, path, dpi)
-        drawings["coverage"] = lambda path: draw_coverage([out, *beside], path, dpi, truth=truth, **judging)
+        drawings["errors"] = lambda target: draw_errors(results, target, dpi)
+        drawings["coverage"] = lambda target: draw_coverage([out, *beside], target, dpi, truth=truth, **judging)
     if has_range(results):
-        drawings["range"] = lambda path: draw_range(results, path, dpi)
+        drawings["range"] = lambda target: draw_range(results, target, dpi)
     if row is not None:
-        drawings["profile"] = lambda path: draw_profile(results, path, row, columns, dpi)
+        drawings["profile"] = lambda target: draw_profile(results, target, row, columns, dpi)
     if pixel:
-        drawings["curve"] = lambda path: draw_curve(results, path, *pixel, dpi)
+        drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
     check_unchanged = watched_images(results.images, judging["mask"])
-    with published_together(out) as drawn, results.unchanged("dsm.tif"):
+    there = stamps(out, [f"{name}.png" for name in PICTURES])
+    pictures: dict[Path, BytesIO] = {}
+    with results.unchanged("dsm.tif"):
         if _is_current(surface := out / "dsm.tif", results.report["finished"]):
-            drawings["dsm"] = lambda path: draw_surface(surface, path, dpi)
+            drawings["dsm"] = lambda target: draw_surface(surface, target, dpi)
         check_made_here(out / f"{name}.png" for name in drawings)
         for name, draw in drawings.items():
-            draw(drawn / f"{name}.png")
+            draw(pictures.setdefault(out / f"{name}.png", BytesIO()))
         check_unchanged()
-    for name in drawings:
-        click.echo(out / f"{name}.png")
+    write_pictures(pictures, there)
+    for picture in pictures:
+        click.echo(picture)
 
 
 def _is_judged(results: "Results") -> bool:

@@ -3,12 +3,10 @@
 Every picture imports this module, so it reports a missing matplotlib (the extra ``plot``).
 """
 
-import os
-import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,36 +31,39 @@ INK = "#555555"
 _WIDEST = 90  # percentile of widths at the end of their scale: low-confidence areas are often as wide as the range
 _BARS, _LEAST_SHARE = 48, 0.001  # of a histogram of widths: most bars, least share shown
 
+Target = Path | BytesIO
+"""Where a picture goes: to a file, or to memory."""
+
 _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left"}
 
 
 @contextmanager
-def page(path: Path, size: tuple[float, float], dpi: int, title: str, run: str = "") -> Iterator[Figure]:
-    """Yield a figure of ``size`` inches and write it as a PNG file at the end; a foreign file is kept.
+def page(target: Target, size: tuple[float, float], dpi: int, title: str, run: str = "") -> Iterator[Figure]:
+    """Yield a figure of ``size`` inches and write it as PNG at the end, to a file as `write_pictures` does.
 
-    The file notes the ``finished`` of its ``run``.
+    The picture notes the ``finished`` of its ``run``.
     """
-    there = stamps(path.parent, [path.name])
+    there = stamps(target.parent, [target.name]) if isinstance(target, Path) else {}
+    drawn = BytesIO() if isinstance(target, Path) else target
     with rc_context(_STYLE):
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
-        with whole_file(path, there) as new, new.open("xb") as stream:
-            figure.savefig(stream, dpi=dpi, format="png", metadata={"Software": "sat-intervals", "Comment": run})
+        figure.savefig(drawn, dpi=dpi, format="png", metadata={"Software": "sat-intervals", "Comment": run})
+    if isinstance(target, Path):
+        write_pictures({target: drawn}, there)
+
+
+def write_pictures(pictures: Mapping[Path, BytesIO], there: Mapping[str, str]) -> None:
+    """Write pictures of one folder; files that have no stamp in ``there``, or that this tool did not make, are kept.
+
+    If there is such a file before the first is written, none is. ``there`` is that of `whole_file`.
+    """
+    check_made_here(pictures)
+    for path, drawn in pictures.items():
+        with whole_file(path, there) as new:
+            new.write_bytes(drawn.getvalue())
             check_made_here([path])  # again: a file may have appeared meanwhile
-
-
-@contextmanager
-def published_together(folder: Path) -> Iterator[Path]:
-    """Give the block another folder for pictures, and write them to ``folder`` at its end; foreign files are kept."""
-    there = stamps(folder, os.listdir(folder))
-    with TemporaryDirectory() as drawn:
-        yield Path(drawn)
-        for picture in sorted(Path(drawn).iterdir()):
-            place = folder / picture.name
-            with whole_file(place, there) as new:
-                shutil.copyfile(picture, new)
-                check_made_here([place])  # again: a file may have appeared meanwhile
 
 
 def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:

@@ -7,20 +7,20 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.show.canvas import DPI, INK, page, plain_logarithm
+from sat_intervals.show.canvas import DPI, INK, Target, page, plain_logarithm
 from sat_intervals.show.legend import BLUE, ORANGE
 
 _CLASSES = (("all", "valid pixels", "black"), ("high", "high confidence", BLUE), ("low", "low confidence", ORANGE))
 
 
-def draw_coverage(runs: Sequence[Path], path: Path, dpi: int = DPI, **judging: Any) -> None:
+def draw_coverage(runs: Sequence[Path], target: Target, dpi: int = DPI, **judging: Any) -> None:
     """Draw nominal against measured coverage, and mean width against measured coverage.
 
     ``runs`` are folders of runs of one pair at several coverages, or one; ``judging`` are the arguments of
     `evaluate_run`: truth, mask, tolerance and bias. Small dots are deciles of confidence.
     """
     reports = sorted((evaluate_run(run, **judging) for run in runs), key=lambda report: float(report["nominal"]))
-    with page(path, (9.0, 4.2), dpi, f"{', '.join(run.name for run in runs)}: intervals and truth") as figure:
+    with page(target, (9.0, 4.2), dpi, f"{', '.join(run.name for run in runs)}: intervals and truth") as figure:
         left, right = figure.subplots(1, 2)
         deciles = [(report["nominal"], decile) for report in reports for decile in report["deciles"]]
         _draw_line(

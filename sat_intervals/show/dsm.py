@@ -15,6 +15,7 @@ from sat_intervals.show.canvas import (
     DPI,
     INK,
     NOTHING,
+    Target,
     add_histogram,
     fitting,
     limits,
@@ -34,7 +35,7 @@ _MOST, _TIMES = 98, 12
 _BAND = {band.name: index for index, band in enumerate(SURFACE)}
 
 
-def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
+def draw_surface(surface: Path, target: Target, dpi: int = DPI) -> None:
     """Draw hillshade, height, interval width and confidence of a surface model, read from its overviews.
 
     If several runs overlap, their agreement replaces confidence.
@@ -71,7 +72,7 @@ def draw_surface(surface: Path, path: Path, dpi: int = DPI) -> None:
         f"{surface.name}: {shape[0]} x {shape[1]} cells of {place.pixel_size[0]:g} m{step}, "
         f"{_figures(height, halves)}\n{_frame(surface, place)}"
     )
-    with page(path, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
+    with page(target, (2 * (inches[1] + 1.4), 2 * (inches[0] + 0.7) + 0.3), dpi, caption) as figure:
         panels = figure.subplots(2, 2).ravel()
         _draw(panels[0], extent, relief, ("Hillshade, sun in the north-west; blue: no data", ""), "gray", (0, 1))
         panels[0].set_facecolor(_NO_DATA)  # flat ground is grey too

@@ -18,6 +18,7 @@ from sat_intervals.show.canvas import (
     DPI,
     INK,
     NOTHING,
+    Target,
     add_histogram,
     fitting,
     limits,
@@ -34,7 +35,7 @@ _STRETCHED = 5.0  # largest ratio of the sides of a map; pixels of longer ones a
 _EDGE = "#888888"
 
 
-def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
+def draw_overview(results: Results, target: Target, dpi: int = DPI) -> None:
     """Draw left image, disparity, interval width, confidence and validity side by side, read from overviews."""
     rows, columns = _arrangement(results.shape)
     width, height = _inches(results.shape, _PANEL if columns > 1 else _LARGE)
@@ -46,7 +47,7 @@ def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
     search = results.config.disparity
     thinned = shape if shape != results.shape else None
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3
-    with page(path, size, dpi, _caption(results, thinned), results.report["finished"]) as figure:
+    with page(target, size, dpi, _caption(results, thinned), results.report["finished"]) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         _draw_grey(panels[0], results, bands.image, limits(bands.image, (0, 1)))
         fitted = limits(disparity, (search.minimum, search.maximum))
@@ -58,7 +59,7 @@ def draw_overview(results: Results, path: Path, dpi: int = DPI) -> None:
         _draw_validity(panels[4], panels[5], results, bands.validity)
 
 
-def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
+def draw_errors(results: Results, target: Target, dpi: int = DPI) -> None:
     """Draw the left image and, in colour, the valid pixels whose interval misses the truth (the paper's figure 7).
 
     All pixels are counted; of large results, every n-th row and column is drawn.
@@ -84,7 +85,7 @@ def draw_errors(results: Results, path: Path, dpi: int = DPI) -> None:
     low, high = limits(image, (0, 1))
     thinned = [f"one {name} in {step}" for name, step in (("row", down), ("column", across)) if step > 1]
     title = ", ".join([_caption(results, None), *thinned]) + (" shown" if thinned else "")
-    with page(path, (max(_TEXT, width + 0.9), height + 1.4), dpi, title) as figure:
+    with page(target, (max(_TEXT, width + 0.9), height + 1.4), dpi, title) as figure:
         panel = figure.subplots()
         # Lower contrast than in the overview, so that the colours stand out.
         _draw_grey(panel, results, image, (low - 0.3 * (high - low), high + 0.3 * (high - low)))

@@ -1,14 +1,12 @@
 """Draw line charts: the interval along a row, and the cost curve of a pixel."""
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.products import INVALID, Bands
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.show.canvas import DPI, INK, NOTHING, Target, fitting, limits, page, say_empty
 from sat_intervals.show.cost_curve import Curve, read_curve
 from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION
 from sat_intervals.tiling import Window
@@ -19,7 +17,7 @@ _LOW = "#d4d4d4"
 
 
 def draw_profile(
-    results: Results, path: Path, row: int, columns: tuple[int, int] | None = None, dpi: int = DPI
+    results: Results, target: Target, row: int, columns: tuple[int, int] | None = None, dpi: int = DPI
 ) -> None:
     """Draw interval, disparity and truth along a row, low-confidence sections in grey (the paper's figures 5, 7, 8).
 
@@ -40,7 +38,7 @@ def draw_profile(
     edges = np.repeat(np.arange(first, last + 2) - 0.5, 2)[1:-1]
     has_intervals = results.config.interval is not None
     title = f"Row {row}, columns {first} to {last}; gaps: invalid pixels"
-    with page(path, (_WIDTH, 5.4), dpi, title) as figure:
+    with page(target, (_WIDTH, 5.4), dpi, title) as figure:
         strip, chart = figure.subplots(2, 1, sharex=True, height_ratios=(1, 4))
         _draw_strip(strip, results, row, first, last, dpi)
         if low.any():
@@ -59,7 +57,7 @@ def draw_profile(
         say_empty(chart, disparity, "no valid pixel")
 
 
-def draw_curve(results: Results, path: Path, row: int, column: int, dpi: int = DPI) -> None:
+def draw_curve(results: Results, target: Target, row: int, column: int, dpi: int = DPI) -> None:
     """Draw a pixel's cost curve, its possibility distribution, the cut and the interval (the paper's figures 2 and 3).
 
     The pixel is matched again. The interval that the run wrote, after median filter and regularisation, is shown below.
@@ -69,7 +67,7 @@ def draw_curve(results: Results, path: Path, row: int, column: int, dpi: int = D
     search = results.config.disparity
     margin = max(1.0, 0.02 * search.count)
     across = (search.minimum - margin, search.maximum + margin)
-    with page(path, (9.0, 7.5), dpi, _describe(row, column, pixel)) as figure:
+    with page(target, (9.0, 7.5), dpi, _describe(row, column, pixel)) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
         above.plot(curve.disparities, curve.costs, color="black", lw=1, marker="o", ms=3, label="cost curve")
         below.plot(curve.disparities, curve.possibilities, color="black", lw=1, marker="o", ms=3, label="possibility")

@@ -23,6 +23,7 @@ from sat_intervals.raster import (
     read_small_image,
     read_small_layers,
     read_tags,
+    stamps,
     whole_file,
 )
 from sat_intervals.raster.published import check_points
@@ -99,14 +100,16 @@ def write_project(out: str | Path) -> Written:
     run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
     check_made_here([file])
     _check_places(run)
+    there = stamps(run.out, [file.name])
     written = Written([], [])
-    with whole_file(file) as new:
-        with run.unchanged("points.tif", "dsm.tif"):
-            layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
-            _write_defaults(run, layers, written)
-            layers += _images(run, written)
-            with zipfile.ZipFile(new, "w") as archive:  # stored, so that the mark is in the first bytes
-                archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(_project(run, layers), _HEAD))
+    with run.unchanged("points.tif", "dsm.tif"):
+        layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
+        _write_defaults(run, layers, written)
+        layers += _images(run, written)
+        project = styles.text_of(_project(run, layers), _HEAD)
+    with whole_file(file, there) as new:
+        with run.unchanged(), zipfile.ZipFile(new, "w") as archive:  # stored, so that the mark is in the first bytes
+            archive.writestr(zipfile.ZipInfo("project.qgs"), project)
         check_made_here([file])  # again: files may have appeared meanwhile
         _check_places(run)
     return Written([*written.files, file], written.notes)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, page
+from sat_intervals.show.canvas import DPI, INK, Target, page
 from sat_intervals.show.legend import BLUE, SKY
 
 
@@ -17,7 +17,7 @@ def has_range(results: Results) -> bool:
     return bool(results.report.get("search") or results.report.get("local_ranges"))
 
 
-def draw_range(results: Results, path: Path, dpi: int = DPI) -> None:
+def draw_range(results: Results, target: Target, dpi: int = DPI) -> None:
     """Draw the matches of the search by disparity, and first and last disparity of the cells."""
     report, search = results.report, results.config.disparity
     found = report.get("search")
@@ -29,7 +29,7 @@ def draw_range(results: Results, path: Path, dpi: int = DPI) -> None:
         f"{100 * ends['maximum'] / valid:.2g} % at the maximum"
     )
     panels = (1 if found else 0) + (2 if local else 0)
-    with page(path, (4.6 * panels, 4.2), dpi, title) as figure:
+    with page(target, (4.6 * panels, 4.2), dpi, title) as figure:
         charts = iter(figure.subplots(1, panels, squeeze=False)[0])
         if found:
             _draw_matches(next(charts), found, (search.minimum, search.maximum))

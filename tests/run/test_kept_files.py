@@ -8,6 +8,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -287,16 +288,16 @@ def test_report_and_plot__refuse_to_replace_an_image_of_the_run(finished):
 # Files of others in the folders
 
 
-def test_page__draws_nothing_behind_a_link_that_takes_the_place_of_its_temporary_file(tmp_path, monkeypatch):
+def test_page__publishes_no_link_that_takes_the_place_of_its_temporary_file(tmp_path, monkeypatch):
     (tmp_path / "mine").write_text("mine")
-    savefig = Figure.savefig
+    write = Path.write_bytes
 
-    def late(*arguments, **named):
+    def late(path, content):
+        write(path, content)
         (temporary,) = tmp_path.glob(".overview.png-*/files/*.png")
         exchanged_for_link(temporary, tmp_path / "mine")
-        return savefig(*arguments, **named)
 
-    monkeypatch.setattr(Figure, "savefig", late)
+    monkeypatch.setattr(Path, "write_bytes", late)
     with (
         pytest.raises(OutputError, match=r"its temporary file .*\.png was replaced"),
         page(tmp_path / "overview.png", (1, 1), 50, ""),
@@ -747,18 +748,49 @@ def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, m
     assert precious.read_text() == "mine"
     assert not (finished / name).is_symlink()
     before = contents(finished)
-    whole = Path.write_text
-
-    def half(path, text, **options):
-        whole(path, text[:100], **options)
-        fail()
-
-    monkeypatch.setattr(Path, "write_text", half)
-    monkeypatch.setattr(Figure, "savefig", lambda figure, stream, **options: stream.write(b"x" * 100) and fail())
+    text, picture = Path.write_text, Path.write_bytes
+    monkeypatch.setattr(Path, "write_text", lambda path, page, **options: text(path, page[:100], **options) and fail())
+    monkeypatch.setattr(Path, "write_bytes", lambda path, content: picture(path, content[:100]) and fail())
     with pytest.raises(SatIntervalsError, match=rf"{name} cannot be written: Input/output error"):
         write()
     monkeypatch.undo()
     assert contents(finished) == before
+
+
+@pytest.mark.parametrize("late", ["overview.png", "profile.png"])
+def test_plot__writes_no_picture_if_one_of_the_user_appears_while_it_draws(finished, monkeypatch, late):
+    """One after another, `overview.png` would be new and `profile.png` old."""
+    assert invoke("plot", finished, "--row", "0", "--dpi", "50").exit_code == 0
+    drawn = Figure.savefig
+
+    def savefig(figure, stream, **options):
+        drawn(figure, stream, **options)
+        (finished / late).unlink(missing_ok=True)
+        (finished / late).write_text("mine")
+
+    before = contents(finished)
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    refused(["plot", finished, "--row", "1", "--dpi", "60"], f"{late} exists and was not made by sat-intervals")
+    assert contents(finished) == before | {str(finished / late): b"mine"}
+
+
+def test_plot__keeps_a_picture_that_another_process_wrote_while_it_drew(finished, monkeypatch):
+    assert invoke("plot", finished, "--row", "0", "--dpi", "50").exit_code == 0
+    other = (finished / "overview.png").read_bytes() + b"of another process"
+    drawn = Figure.savefig
+
+    def savefig(figure, stream, **options):
+        drawn(figure, stream, **options)
+        (finished / "overview.png").write_bytes(other)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    refused(["plot", finished, "--dpi", "60"], "overview.png was written by another process meanwhile")
+    assert (finished / "overview.png").read_bytes() == other
+
+
+def test_plot__needs_no_temporary_folder_of_the_system(finished, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(finished / "missing"))
+    assert invoke("plot", finished, "--dpi", "50").exit_code == 0
 
 
 # Files of others with the names of ours

@@ -319,7 +319,7 @@ def test_plot__without_intervals_claims_none(tmp_path, words, unrendered):
     [((40, 60), np.nan, "Confidence"), ((1, 5), 1.0, "Agreement of runs")],
 )
 def test_plot__draws_the_surface_of_a_run(tmp_path, monkeypatch, words, shape, agreement, last):
-    monkeypatch.setattr(maps, "draw_overview", lambda results, path, dpi: path.touch())
+    monkeypatch.setattr(maps, "draw_overview", lambda results, stream, dpi: stream.write(b"drawn"))
     out = write_run(tmp_path, *random_bands(20, 20)[:2])
     height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])) / 10
     height[:, 3] = np.nan

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run
-from helpers import invoke
+from helpers import fail, invoke
 from selenium.webdriver import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -105,6 +105,13 @@ def test_write_report__ends_where_another_run_comes_before_the_page_is_written(t
     with pytest.raises(SatIntervalsError, match="was replaced while it was read: rerun the command"):
         write_report(results)
     assert not (results.out / "report.html").exists()
+
+
+def test_write_report__calls_no_failed_read_a_failed_write(tmp_path, monkeypatch):
+    results = open_results(write_run(tmp_path, *random_bands(40, 50)))
+    monkeypatch.setattr(report_page, "_asset", fail)
+    with pytest.raises(OSError, match="Input/output error"):
+        write_report(results)
 
 
 def test_report__says_in_one_line_what_is_wrong(tmp_path):

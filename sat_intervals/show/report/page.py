@@ -34,10 +34,12 @@ def write_report(results: Results) -> Path:
     there = stamps(path.parent, [path.name])
     check_made_here([path])
     check_images = watched_images(results.images)
+    with results.unchanged():  # over all that is read from the run
+        page = _page(_contents(results))
+    check_images()
     with whole_file(path, there) as new:
-        with results.unchanged():  # over all that is read from the run
-            new.write_text(_page(_contents(results)), encoding="utf-8")
-        check_images()
+        with results.unchanged():  # another run may have come to the folder
+            new.write_text(page, encoding="utf-8")
         check_made_here([path])  # again: a file may have appeared meanwhile
     return path
 
