@@ -89,7 +89,7 @@ def assemble(
         with logged_stage(seconds, "files"):
             assemble_files(job, writer, parts, workers, progress)
             if keep_tiles:  # strips of a killed run are finished without reading its tiles again
-                job.store.check_intact(records)
+                job.store.keep(records)
             job.check_inputs()
             steps = len(files) * len(parts)
             progress("files", steps, steps)  # a last chance to interrupt the run before it publishes
@@ -136,12 +136,16 @@ def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_til
         _LOG.warning("parts of the files stay in %s: %s", job.store.folder, reason(error))
 
 
-def remove_tiles(job: Job) -> None:
-    """Remove the tiles of a complete run, if they can be reached."""
+def remove_tiles(job: Job) -> bool:
+    """Remove the tiles of a complete run, if they can be reached; return whether none are left."""
     try:
-        job.store.remove()
+        if job.store.remove():
+            return True
     except OSError as error:
         _LOG.warning("the tiles of the complete run stay: %s", reason(error))
+    else:
+        _LOG.warning("files in %s stay: they have no sign that they are of this run", job.store.folder)
+    return False
 
 
 def _add_seconds(seconds: dict[str, float], records: Records) -> None:

@@ -111,9 +111,9 @@ def _match_pair(
         if not overwrite and job.is_finished():
             check_as_published(job.out)
             run = open_run(job.out)
-            remove_tiles(job)
+            done = "; its remaining tiles were removed" if remove_tiles(job) else ""
             remove_scratch(job.out, RUN_FILES)
-            _LOG.warning("the run in %s was already complete; its remaining tiles were removed", job.out)
+            _LOG.warning("the run in %s was already complete%s", job.out, done)
             return run.report
         job.begin(overwrite=overwrite)
         with logged_stage(seconds, "kernels"):

@@ -5,6 +5,7 @@ names too, and only folders named after their own manifest or mark are deleted t
 """
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 from sat_intervals.store.folder import MADE, Folder, folder_at, mark
@@ -58,14 +59,11 @@ def place_of(home: Path, store: str | None) -> Folder:
 def is_own(folder: Folder) -> bool:
     """Return whether a run made a folder of a store: its name ends with the digest of its manifest.
 
-    If a removal was interrupted, which deletes the manifest first, the mark of the folder has that digest.
+    Without a manifest that can be read, the mark of the folder has that digest: a removal deletes the manifest first,
+    and a power loss may empty it.
     """
-    text = folder.read(MANIFEST)
-    if text is None:
-        made_by = folder.read(MADE) or ""
-        run = made_by[:-8]
-        return bool(run) and made_by == mark(run) and str(folder).endswith(run)
-    try:
-        return str(folder).endswith(digest(parsed(text, folder)))
-    except StoreError:
-        return False
+    with suppress(StoreError):
+        return str(folder).endswith(digest(parsed(folder.read(MANIFEST) or "", folder)))
+    made_by = folder.read(MADE) or ""
+    run = made_by[:-8]
+    return bool(run) and made_by == mark(run) and str(folder).endswith(run)

@@ -33,18 +33,19 @@ _FOLDER = re.compile(
 _UNFINISHED = re.compile(r"(?:(?<=/)|^)\.([^/]+)\.[0-9a-f]{32}$"), re.compile(r"()\.[0-9a-f]{32}\.partial$")
 
 
-def drop(folder: Folder) -> None:
-    """Delete the tiles of a run in a folder, and the folder if it is then empty.
+def drop(folder: Folder) -> bool:
+    """Delete the tiles of a run in a folder, and the folder if it is then empty; return whether none are left.
 
     Nothing is deleted if there is no sign of a run.
     """
-    names = _names(folder)
-    if is_of_run(folder):
+    names, is_dropped = _names(folder), is_of_run(folder)
+    if is_dropped:
         # The manifest first, since the rest is invalid without it. The mark last, to recognise an unfinished removal.
         folder.delete(MANIFEST)
         folder.delete_all(names - {MANIFEST, MADE}, [*FOLDERS, ARRAYS])
         folder.delete(MADE)
     folder.delete_if_empty()
+    return is_dropped or not names
 
 
 def drop_earlier(folder: Folder | None, *, is_at_home: bool, overwrite: bool) -> None:

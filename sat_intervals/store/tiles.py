@@ -325,7 +325,7 @@ class Store:
         with self._damage_handled():
             yield from self._arrays.strips(rows, _checksums(records), first, last)
 
-    def check_intact(self, records: Records) -> None:
+    def keep(self, records: Records) -> None:
         """Compare the files of all tiles with their checksums, and restore the arrays' metadata; raises as `strips`."""
         with self._damage_handled():
             self._arrays.create()
@@ -349,10 +349,13 @@ class Store:
                 f"tiles {names} in {self.folder} are damaged: rerun the same command: it matches them again"
             ) from error
 
-    def remove(self) -> None:
-        """Delete the tiles of this run and no other files; those of another run may have taken their place."""
-        if (there := unsealed(self.folder.read(MANIFEST))) is None or digest(there) == self.run:
-            remove_tiles(self._marks, self.folder)
+    def remove(self) -> bool:
+        """Delete the tiles of this run and no other files; return whether none are left.
+
+        Those of another run may have taken their place.
+        """
+        there = unsealed(self.folder.read(MANIFEST))
+        return (there is None or digest(there) == self.run) and remove_tiles(self._marks, self.folder)
 
     def mark_finished(self, name: str, stamps: Sequence[str]) -> None:
         """Mark a run as finished, so that its tiles are removed even if it is killed before.
@@ -366,10 +369,11 @@ class Store:
         self._marks.delete(REPLACING)
 
 
-def remove_tiles(home: Folder, place: Folder) -> None:
-    """Delete a run's tiles in ``place``, and its marker files in ``home``."""
-    drop(place)
+def remove_tiles(home: Folder, place: Folder) -> bool:
+    """Delete a run's tiles in ``place``, and its marker files in ``home``; return whether no tiles are left."""
+    is_clean = drop(place)
     home.delete_all([name for name in home.sizes() if final_name(name) in (PLACE, REPLACING, FINISHED)])
+    return is_clean
 
 
 def has_begun(home: Path) -> bool:

@@ -320,6 +320,31 @@ def test_match__removes_tiles_that_a_death_left_beside_its_result(
     assert "already holds a run" in match(scene, out, *store, status=2)
 
 
+def test_match__does_not_say_that_it_removed_tiles_without_a_sign_of_a_run(scene, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "remove", dies)
+        match(scene, out, status=1)
+    for name in ("manifest.json", MARK):
+        (out / "tiles" / name).unlink()
+    tiles = contents(out / "tiles" / "arrays.zarr")
+    assert match(scene, out) == (
+        f"sat-intervals: files in {out}/tiles stay: they have no sign that they are of this run\n"
+        f"sat-intervals: the run in {out} was already complete\n"
+    )
+    assert contents(out / "tiles" / "arrays.zarr") == tiles
+
+
+@pytest.mark.parametrize("how", ["empty", "half", "gone"])
+def test_match__overwrites_tiles_in_a_store_whose_manifest_a_power_loss_damaged(scene, tmp_path, how):
+    out, store = tmp_path / "out", tmp_path / "store"
+    match(scene, out, "--store", store, "--keep-tiles")
+    (manifest,) = store.glob("*/manifest.json")
+    damage(manifest, how)
+    match(scene, out, "--overwrite", "--store", store, "--tile-size", "128")
+    assert not list(store.glob("*/records/*"))
+
+
 @pytest.mark.parametrize(
     ("name", "how"),
     [("intervals.tif", "half"), ("validity.tif", "bit"), *itertools.product(["run.json"], ["half", "bit", "empty"])],
