@@ -79,8 +79,7 @@ def plot(
     if pixel:
         drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
     check_unchanged = watched_images(results.images, judging["mask"])
-    there = stamps(out, [f"{name}.png" for name in PICTURES])
-    pictures: dict[Path, BytesIO] = {}
+    there, pictures = stamps(out, [f"{name}.png" for name in PICTURES]), dict[Path, BytesIO]()
     with results.unchanged("dsm.tif"):
         if _is_current(surface := out / "dsm.tif", results.report["finished"]):
             drawings["dsm"] = lambda target: draw_surface(surface, target, dpi)

@@ -2,6 +2,7 @@
 
 import os
 import stat
+from io import BufferedReader
 
 _KINDS = {
     stat.S_IFIFO: "a named pipe",
@@ -42,8 +43,24 @@ def check_regular(path: str | os.PathLike[str], way_out: str = "give a regular f
         Names the path, its kind and the way out.
     """
     try:
-        kind = _KINDS.get(stat.S_IFMT(os.stat(path).st_mode))
+        status = os.stat(path)
     except (OSError, ValueError):
         return
-    if kind:
+    _check_kind(path, status, way_out)
+
+
+def open_regular(path: str | os.PathLike[str]) -> BufferedReader:
+    """Open a file for reading; raise as `check_regular` also if something else takes its place meanwhile."""
+    check_regular(path)
+    stream = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    try:
+        _check_kind(path, os.fstat(stream.fileno()), "give a regular file")
+    except SatIntervalsError:
+        stream.close()
+        raise
+    return stream
+
+
+def _check_kind(path: str | os.PathLike[str], status: os.stat_result, way_out: str) -> None:
+    if kind := _KINDS.get(stat.S_IFMT(status.st_mode)):
         raise SatIntervalsError(f"{os.fspath(path)} is {kind}: {way_out}")

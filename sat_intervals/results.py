@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, NonNegativeInt, PositiveInt, ValidationError
 
 from sat_intervals.config import Config, Regularization, load_config
-from sat_intervals.errors import RunError, SatIntervalsError, check_regular
+from sat_intervals.errors import RunError, SatIntervalsError, open_regular
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import (
@@ -266,9 +266,9 @@ def open_run(out: str | Path) -> Run:
     out = Path(out)
     file = out / "run.json"
     try:
-        check_regular(file)
         which = _which(out)
-        text = file.read_text(encoding="utf-8")
+        with open_regular(file) as stream:
+            text = stream.read().decode()
         report = json.loads(text, parse_int=_integer)
         if report.pop(SEAL, None) is not None and unsealed(text) is None:
             raise SatIntervalsError("it is damaged or was changed: restore it, or move it away and match again")

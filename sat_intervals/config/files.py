@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from sat_intervals.config.sections import ConfigError
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError, open_regular
 
 # Largest size in bytes of a file of settings or pairs, and of a CSV file of pairs; YAML nodes of a file of settings,
 # aliases expanded.
@@ -73,8 +73,7 @@ def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:
     SatIntervalsError
         The file is larger, or not a regular file.
     """
-    check_regular(file)
-    with file.open("rb") as stream:
+    with open_regular(file) as stream:
         content = stream.read(most + 1)
     if len(content) > most:
         raise SatIntervalsError(f"{file} has more than {most // 10**6} MB: is it the right file?")

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
 from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
 from sat_intervals.raster import (
     Georeferencing,
@@ -187,8 +187,7 @@ def _is_of_run(picture: Path, finished: str) -> bool:
 
 
 def _file(path: Path) -> dict[str, Any]:
-    check_regular(path)
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {"href": f"./{path.name}", "file:size": path.stat().st_size, "file:checksum": _SHA256 + digest}
 

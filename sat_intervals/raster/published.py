@@ -4,7 +4,7 @@ import json
 from operator import index
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.layers import read_alone
@@ -32,12 +32,14 @@ def check_points(out: Path) -> None:
 def published_points(out: Path) -> dict[str, int] | None:
     """Return size and CRC-32 of ``points.tif`` from ``points.json``; None if that is missing."""
     file = out / POINTS_REPORT
-    check_regular(file)
     try:
-        known = json.loads(file.read_text(encoding="utf-8"))["files"][POINTS_FILE]
+        with open_regular(file) as stream:
+            known = json.loads(stream.read().decode())["files"][POINTS_FILE]
         return {key: index(known[key]) for key in ("bytes", "crc32")}
     except FileNotFoundError:
         return None
+    except SatIntervalsError:
+        raise
     except OSError as error:
         raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: move it away") from error
     except (ValueError, LookupError, TypeError, RecursionError) as error:

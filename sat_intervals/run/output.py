@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
 from sat_intervals.raster import RUN_FILES, is_marked, restore, stamps
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.seal import check_place
 from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.store.marks import finished_run, is_replacing
-from sat_intervals.store.tiles import has_begun
+from sat_intervals.store.removal import has_begun
 
 OUTPUTS = (*(file.name for file in RUN_FILES), "run.json")
 
@@ -82,7 +82,8 @@ def _is_of_run(file: Path, published: dict[str, Any] | None) -> bool:
 def _published(file: Path) -> dict[str, Any] | None:
     """Return sizes and checksums of rasters from a run's report; empty if there is no report, None if it is none."""
     try:
-        text = file.read_text(encoding="utf-8")
+        with open_regular(file) as stream:
+            text = stream.read().decode()
         report = (unsealed(text) if SEAL in json.loads(text) else json.loads(text)) or {}
         return dict(report.get("files", {})) if {"settings", "inputs", "tiles"} <= report.keys() else None
     except FileNotFoundError:

@@ -17,7 +17,7 @@ from glob import escape
 from itertools import groupby
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.store.open_folder import empty, opened
 
 # File with the `mark` of the run that made a folder. Its name outlasts a power loss, which empties files.
@@ -67,9 +67,9 @@ class LocalFolder:
 
     def read_bytes(self, name: str) -> bytes | None:
         """See `Folder`."""
-        check_regular(self.path / name)
         try:
-            return (self.path / name).read_bytes()
+            with open_regular(self.path / name) as file:
+                return file.read()
         except FileNotFoundError:
             return None
 
@@ -78,9 +78,8 @@ class LocalFolder:
         return [self._part(*part) for part in parts]
 
     def _part(self, name: str, start: int, stop: int) -> bytes | None:
-        check_regular(self.path / name)
         try:
-            with (self.path / name).open("rb") as file:
+            with open_regular(self.path / name) as file:
                 file.seek(start)
                 return file.read(stop - start)
         except FileNotFoundError:
@@ -91,8 +90,9 @@ class LocalFolder:
         names: list[str] = []
         with suppress(FileNotFoundError, NotADirectoryError):
             names = os.listdir(self.path / folder)
-        files = [self.path / folder / name for name in names if name.endswith(".json") and not name.startswith(".")]
-        return {file.stem: file.read_text(errors="replace") for file in files if file.is_file()}
+        files = [Path(folder) / name for name in names if name.endswith(".json") and not name.startswith(".")]
+        texts = {file.stem: self.read(str(file)) for file in files if (self.path / file).is_file()}
+        return {name: text for name, text in texts.items() if text is not None}
 
     def sizes(self) -> dict[str, int]:
         """See `Folder`."""

@@ -3,10 +3,11 @@
 import errno
 import re
 from contextlib import suppress
+from pathlib import Path
 
-from sat_intervals.store.folder import MADE, Folder
+from sat_intervals.store.folder import MADE, Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed
-from sat_intervals.store.place import is_own
+from sat_intervals.store.place import PLACE, is_own
 
 # Errors that mean that a link or another folder took the place of one.
 REPLACED = errno.ELOOP, errno.ESTALE
@@ -135,3 +136,8 @@ def is_of_run(folder: Folder) -> bool:
     with suppress(StoreError):
         return {"layout", "kernels"} <= parsed(folder.read(MANIFEST) or "", folder).keys()
     return False
+
+
+def has_begun(home: Path) -> bool:
+    """Return whether a run made this folder of tiles; a user's folder may have the same name."""
+    return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None

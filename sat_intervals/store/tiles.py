@@ -36,7 +36,6 @@ from sat_intervals.store.removal import (
     drop,
     drop_earlier,
     final_name,
-    is_of_run,
 )
 from sat_intervals.store.steps import Steps
 from sat_intervals.store.zarr_arrays import STORED_BYTES, Checksums, DamagedFileError, TileArrays
@@ -354,8 +353,8 @@ class Store:
 
         Those of another run may have taken their place.
         """
-        there = unsealed(self.folder.read(MANIFEST))
-        return (there is None or digest(there) == self.run) and remove_tiles(self._marks, self.folder)
+        is_own = (there := unsealed(self.folder.read(MANIFEST))) is None or digest(there) == self.run
+        return is_own and remove_tiles(self._marks, self.folder)
 
     def mark_finished(self, name: str, stamps: Sequence[str]) -> None:
         """Mark a run as finished, so that its tiles are removed even if it is killed before.
@@ -371,14 +370,9 @@ class Store:
 
 def remove_tiles(home: Folder, place: Folder) -> bool:
     """Delete a run's tiles in ``place``, and its marker files in ``home``; return whether no tiles are left."""
-    is_clean = drop(place)
+    is_gone = drop(place)
     home.delete_all([name for name in home.sizes() if final_name(name) in (PLACE, REPLACING, FINISHED)])
-    return is_clean
-
-
-def has_begun(home: Path) -> bool:
-    """Return whether a run made this folder of tiles; a user's folder may have the same name."""
-    return is_of_run(folder_at(home)) or folder_at(home).read(PLACE) is not None
+    return is_gone
 
 
 def _checksums(records: Records) -> Checksums:

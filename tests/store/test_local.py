@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import pytest
 from helpers import contents
 
+from sat_intervals import errors
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store.local import LocalFolder
 
@@ -50,6 +51,21 @@ def test_read_all__of_a_folder_that_cannot_be_listed_is_not_nothing(tmp_path, mo
 
 def denied(place):
     raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(place))
+
+
+@pytest.mark.parametrize("read", [lambda folder: folder.read("a.json"), lambda folder: folder.read_all("")])
+def test_read__of_a_file_whose_place_a_pipe_takes_does_not_wait_for_a_writer(tmp_path, monkeypatch, read):
+    check = errors.check_regular
+
+    def late(path, *way_out):
+        check(path, *way_out)
+        path.unlink()
+        os.mkfifo(path)
+
+    (tmp_path / "a.json").touch()
+    monkeypatch.setattr(errors, "check_regular", late)
+    with pytest.raises(SatIntervalsError, match=r"a\.json is a named pipe: give a regular file"):
+        read(LocalFolder(tmp_path))
 
 
 def test_a_folder_that_was_deleted_has_no_files(tmp_path):
