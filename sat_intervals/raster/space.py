@@ -10,6 +10,8 @@ from sat_intervals.raster.files import File
 from sat_intervals.raster.publishing import OutputError
 
 WAY_OUT = "free disk space or choose another folder"
+# Errors of the path: more space does not help.
+_OF_PATH = FileExistsError, NotADirectoryError, FileNotFoundError, PermissionError
 # Bytes of compressed pixels in those of the pixels, at most: noisy bands take a quarter, see `blocks`.
 _SHARE = 0.5
 
@@ -45,3 +47,8 @@ def check_space(folder: Path, needed: int, what: str) -> None:
 
 def _size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB"
+
+
+def way_out(error: Exception) -> str:
+    """Return what to do about an error of writing."""
+    return "choose another folder" if isinstance(error, _OF_PATH) else WAY_OUT

@@ -26,7 +26,7 @@ from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
 from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, flush, pinned, publish, put_back, stamps
 from sat_intervals.raster.seal import check_place
-from sat_intervals.raster.space import WAY_OUT, check_space, file_bytes
+from sat_intervals.raster.space import check_space, file_bytes, way_out
 from sat_intervals.raster.streaming import Stream
 from sat_intervals.store.folder import LocalFolder
 
@@ -287,7 +287,7 @@ class OutputWriter:
         try:
             yield
         except (*gdal.GDAL_ERRORS, OSError) as error:
-            why = f"{self._reason(error)}: {WAY_OUT}"
+            why = f"{self._reason(error)}: {way_out(error)}"
             if gdal.is_out_of_memory(error):
                 why = f"not enough memory ({gdal.reason(error)}): give the process more memory"
             raise OutputError(f"{path} cannot be written: {why}") from error

@@ -10,7 +10,12 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed
 from sat_intervals.store.place import PLACE, is_own
 
 # Errors that mean that a link or another folder took the place of one.
-REPLACED = errno.ELOOP, errno.ESTALE
+_REPLACED = errno.ELOOP, errno.ESTALE
+# What to do where a store on a server does not answer.
+_ON_SERVER = (
+    "check the URL, the credentials, and whether the package of its file system is installed (pip install "
+    "'sat-intervals[remote]' for s3://)"
+)
 
 ARRAYS, RECORDS, FAILURES = "arrays.zarr", "records", "failures"
 BORDERS, PIXELS, COSTS, PARTS = "borders", "pixels", "costs", "parts"
@@ -67,8 +72,15 @@ def drop_earlier(folder: Folder | None, *, is_at_home: bool, overwrite: bool) ->
     try:
         drop(folder)
     except OSError as error:
-        way_out = "move it away" if error.errno in REPLACED else "check its rights"
-        raise StoreError(f"{folder} cannot be removed: {error.strerror or error}: {way_out}") from error
+        raise unusable(folder, error, "removed") from error
+
+
+def unusable(folder: Folder, error: OSError, how: str) -> StoreError:
+    """Return the error for a folder of tiles that cannot be ``how``, such as "used", with the way out."""
+    way_out = "move it away" if error.errno in _REPLACED else "make room, check its rights or choose another folder"
+    if "://" in str(folder):
+        way_out = _ON_SERVER
+    return StoreError(f"{folder} cannot be {how}: {error.strerror or error}: {way_out}")
 
 
 def check_not_foreign(folder: Folder) -> None:

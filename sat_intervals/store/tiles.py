@@ -30,12 +30,12 @@ from sat_intervals.store.removal import (
     FOLDERS,
     NORMALIZATION,
     RECORDS,
-    REPLACED,
     SEARCH,
     check_not_foreign,
     drop,
     drop_earlier,
     final_name,
+    unusable,
 )
 from sat_intervals.store.steps import Steps
 from sat_intervals.store.zarr_arrays import STORED_BYTES, Checksums, DamagedFileError, TileArrays
@@ -43,12 +43,6 @@ from sat_intervals.tiling import Grid, Tile
 
 Records = Mapping[str, Mapping[str, Any]]
 """Records of tiles, by name."""
-
-# What to do where a store does not answer.
-_WAY_OUT = (
-    "check the path or URL, the credentials, and whether the package of its file system is installed (pip install "
-    "'sat-intervals[remote]' for s3://)"
-)
 
 # Increase when arrays or records change: older tiles cannot be resumed.
 LAYOUT = 12
@@ -178,8 +172,7 @@ class Store:
             if not folder.create(MANIFEST, sealed(manifest)):
                 self.check(manifest)
         except OSError as error:
-            way_out = "move it away" if error.errno in REPLACED else _WAY_OUT
-            raise StoreError(f"{folder} cannot be used: {error.strerror or error}: {way_out}") from error
+            raise unusable(folder, error, "used") from error
 
     def _place_before(self, overwrite: bool) -> Folder | None:
         """Return the folder of the earlier run's tiles; with ``overwrite``, None if they must be kept."""

@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
-from helpers import COMMAND, invoke
+from finished import random_bands, write_run
+from helpers import COMMAND, invoke, refused
 from rasterio._err import CPLE_OutOfMemoryError
 
 from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
@@ -317,3 +318,15 @@ def test_evaluate_surface__refuses_a_reference_in_feet(tmp_path, crs, unit):
         dataset.units = (unit,) if unit else dataset.units
     with pytest.raises(SatIntervalsError, match=r"reference.tif has heights in (ft|US survey foot): convert them to m"):
         evaluate_surface(dsm(tmp_path / "dsm.tif", "above egm96.gtx"), reference)
+
+
+# ---- Folders -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("place", ["file", "file/in"])
+def test_folders__that_are_files_are_named_with_a_way_out_that_helps(tmp_path, place):
+    out, folder = write_run(tmp_path, *random_bands(20, 30)[:2]), tmp_path / place
+    (tmp_path / "file").touch()
+    reason = "File exists" if place == "file" else "Not a directory"
+    refused(["export", out, "--to", "otb", folder], f"{folder} cannot be written: {reason}: choose another folder\n")
+    pair = [write(tmp_path / name, np.arange(6400, dtype="uint16").reshape(64, 100)) for name in ("l.tif", "r.tif")]
+    command = ["match", *pair, tmp_path / "new", "--disparity", "0", "4", "--store", folder]
+    refused(command, f"{folder}/", "cannot be used: Not a directory: make room, check its rights or choose another")

@@ -536,7 +536,7 @@ def test_match__ends_before_its_work_where_tiles_of_the_earlier_run_cannot_be_re
 
     with monkeypatch.context() as patch:
         patch.setattr(removal, "drop", denied)
-        assert f"{out}/tiles cannot be removed: Permission denied: check its rights" in match(
+        assert f"{out}/tiles cannot be removed: Permission denied: make room, check its rights or" in match(
             scene, out, *words, status=2
         )
     match(scene, out, *words)
