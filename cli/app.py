@@ -168,6 +168,8 @@ def _explained(error: Exception) -> tuple[int, str]:
         return FAILED, f"{line}: set NUMBA_CACHE_DIR to a folder that can be written"
     if isinstance(error, RuntimeError) and line.startswith("Symlink loop"):
         return USER_ERROR, f"{line}: it is a link to itself, choose another path"
+    if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
+        return USER_ERROR, "a folder, perhaps the working directory, has a name that is not UTF-8: rename it"
     if isinstance(error, ValueError) and line.startswith("A dask config file"):
         return USER_ERROR, f"{line}: fix it, or set DASK_CONFIG to another"
     return FAILED, f"{type(error).__name__}: {line} (this should not happen; --debug shows where)"

@@ -321,6 +321,18 @@ def test_evaluate_surface__refuses_a_reference_in_feet(tmp_path, crs, unit):
 
 
 # ---- Folders -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("command", ["plan", "match"])
+def test_folders__names_in_no_encoding_are_named(tmp_path, monkeypatch, command):
+    """Arguments are refused before; paths of the working directory and behind links come to the files only later."""
+    (tmp_path / "plain").mkdir()
+    for name in ("l.tif", "r.tif"):
+        write(tmp_path / "plain" / name, np.arange(6400, dtype="uint16").reshape(64, 100))
+    monkeypatch.chdir((tmp_path / "plain").rename(tmp_path / os.fsdecode(b"caf\xe9")))
+    pair = ["l.tif", "r.tif", *(["new"] if command == "match" else []), "--disparity", "0", "4"]
+    said = "a folder, perhaps the working directory, has a name that is not UTF-8: rename it"
+    refused([command, *pair], said)
+
+
 @pytest.mark.parametrize("place", ["file", "file/in"])
 def test_folders__that_are_files_are_named_with_a_way_out_that_helps(tmp_path, place):
     out, folder = write_run(tmp_path, *random_bands(20, 30)[:2]), tmp_path / place
