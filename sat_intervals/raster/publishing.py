@@ -121,6 +121,8 @@ def publish(
                 rename_new(finished / name, folder / name)
         if stamps(folder, compared) != compared:
             raise OutputError(f"another program changed temporary files in {folder}: rerun the command")
+        with failing(folder):
+            _flush_names(folder)
     except BaseException:
         for name in names:
             with suppress(OSError):
@@ -204,6 +206,18 @@ def _exchange(new: Path, place: Path) -> None:
     rename = getattr(ctypes.CDLL(None), "renameat2", None)
     if rename is None or rename(_HERE, os.fsencode(new), _HERE, os.fsencode(place), _EXCHANGE):
         os.replace(new, place)
+
+
+def _flush_names(folder: Path) -> None:
+    """Flush new names in a folder to the disk, before what they replace is deleted: a power loss could take both."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # of file systems that flush no folders
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def flush(path: Path) -> None:

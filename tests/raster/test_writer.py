@@ -1,8 +1,10 @@
 """The writer of a run's files replaces none of the user's, and publishes none that is not its own."""
 
+import errno
 import os
 import shutil
-from contextlib import suppress
+import stat
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +113,34 @@ def test_output_writer__deletes_nothing_in_a_folder_that_took_the_place_of_its_o
         assert (place / names[inner]).read_text() == "mine"
         shutil.rmtree(hidden)
         shutil.rmtree(tmp_path / "moved")
+
+
+@pytest.mark.parametrize("error", [None, errno.EINVAL, errno.EIO])
+def test_output_writer__names_are_on_the_disk_before_replaced_files_are_deleted(tmp_path, monkeypatch, error):
+    """Else a power loss could take both; some file systems flush no folders."""
+    rasters = np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16)
+    with writer(tmp_path) as output:
+        written(output, *rasters)
+    before, flushed = contents(tmp_path), []
+
+    def fsync(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            replaced = os.listdir(tmp_path / ".unpublished-intervals.tif" / "files" / "replaced")
+            flushed.append((sorted(os.listdir(descriptor)), sorted(replaced)))
+            if error:
+                raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with (
+        pytest.raises(OutputError, match="cannot be written: Input/output error")
+        if error == errno.EIO
+        else nullcontext(),
+        writer(tmp_path) as output,
+    ):
+        written(output, rasters[0] + 1, rasters[1])
+    names = ["intervals.tif", "run.json", "validity.tif"]
+    assert flushed == [([".unpublished-intervals.tif", *names], names)]
+    assert (contents(tmp_path) == before) == (error == errno.EIO)
 
 
 def written(output, *rasters):
