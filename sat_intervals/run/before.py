@@ -15,7 +15,7 @@ from sat_intervals.run.workers import reason
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.marks import finished_run
-from sat_intervals.store.place import is_own, place_of
+from sat_intervals.store.place import place_of, run_of
 from sat_intervals.store.tiles import remove_tiles
 from sat_intervals.tiling import Window
 
@@ -51,9 +51,10 @@ def tidy(folder: Path, keep_tiles: bool, store: str | None) -> None:
         return
     try:
         place = place_of(home, store)
-        if place == LocalFolder(home.absolute()) or is_own(place):
+        is_at_home, run = place == LocalFolder(home.absolute()), run_of(place)
+        if is_at_home or run:
             with LocalFolder(home).locked():
                 check_as_published(folder)
-                remove_tiles(LocalFolder(home), place)
+                remove_tiles(LocalFolder(home), place if is_at_home else place.of_run(run))
     except (StoreError, OSError) as error:  # the run is complete
         _LOG.warning("the tiles of the complete run stay: %s", reason(error))

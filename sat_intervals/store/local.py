@@ -18,7 +18,7 @@ from itertools import groupby
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, open_regular
-from sat_intervals.store.open_folder import empty, opened
+from sat_intervals.store.open_folder import empty, opened, read_small, write_new
 
 # File with the `mark` of the run that made a folder. Its name outlasts a power loss, which empties files.
 MADE = ".sat-intervals.tiles"
@@ -38,9 +38,8 @@ _LOCKED: dict[Path, os.stat_result] = {}
 class LocalFolder:
     """See `Folder`. Files are renamed when complete; runs exclude each other with ``flock``.
 
-    Nothing is written or deleted behind a link that is the folder or in it, nor in the folder of another run that took
-    its place, nor in any that took the place of one that this process has locked: files there are those of somebody
-    else.
+    Nothing is written or deleted behind a link that is the folder or in it, in a folder without the mark of the run, or
+    in one that took the place of one that this process has locked: files there are those of somebody else.
 
     Attributes
     ----------
@@ -109,61 +108,72 @@ class LocalFolder:
 
     def write_bytes(self, name: str, content: bytes) -> None:
         """See `Folder`."""
-        with self._written(name, content) as (temporary, file):
-            os.replace(temporary, file)
+        with self._written(name, content) as (folder, temporary, file):
+            os.replace(temporary, file, src_dir_fd=folder, dst_dir_fd=folder)
 
     def create(self, name: str, text: str) -> bool:
         """See `Folder`."""
-        with self._written(name, text.encode()) as (temporary, file):
+        with self._written(name, text.encode()) as (folder, temporary, file):
             try:
-                os.link(temporary, file)
+                os.link(temporary, file, src_dir_fd=folder, dst_dir_fd=folder)
             except FileExistsError:
                 return False
             except OSError:  # a file system without hard links
-                if file.exists():
+                if (self.path / name).exists():
                     return False
-                os.replace(temporary, file)
+                os.replace(temporary, file, src_dir_fd=folder, dst_dir_fd=folder)
         return True
 
     @contextmanager
-    def _written(self, name: str, content: bytes) -> Iterator[tuple[Path, Path]]:
-        """Write a temporary file, deleted after the block; yield it and the final path."""
-        file = self._own(name)
-        temporary = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
+    def _written(self, name: str, content: bytes) -> Iterator[tuple[int, str, str]]:
+        """Write a temporary file, deleted after the block; yield as `_entered`, with its name before the final one."""
         try:
-            with temporary.open("xb") as stream:
-                stream.write(content)
-            yield temporary, file
+            with self._entered(name) as (folder, file):
+                temporary = os.path.join(os.path.dirname(file), f".{os.path.basename(file)}.{uuid.uuid4().hex}")
+                try:
+                    write_new(temporary, content, folder)
+                    yield folder, temporary, file
+                finally:
+                    with suppress(FileNotFoundError):
+                        os.unlink(temporary, dir_fd=folder)
         except OSError as error:
-            raise OSError(error.errno, error.strerror, str(file)) from error
-        finally:
-            temporary.unlink(missing_ok=True)
+            raise OSError(error.errno, error.strerror, str(self.path / name)) from error
 
     def delete(self, name: str) -> None:
         """See `Folder`."""
-        place, top = self._own(name), self._top
-        with suppress(FileNotFoundError), opened(top) as folder:
-            _check_locked(top, os.fstat(folder))
-            os.unlink(place.relative_to(top), dir_fd=folder)
+        with suppress(FileNotFoundError), self._entered(name) as (folder, file):
+            os.unlink(file, dir_fd=folder)
 
     @property
     def _top(self) -> Path:
         """Return the folder of the store."""
         return (self.path, *self.path.parents)[self.depth]
 
+    @contextmanager
+    def _entered(self, name: str) -> Iterator[tuple[int, str]]:
+        """Open the folder of the store; yield it, and a name in it. Raise if what is changed would be somebody else's.
+
+        What takes the place of the folder meanwhile is not changed.
+        """
+        place, top = self.path / name, self._top
+        for above in place.parents[: self.depth + len(Path(name).parts)]:
+            if above.is_symlink():
+                raise OSError(errno.ELOOP, f"{above} has become a symbolic link", str(place))
+        with opened(top) as folder:
+            if (locked := _LOCKED.get(top.absolute())) and not os.path.samestat(locked, os.fstat(folder)):
+                raise OSError(errno.ESTALE, f"{top} has been replaced by another folder", str(place))
+            made_by = read_small(MADE, folder) if self.run else mark(self.run)
+            if made_by is None and name != MADE:
+                raise OSError(errno.ESTALE, f"{top} has been replaced by a folder that no run made", str(place))
+            if made_by and made_by != mark(self.run) and made_by == mark(made_by[:-8]):  # otherwise it is damaged
+                raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
+            yield folder, str(place.relative_to(top))
+
     def _own(self, name: str) -> Path:
-        """Return the path of what is written or deleted; raise if that would be somebody else's."""
-        place = self.path / name
-        for folder in place.parents[: self.depth + len(Path(name).parts)]:
-            if folder.is_symlink():
-                raise OSError(errno.ELOOP, f"{folder} has become a symbolic link", str(place))
-        top = self._top
-        with suppress(FileNotFoundError):
-            _check_locked(top, top.stat())
-        made_by = LocalFolder(top).read(MADE) if self.run else None
-        if made_by and made_by != mark(self.run) and made_by == mark(made_by[:-8]):  # otherwise it is damaged
-            raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
-        return place
+        """Return the path of a folder that is made or deleted; raise if it would be somebody else's."""
+        with suppress(FileNotFoundError), self._entered(name):
+            pass
+        return self.path / name
 
     def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
         """See `Folder`."""
@@ -316,12 +326,6 @@ def _raise_unless_missing(error: OSError) -> None:
     """Raise, since files of a folder that cannot be listed are not missing; it may have been deleted meanwhile."""
     if not isinstance(error, (FileNotFoundError, NotADirectoryError)):
         raise error
-
-
-def _check_locked(folder: Path, status: os.stat_result) -> None:
-    """Raise if this process has locked a folder of this path, and it is another one."""
-    if (locked := _LOCKED.get(folder.absolute())) and not os.path.samestat(locked, status):
-        raise OSError(errno.ESTALE, f"{folder} has been replaced by another folder", str(folder))
 
 
 def mark(run: str) -> str:

@@ -1,8 +1,10 @@
-"""Delete in open folders, so that nothing that takes the place of one meanwhile is lost."""
+"""Write and delete in open folders, so that nothing that takes the place of one meanwhile is lost."""
 
+import errno
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,6 +20,26 @@ def opened(folder: Path) -> Iterator[int]:
         yield descriptor
     finally:
         os.close(descriptor)
+
+
+def write_new(name: str, content: bytes, folder: int) -> None:
+    """Write a new file in an open folder."""
+    with open(name, "xb", opener=lambda path, flags: os.open(path, flags, 0o666, dir_fd=folder)) as stream:
+        stream.write(content)
+
+
+def read_small(name: str, folder: int) -> str | None:
+    """Read the beginning of a file in an open folder; None if there is no regular file."""
+    try:
+        file = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.ELOOP, errno.ENXIO):
+            return None
+        raise
+    try:
+        return os.read(file, 1024).decode(errors="replace") if stat.S_ISREG(os.fstat(file).st_mode) else None
+    finally:
+        os.close(file)
 
 
 def empty(folder: int, name: str, pattern: str) -> None:

@@ -56,14 +56,14 @@ def place_of(home: Path, store: str | None) -> Folder:
     return folder_at(place)
 
 
-def is_own(folder: Folder) -> bool:
-    """Return whether a run made a folder of a store: its name ends with the digest of its manifest.
+def run_of(folder: Folder) -> str:
+    """Return the run that made a folder of a store: the digest of its manifest, with which its name ends; "" if none.
 
     Without a manifest that can be read, the mark of the folder has that digest: a removal deletes the manifest first,
     and a power loss may empty it.
     """
-    with suppress(StoreError):
-        return str(folder).endswith(digest(parsed(folder.read(MANIFEST) or "", folder)))
     made_by = folder.read(MADE) or ""
-    run = made_by[:-8]
-    return bool(run) and made_by == mark(run) and str(folder).endswith(run)
+    run = made_by[:-8] if made_by == mark(made_by[:-8]) else ""
+    with suppress(StoreError):
+        run = digest(parsed(folder.read(MANIFEST) or "", folder))
+    return run if str(folder).endswith(run) else ""

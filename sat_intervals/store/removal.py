@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sat_intervals.store.folder import MADE, Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed
-from sat_intervals.store.place import PLACE, is_own
+from sat_intervals.store.place import PLACE, run_of
 
 # Errors that mean that a link or another folder took the place of one.
 _REPLACED = errno.ELOOP, errno.ESTALE
@@ -66,8 +66,8 @@ def drop_earlier(folder: Folder | None, *, is_at_home: bool, overwrite: bool) ->
         return
     if not is_at_home:
         with suppress(OSError):
-            if overwrite and is_own(folder):
-                drop(folder)
+            if overwrite and (run := run_of(folder)):
+                drop(folder.of_run(run))
         return
     try:
         drop(folder)

@@ -100,8 +100,8 @@ class Store:
 
     @property
     def _marks(self) -> Folder:
-        """Return the folder of the marker files."""
-        return folder_at(self.home).of_run(self.run)
+        """Return the folder of the marker files, which is locked during a run."""
+        return folder_at(self.home) if self.elsewhere else self.folder
 
     @property
     def _arrays(self) -> TileArrays:
@@ -153,9 +153,9 @@ class Store:
             self._place.make("")  # fails before anything is deleted
             drop_earlier(None if text else before, is_at_home=before == home, overwrite=overwrite)
             if overwrite or (text is None and not self.elsewhere):
-                drop(self._place)
+                drop(folder if self.elsewhere else home)
             self._place.make("")
-            self._place.write(MADE, mark(self.run))
+            folder.write(MADE, mark(self.run))
             if folder.read(MANIFEST) == "":  # after a power loss
                 folder.delete(MANIFEST)
             for name in FOLDERS:
@@ -347,7 +347,7 @@ class Store:
         Those of another run may have taken their place.
         """
         is_own = (there := unsealed(self.folder.read(MANIFEST))) is None or digest(there) == self.run
-        return is_own and remove_tiles(self._marks, self.folder)
+        return is_own and remove_tiles(folder_at(self.home), self.folder)
 
     def mark_finished(self, name: str, stamps: Sequence[str]) -> None:
         """Mark a run as finished, so that its tiles are removed even if it is killed before.

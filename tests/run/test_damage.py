@@ -28,8 +28,9 @@ from sat_intervals.run.assemble import assemble
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.tile import match_block
-from sat_intervals.store import removal
+from sat_intervals.store import local, removal
 from sat_intervals.store.local import MADE, LocalFolder, mark
+from sat_intervals.store.removal import drop
 from sat_intervals.store.tiles import DamagedTilesError, Store
 
 SHARDS = ["arrays.zarr/int16/c/0/1/0", "arrays.zarr/uint32/c/0/1/0", "arrays.zarr/right/c/1/0"]
@@ -455,6 +456,74 @@ def test_match_block__keeps_files_behind_a_folder_that_becomes_a_link(scene, tmp
             delete()
     assert_kept(mine)
     assert {file for file in user.rglob("*") if file.is_file()} == set(mine)
+
+
+def unmarked(another, tmp_path):
+    """A folder of the user's with names of a run's files."""
+    of_tile = [name.replace("/1/0", "/0/0") for name in (*SHARDS, *CHUNKS)]
+    with_files(tmp_path / "mine", [*of_tile, "records/0_0.json", "normalization.json", "range.json"])
+    return tmp_path / "mine"
+
+
+def marked(another, tmp_path):
+    """The tiles of another run."""
+    return another.store.home
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+@pytest.mark.parametrize("taken_by", [unmarked, marked])
+def test_store__changes_nothing_in_a_folder_that_takes_the_place_of_its_own(scene, tmp_path, elsewhere, taken_by):
+    """Also in a worker, which has no lock; a store elsewhere has none either."""
+    job = begun(scene, tmp_path / "out", cluster={"store": str(tmp_path / "store") if elsewhere else None})
+    another = begun(scene, tmp_path / "another", sgm={"p1": 9})
+    first, *_ = job.store.grid
+    match_block(another, first)
+    place = Path(str(job.store.folder))
+    place.rename(tmp_path / "moved")
+    there = taken_by(another, tmp_path).rename(place)
+    mine = contents(there)
+    writes = [
+        lambda: match_block(job, first),
+        lambda: job.store.write_record(first, {"files": {}}),
+        lambda: job.store.write_normalization({}),
+        lambda: job.store.write_search({}, ""),
+        lambda: job.store.steps.write("pixels", "0_0", np.zeros(1)),
+        lambda: job.parts().begin(),
+        lambda: job.store._arrays.drop(first),
+        lambda: drop(job.store.folder),
+    ]
+    for write in writes:
+        with suppress(OSError, SatIntervalsError):
+            write()
+        assert contents(there) == mine
+
+
+@pytest.mark.parametrize("moment", ["opened", "written"])
+@pytest.mark.parametrize("name", [MARK, "manifest.json", "records/0_0.json"])
+def test_write__changes_nothing_in_a_folder_that_takes_the_place_of_an_open_one(tmp_path, monkeypatch, moment, name):
+    for folder in ("own", "mine"):
+        with_files(tmp_path / folder, ["manifest.json", "records/0_0.json"])
+        (tmp_path / folder / MARK).write_text(mark(folder))
+    mine = contents(tmp_path / "mine")
+    write_new = local.write_new
+
+    def exchange():
+        (tmp_path / "own").rename(tmp_path / "moved")
+        (tmp_path / "mine").rename(tmp_path / "own")
+
+    def late(*arguments):
+        if moment == "opened":
+            exchange()
+        write_new(*arguments)
+        if moment == "written":
+            exchange()
+
+    monkeypatch.setattr(local, "write_new", late)
+    LocalFolder(tmp_path / "own").of_run("own").write(name, "new")
+    assert {
+        tmp_path / "mine" / file.relative_to(tmp_path / "own"): c for file, c in contents(tmp_path / "own").items()
+    } == mine
+    assert (tmp_path / "moved" / name).read_text() == "new"
 
 
 def test_match_block__keeps_the_tiles_of_another_run_that_take_the_place_of_its_own(scene, tmp_path):

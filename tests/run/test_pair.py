@@ -338,7 +338,7 @@ def test_digest__tells_what_differences_tell(tmp_path):
 
 @pytest.mark.parametrize("links", [True, False])
 def test_create__writes_a_file_once(tmp_path, monkeypatch, links):
-    def refuse(*places):
+    def refuse(*places, **folders):
         raise PermissionError(errno.EPERM, "no links here")
 
     if not links:

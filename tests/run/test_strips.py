@@ -314,6 +314,7 @@ def test_strip_bytes__bounds_what_writing_a_strip_takes(tmp_path, compression):
     rasters = noise.astype(np.float32) / 8, noise[:1].astype(np.uint16)
     bands = sum(raster.nbytes for raster in rasters)
     del noise
+    job.begin()
     parts = job.parts()
     parts.folder.make("parts")
     tracemalloc.start()
