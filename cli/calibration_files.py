@@ -10,16 +10,20 @@ def checked_folder(output: Path, head: str) -> Path:
 
     A file is replaced only if the first line of its explanation is that of ``head``, so that it is of the same kind.
     """
-    from sat_intervals.errors import SatIntervalsError, check_regular
+    from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
 
     folder = output.absolute().parent
     if output.is_dir() or not os.access(folder, os.W_OK):
         raise SatIntervalsError(f"{output} cannot be written: give --output a file in an existing folder")
     check_regular(output, "move it away")
-    if output.exists() and output.read_bytes().partition(b"\n")[0] != head.partition("\n")[0].encode():
-        raise SatIntervalsError(
-            f"{output} exists and was not made by sat-intervals calibrate, or holds something else: move it away"
-        )
+    if output.exists():
+        mark = (head.partition("\n")[0] + "\n").encode()
+        with open_regular(output) as stream:
+            is_ours = stream.read(len(mark)) == mark  # the file may be of any size
+        if not is_ours:
+            raise SatIntervalsError(
+                f"{output} exists and was not made by sat-intervals calibrate, or holds something else: move it away"
+            )
     return folder
 
 

@@ -1,6 +1,7 @@
 """Calibrations of surface models in metres, from heights made up with a known error."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -182,6 +183,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
     geoid = write_raster(tmp_path / "geoid.tif", [height - 47.5])
     away = write_raster(tmp_path / "away.tif", [height], Affine(1, 0, 5, 0, -1, 5))
     (tmp_path / "mine.yaml").write_text("mine: 1\n")
+    os.truncate(tmp_path / "mine.yaml", 1 << 40)  # only its beginning is read
     given = ["--dsm", model, "--reference", reference]
     (tmp_path / "levels.yaml").write_text(
         "# Calibration: levels of the cost curve that reach a coverage, found by sat-i"
