@@ -42,7 +42,7 @@ bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
 
 # Hostile use at random moments for an hour, or MINUTES=5: prints what it finds and keeps it in build/hostile.
-hostile: $(VENV)/.has-dsm,test
+hostile: $(VENV)/.has-dsm,plot,test
 	rm -rf build/hostile
 	mkdir -p build
 	$(BIN)/python tests/hostile.py build/hostile --minutes $(MINUTES) --seed $(SEED)

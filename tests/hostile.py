@@ -6,7 +6,7 @@ A trial runs a command in a child of this process. The child counts its calls to
 audit hook of Python, and disturbs itself at random ones. If it died, its files are damaged as by a power loss; then
 the same command runs again. It is a finding if
 
-- a command ends with status 0, and its rasters differ from those of an undisturbed run on the inputs that it names;
+- a command ends with status 0, and its results differ from those of an undisturbed run on the inputs that it names;
 - what is the user's, or an earlier run that was not replaced, is nowhere any more;
 - a command hangs, crashes, or says that something should not happen.
 
@@ -45,24 +45,30 @@ OF_FILES = {f"os.{name}" for name in ("rename", "link", "symlink", "remove", "rm
 OF_FILES |= {"open", "os.truncate", "fcntl.flock"}
 PATIENCE = 120.0  # seconds
 DIED = 137
-IMAGES, SENSORS = ("left", "right", "mask"), ("left_model", "right_model", "left_grid", "right_grid")
+IMAGES, SENSORS = ("left", "right", "mask", "truth"), ("left_model", "right_model", "left_grid", "right_grid")
 P1 = {"A": 8, "B": 9}  # settings in two versions
 KINDS = [
     *("match", "match --keep-tiles", "match --store", "match --store --keep-tiles", "match --left-mask"),
     *("match --overwrite", "match --overwrite --keep-tiles", "match --overwrite --store"),
-    *("surface", "surface --keep-tiles", "batch", "triangulate", "dsm", "export", "stac", "report", "project"),
+    *("surface", "surface --keep-tiles", "batch", "triangulate", "dsm", "stac", "report", "project", "plot"),
+    *("export --to otb", "export --to asp", "export --to cars", "export --to s2p", "reference", "calibrate"),
 ]
-RASTERS = {
+RESULTS = {
     "match": ["out/intervals.tif", "out/validity.tif"],
     "surface": ["out/intervals.tif", "out/validity.tif", "out/points.tif", "out/dsm.tif"],
     "batch": ["out/one/intervals.tif", "out/one/validity.tif", "out/one/dsm.tif"],
     "triangulate": ["out/points.tif"],
     "dsm": ["out/dsm.tif"],
-    "export": ["target/disparity.tif", "target/mask.tif"],
+    "export --to otb": ["target/disparity.tif", "target/mask.tif"],
+    "export --to asp": ["target/export-F.tif"],
+    "export --to cars": ["target/epi_disp.tif", "target/epi_disp_interval_bounds_inf.tif", "target/epi_disp_mask.tif"],
+    "export --to s2p": ["target/rectified_disp.tif", "target/rectified_disp_confidence.tif"],
+    "reference": ["out/truth.tif"],
+    "calibrate": ["target/levels.yaml"],
 }
 # Files of a finished run that are not there when a command begins.
 BEFORE = {"triangulate": ["dsm.tif", "points.tif", "points.json"], "dsm": ["dsm.tif"]}
-BEFORE |= {command: [] for command in ("export", "stac", "report", "project")}
+BEFORE |= {command: [] for command in ("export", "stac", "report", "project", "plot", "reference")}
 DAMAGES = {
     "empty": lambda content, at: b"",
     "half": lambda content, at: content[: len(content) // 2],
@@ -165,14 +171,26 @@ def run(top, command, actions=None, dies_after=None):
     return status, said.read_text(errors="replace"), int(count.read_text()) if count.exists() else 0
 
 
+def results_of(kind):
+    return RESULTS.get(kind, RESULTS.get(kind.split()[0], []))
+
+
 def pixels_of(top, kind):
-    """Digests of the pixels of a command's rasters, read in a child: this process must not have GDAL's threads."""
+    """Digests of a command's results, of rasters only the pixels.
+
+    They are read in a child: this process must not have GDAL's threads.
+    """
     target = Path(f"{top}.pixels")
 
     def read():
         warnings.simplefilter("ignore")
         found = {}
-        for name in RASTERS.get(kind.split()[0], []):
+        for name in results_of(kind):
+            if not name.endswith(".tif"):
+                with suppress(OSError):
+                    content = (top / name).read_bytes().replace(bytes(top), b"")  # it names the inputs
+                    found[name] = hashlib.sha256(content).hexdigest()
+                continue
             with suppress(rasterio.errors.RasterioIOError), rasterio.open(top / name) as file:
                 found[name] = hashlib.sha256(file.read().tobytes()).hexdigest()
         target.write_text(json.dumps(found))
@@ -195,6 +213,7 @@ class Scenes:
             ("earlier", "match --keep-tiles", {"left": "B", "right": "B", "settings": "B"}),
         ):
             self.undisturbed(folder / name, kind, versions)  # its images must stay where they are
+        assert forked(self._make_heights).wait() == 0
 
     def input(self, name, version):
         return self.folder / version / f"{name}.tif"
@@ -205,7 +224,7 @@ class Scenes:
             (self.folder / version).mkdir()
             scene, mask = make_scene(150, 170, seed=seed), np.zeros((150, 170), np.uint8)
             mask[20:50, 30 * seed : 30 * seed + 40] = 1
-            for name, pixels in zip(IMAGES, (scene.left, scene.right, mask), strict=True):
+            for name, pixels in zip(IMAGES, (scene.left, scene.right, mask, scene.truth), strict=True):
                 kind = {"height": 150, "width": 170, "count": 1, "dtype": pixels.dtype, "crs": "EPSG:32631"}
                 kind["transform"] = rasterio.Affine(0.5, 0, 3e5, 0, -0.5, 48e5)
                 with rasterio.open(self.input(name, version), "w", driver="GTiff", **kind) as file:  # of equal sizes
@@ -224,6 +243,13 @@ class Scenes:
             with rasterio.open(self.input(name, "B"), "w", **profile) as file:
                 file.write(pixels)
 
+    def _make_heights(self):
+        with rasterio.open(self.folder / "finished" / "out" / "dsm.tif") as file:
+            heights, profile = file.read(1), file.profile | {"count": 1}
+        for version, factor in (("A", 1.0), ("B", 1.2)):
+            with rasterio.open(self.input("heights", version), "w", **profile) as file:
+                file.write(heights * factor, 1)
+
     def settings(self, version, overlap):
         sections = {"disparity": {"minimum": -12, "maximum": 14}, "cluster": {"workers": 1, "retries": 0}}
         sections |= {"tiles": {"size": 64, "overlap": overlap}, "sgm": {"p1": P1[version], "p2": 40}}
@@ -233,7 +259,9 @@ class Scenes:
         """Make the folder of a command; return its words."""
         shutil.rmtree(top, ignore_errors=True)
         (inputs := top / "inputs").mkdir(parents=True)
-        for name in (*IMAGES, *SENSORS):
+        (top / "target").mkdir()
+        (inputs / "meta.json").write_text(json.dumps({"disparity": [-12, 14], "group": "demo"}))
+        for name in (*IMAGES, *SENSORS, *(["heights"] if kind == "reference" else [])):
             shutil.copy(self.input(name, versions.get(name, "A")), inputs)
         (settings := inputs / "settings.yaml").write_text(self.settings(versions.get("settings", "A"), overlap))
         command, *options = kind.split()
@@ -255,7 +283,10 @@ class Scenes:
             "batch": ["batch", top / "pairs.csv", out, *end],
             "triangulate": ["triangulate", out, *sensors],
             "dsm": ["dsm", out, "--resolution", "1"],
-            "export": ["export", out, top / "target", "--to", "otb"],
+            "export": ["export", out, top / "target" / ("export" if "asp" in options else ""), *options],
+            "reference": ["reference", out, *sensors, "--heights", inputs / "heights.tif", "--ellipsoid", "--quiet"],
+            "calibrate": ["calibrate", inputs, "--output", top / "target" / "levels.yaml", *end],
+            "plot": ["plot", out, "--truth", inputs / "truth.tif", "--row", "60"],
         }.get(command, [command, out])
 
     def undisturbed(self, top, kind, versions, overlap="exact"):
@@ -266,7 +297,8 @@ class Scenes:
 
     def expected(self, kind, versions, overlap):
         """What an undisturbed command writes, see `pixels_of`."""
-        kind = f"{kind.split()[0]}{' --left-mask' if '--left-mask' in kind else ''}"
+        if kind.split()[0] == "match":
+            kind = "match --left-mask" if "--left-mask" in kind else "match"
         key = kind, tuple(sorted(versions.items())), overlap
         if key not in self.known:
             self.undisturbed(self.folder / "clean", kind, versions, overlap)
@@ -284,7 +316,7 @@ class Trial:
             without = self.kind.replace(" --overwrite", "")
             scenes.moments[self.kind] = scenes.undisturbed(scenes.folder / "clean", without, {}, self.overlap)
         self.command = scenes.prepare(top, self.kind, {}, self.overlap)
-        self.out, self.store, self.mine = top / "out", top / "store", top / "mine"
+        self.out, self.store, self.target, self.mine = (top / name for name in ("out", "store", "target", "mine"))
         self.swapped, self.done = None, top.with_name(f"{top.name}.done")
         self.done.write_text("")
         (top / "aside").mkdir()
@@ -296,7 +328,7 @@ class Trial:
             (self.mine / name).write_text(f"mine, {name}")
         shutil.copytree(scenes.folder / "foreign" / "out", self.mine / "run")
         if self.random.random() < 0.3:
-            for folder in (self.out, self.out / "tiles", top / "target"):
+            for folder in (self.out, self.out / "tiles", self.target):
                 folder.mkdir(parents=True, exist_ok=True)
                 (folder / "notes.txt").write_text(f"of the user, {folder}")
         self.users = snapshot(self.mine) | {p: c for p, c in snapshot(top).items() if p.name == "notes.txt"}
@@ -311,16 +343,17 @@ class Trial:
 
     def own_files(self):
         """Files of the command in its folders; not the results, which anybody may change when they are published."""
-        users = set(self.users.values())
-        found = {path: content for top in (self.out, self.store) for path, content in snapshot(top).items()}
-        results = self.out, self.out / "one"
+        users, results = set(self.users.values()), (self.out, self.out / "one", self.target)
+        found = [item for top in (self.out, self.store, self.target) for item in snapshot(top).items()]
         return sorted(
-            p for p, content in found.items() if p.parent not in results and content not in users and content[0] != "-"
+            path for path, content in found if path.parent not in results and content not in users and content[0] != "-"
         )
 
-    def own_folders(self):
-        tops = [folder for folder in (self.out, self.out / "tiles", self.store, self.top / "target") if folder.is_dir()]
-        return [*tops, *sorted({path.parent for path in self.own_files()})]
+    def places(self):
+        """Files and folders of the command, but for temporary ones of random names: nobody puts anything there."""
+        files = [path for path in self.own_files() if not path.relative_to(self.top).parts[1].startswith(".calibrate-")]
+        tops = [folder for folder in (self.out, self.out / "tiles", self.store, self.target) if folder.is_dir()]
+        return [*files, *tops, *sorted({path.parent for path in files})]
 
     def aside(self, path):
         if os.path.lexists(path):
@@ -396,8 +429,9 @@ class Trial:
         """A link, a pipe or a folder of the user takes the place of something, or is there before it."""
         names = [*OUTPUTS, "tiles", "tiles/records/0_0.json", "tiles/.sat-intervals.lock", "points.json", "dsm.tif"]
         names += [".unpublished-intervals.tif", "stac.json", "report.html", "project.qgz", "width.vrt", "batch.json"]
-        places = [self.out / self.random.choice(names), self.top / "target" / "disparity.tif"]
-        place = self.random.choice([*self.own_files(), *self.own_folders(), *2 * places])
+        names += ["overview.png", "errors.png"]
+        places = [self.out / self.random.choice(names), self.top / self.random.choice(results_of(self.kind) or names)]
+        place = self.random.choice([*self.places(), *2 * places])
         links = {"file": self.mine / "points.tif", "folder": self.mine / "folder", "run": self.mine / "run"}
         links |= {"nothing": self.top / "nothing", "itself": place}
         how = self.random.choice([*links, "hard", "pipe", "of_the_user"])
@@ -413,10 +447,11 @@ class Trial:
             else:
                 place.mkdir()
                 (place / "file").write_text(f"of the user, {place}")
+                self.users[place / "file"] = digest(place / "file")  # other disturbances leave it alone
 
     def exchange(self):
         """Another folder takes the place of one of the command's."""
-        place = self.random.choice([*self.own_folders(), self.top / "inputs"])
+        place = self.random.choice([*(path for path in self.places() if path.is_dir()), self.top / "inputs"])
         new = self.random.choice([self.mine / name for name in ("run", "run/tiles", "folder")])
         if new.is_dir() and place.is_dir():
             self.note("exchange", new, place)
@@ -439,8 +474,9 @@ class Trial:
                 ways = self.obstruct, self.exchange, self.damage, self.exchange_contents, self.fail, self.die
                 return theme, {moment: self.random.choice(ways) for moment in moments}
         kind = self.kind.split()[0]
-        names = ["left", "right", "settings"] if kind in ("match", "surface", "batch") else []
-        names += SENSORS if kind in ("surface", "batch", "triangulate") else []
+        names = ["left", "right", "settings"] if kind in ("match", "surface", "batch", "calibrate") else []
+        names += SENSORS if kind in ("surface", "batch", "triangulate", "reference") else []
+        names += {"calibrate": ["truth", "truth"], "reference": ["heights", "heights"]}.get(kind, [])
         names += ["mask", "mask"] if "--left-mask" in self.kind else []
         if not names:
             return theme, {moments[0]: self.swap_run}
@@ -486,23 +522,20 @@ class Trial:
         is_lost = any(not there[content] for content in self.old)
         if is_lost and status not in (0, DIED) and not self.is_right():
             return f"the earlier run is lost, status {status}"
-        changed = {place for _, place in self.noted("obstruct")} & {str(self.top / name) for name in self.rasters}
-        if status == 0 and not changed and not self.is_another_run and not self.is_right():
-            return f"wrong rasters: {said}"
+        results = {str(self.top / name) for name in results_of(self.kind)}
+        is_changed = any(place in results for _, place in self.noted("obstruct"))
+        if status == 0 and not is_changed and not self.is_another_run and not self.is_right():
+            return f"wrong results: {said}"
         return None
 
     @property
     def is_another_run(self):
         """Whether the folder of the command may be another one now."""
-        at_out = [place for _, place in self.noted("obstruct") if place == str(self.out)]
+        at_out = [place for _, place in self.noted("obstruct") if place in (str(self.out), str(self.target))]
         return bool(at_out or self.noted("exchange") or self.noted("swap_run"))
 
-    @property
-    def rasters(self):
-        return RASTERS.get(self.kind.split()[0], [])
-
     def is_right(self):
-        """Whether the rasters are those of the inputs that the run names."""
+        """Whether the results are those of the inputs that the run names."""
         found = pixels_of(self.top, self.kind)
         versions = [{}, *([{self.swapped: "B"}] if self.swapped else [])]
         if self.kind.split()[0] in ("match", "surface"):
@@ -524,11 +557,8 @@ class Trial:
 def hostile(folder, minutes, seed, trial):
     """Run trials; return the number of findings."""
     scenes, counts, findings = Scenes(folder / "scenes"), Counter(), 0
-    end, numbers = (
-        time.monotonic() + 60 * minutes,
-        [trial] if trial else range(1_000_000 * seed, 1_000_000 * (seed + 1)),
-    )
-    for number in numbers:
+    end = time.monotonic() + 60 * minutes
+    for number in [trial] if trial else range(1_000_000 * seed, 1_000_000 * (seed + 1)):
         if time.monotonic() > end:
             break
         tried = Trial(scenes, folder / "trial", number)
