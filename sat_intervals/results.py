@@ -265,6 +265,8 @@ def open_run(out: str | Path) -> Run:
     """
     out = Path(out)
     file = out / "run.json"
+    # another run may be there for a moment
+    check_steady = watched([file, *(out / name for name in _BANDS)], is_local=True)
     try:
         which = _which(out)
         with open_regular(file) as stream:
@@ -293,6 +295,7 @@ def open_run(out: str | Path) -> Run:
             f"{file} is not the report of a run{where}: move it away and match again with --overwrite"
         ) from error
     places = [_checked_place(out / name, bands, region, files.get(name)) for name, bands in _BANDS.items()]
+    check_steady()
     return Run(out, report, config, region, which, places[-1])
 
 

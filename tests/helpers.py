@@ -129,6 +129,14 @@ def contents(folder):
     return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+def exchanged(one, other):
+    """Let two folders, or files, take each other's names."""
+    aside = one.with_name(f"{one.name}-aside")
+    one.rename(aside)
+    other.rename(one)
+    aside.rename(other)
+
+
 def exchanged_for_link(file, mine, way="symlink_to"):
     """What a hostile process does as soon as it sees a temporary file."""
     file.rename(mine.with_name("moved"))

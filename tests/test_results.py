@@ -4,7 +4,7 @@ import json
 
 import pytest
 from finished import random_bands, write_run
-from helpers import invoke
+from helpers import exchanged, invoke
 
 from sat_intervals import results
 
@@ -76,3 +76,30 @@ def test_commands__end_where_a_file_with_another_place_appears_beside_the_run(tm
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert "validity.tif.aux.xml changes what is read from" in done.stderr
     assert not [*out.glob("*.qgz"), *out.glob("stac*"), *tmp_path.glob("to/*.tif")]
+
+
+@pytest.mark.parametrize("command", [["stac"], ["report"], ["export", "--to", "otb"]])
+def test_commands__end_where_the_run_is_another_for_a_moment(tmp_path, monkeypatch, command):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    out, other = (write_run(tmp_path / name, *random_bands(20, 30)) for name in "ab")
+    which, checked = results._which, results._checked_place
+
+    def and_leaves(out):
+        found = which(out)
+        exchanged(out, other)
+        return found
+
+    def and_is_back(file, *arguments):
+        found = checked(file, *arguments)
+        if file.name == "validity.tif":  # the last that is checked
+            exchanged(out, other)
+        return found
+
+    monkeypatch.setattr(results, "_which", and_leaves)
+    monkeypatch.setattr(results, "_checked_place", and_is_back)
+    arguments = [out, tmp_path / "to"] if command[0] == "export" else [out]
+    done = invoke(command[0], *arguments, *command[1:])
+    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
+    assert "was replaced or changed while it was read: rerun the command" in done.stderr
+    assert not [*out.glob("stac*"), *out.glob("report*"), *tmp_path.glob("to/*.tif")]

@@ -302,18 +302,18 @@ def _differing(files: Mapping[str, Mapping[str, Any]], is_over: Event) -> str | 
     return None
 
 
-def watched(files: Iterable[str | Path | None]) -> Callable[[], None]:
+def watched(files: Iterable[str | Path | None], *, is_local: bool = False) -> Callable[[], None]:
     """Return a function that raises if a file was made, replaced or changed since; None is ignored.
 
     Call it between reading several times from files and publishing what was made of them. Of rasters, see
-    `watched_rasters`. A server that does not answer does not change a file.
+    `watched_rasters`. A server that does not answer does not change a file; with ``is_local``, none is asked.
     """
     names = {str(file) for file in files if file is not None}
-    before = {file: (_moment(file), stamp_of(file)) for file in names}
+    before = {file: (_moment(file), None if is_local else stamp_of(file)) for file in names}
 
     def check() -> None:
         for file, (moment, stamp) in before.items():
-            now = stamp_of(file)
+            now = None if is_local else stamp_of(file)
             if moment.is_touched(_moment(file)) or (None not in (stamp, now) and stamp != now):
                 raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
 

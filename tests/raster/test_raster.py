@@ -11,12 +11,13 @@ import time
 import warnings
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import OUTPUTS
+from helpers import OUTPUTS, exchanged
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rasterio.control import GroundControlPoint
@@ -27,7 +28,7 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
     POINT_FILES,
@@ -39,6 +40,7 @@ from sat_intervals.raster import (
     OutputWriter,
     check_pair,
     gdal,
+    images,
     open_image,
     other_files,
     publishing,
@@ -139,6 +141,24 @@ def test_open_image__tells_what_the_file_has(tmp_path):
     assert (image.path, image.band, image.height, image.width) == (str(path), 1, 3, 4)
     assert (image.dtype, image.nodata, image.use_mask, image.alpha, image.mask) == ("uint16", 7, False, None, None)
     assert image.georeferencing == Georeferencing(CRS.from_epsg(32631), UTM["transform"])
+
+
+def test_open_image__raises_if_its_folder_is_another_for_a_moment(tmp_path, monkeypatch):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        make(tmp_path / name / "left.tif", RAMP, nodata=ord(name))
+
+    @contextmanager
+    def of_the_other(path, *arguments):
+        exchanged(tmp_path / "a", tmp_path / "b")
+        with opened(path, *arguments) as dataset:
+            exchanged(tmp_path / "a", tmp_path / "b")
+            yield dataset
+
+    opened = images.opened
+    monkeypatch.setattr(images, "opened", of_the_other)
+    with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed while it was read"):
+        open_image(tmp_path / "a" / "left.tif")
 
 
 def test_open_image__finds_a_relative_path_from_anywhere(tmp_path, monkeypatch):
