@@ -261,11 +261,10 @@ def open_run(out: str | Path) -> Run:
     Raises
     ------
     SatIntervalsError
-        The folder is not a finished run, or its files do not belong together.
+        The folder is not a finished run, its files do not belong together, or it was another run for a moment.
     """
     out = Path(out)
     file = out / "run.json"
-    # another run may be there for a moment
     check_steady = watched([file, *(out / name for name in _BANDS)], is_local=True)
     try:
         which = _which(out)

@@ -57,8 +57,10 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     """
     check_regular(path)
     if file := local_file(path):
-        name = str(file.resolve()) if file == Path(path) else path
-        return {"path": name} | _of_file(file, (known or {}).get(name, {}))
+        if file == Path(path):
+            file = file.resolve()  # once: a link may lead elsewhere later
+            path = str(file)
+        return {"path": path} | _of_file(file, (known or {}).get(path, {}))
     if path.startswith("/vsicurl?"):
         raise SatIntervalsError(f"{path}: a change of this file would not be noticed: give its URL alone")
     name = path.removeprefix("/vsicurl/")
@@ -185,6 +187,12 @@ def checksum_of(file: Path) -> dict[str, int]:
         while block := stream.read(1 << 20):
             size, crc32 = size + len(block), zlib.crc32(block, crc32)
     return {"bytes": size, "crc32": crc32}
+
+
+def checksum_of_text(text: str) -> dict[str, int]:
+    """Return the `checksum_of` a file with this text."""
+    content = text.encode()
+    return {"bytes": len(content), "crc32": zlib.crc32(content)}
 
 
 def _of_url(url: str) -> dict[str, Any]:

@@ -133,9 +133,7 @@ def open_image(
             alpha=alphas[0] if alphas else None,
             mask=mask,
             georeferencing=Georeferencing.of(dataset),
-            beside=tuple(
-                file for file in dataset.files if file.lower().endswith((".msk", ".aux.xml")) and is_read(file)
-            ),
+            beside=_beside(dataset.files),
             stamps=stamps,
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
@@ -214,6 +212,11 @@ def _kinds(dataset: DatasetReader) -> tuple[list[int], list[int]]:
     """Return the numbers of the image bands and of the alpha bands."""
     alphas = [band for band, kind in enumerate(dataset.colorinterp, start=1) if kind == ColorInterp.alpha]
     return [band for band in dataset.indexes if band not in alphas], alphas
+
+
+def _beside(files: Iterable[str]) -> tuple[str, ...]:
+    """Return those of a raster's files with its mask or no-data value that have names of their own."""
+    return tuple(file for file in files if file.lower().endswith((".msk", ".aux.xml")) and is_read(file))
 
 
 def _chosen(path: str, bands: list[int], band: int | None) -> int:

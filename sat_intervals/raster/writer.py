@@ -22,7 +22,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.identity import checksum_of, checksum_of_text
 from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
 from sat_intervals.raster.publishing import REPLACED, REPORTS, OutputError, flush, pinned, publish, put_back, stamps
 from sat_intervals.raster.seal import check_place
@@ -259,6 +259,14 @@ class OutputWriter:
             Called before, with the `stamps` that the files will have, the report last.
         """
         made = self.build()
+        names = [file.name for file in self._files] + ([report[0]] if report else [])
+        if report:
+            name, text = report
+            with self._failing(self._folder / name):
+                with (self._pinned / name).open("x", encoding="utf-8") as stream:
+                    stream.write(text)
+                flush(self._pinned / name)
+            made[name] = checksum_of_text(text)
         compared = stamps(self._pinned, made)
         for name, checksum in made.items():
             with self._failing(self._folder / name):
@@ -268,14 +276,6 @@ class OutputWriter:
         self._check_folders()
         if not self._scratch.exists():  # perhaps another folder took the place of the whole one
             raise OutputError(f"{self._scratch}, a folder of temporary files, is gone: rerun the command")
-        names = [file.name for file in self._files]
-        if report:
-            name, text = report
-            names.append(name)
-            with self._failing(self._folder / name):
-                with (self._pinned / name).open("x", encoding="utf-8") as stream:
-                    stream.write(text)
-                flush(self._pinned / name)
         announce(list(stamps(self._pinned, names).values()))
         may_go = self._there if replaceable is None else replaceable
         publish(self._pinned, self._folder, names, may_go, self._failing, compared)

@@ -320,12 +320,29 @@ def test_output_writer__keeps_foreign_files_where_its_own_grow(tmp_path):
     assert names == [f"{hidden}/mine.txt", f"{hidden}/replaced/mine.txt", "intervals.tif", "validity.tif"]
 
 
-def test_output_writer__publishes_no_file_that_is_truncated_after_it_was_compared(tmp_path):
+@pytest.mark.parametrize("name", ["intervals.tif", "run.json"])
+def test_output_writer__publishes_no_file_that_is_truncated_after_it_was_compared(tmp_path, name):
     with writer(tmp_path) as output:
         output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
-        made = tmp_path / ".unpublished-intervals.tif" / "files" / "intervals.tif"
+        made = tmp_path / ".unpublished-intervals.tif" / "files" / name
         with pytest.raises(OutputError, match=r"changed temporary files in .*: rerun the command"):
-            output.publish(("run.json", "{}"), announce=lambda stamps: os.truncate(made, 100))
+            output.publish(("run.json", "{}"), announce=lambda stamps: os.truncate(made, 1))
+    assert not list(tmp_path.glob("*.*"))
+
+
+def test_output_writer__publishes_no_report_that_is_damaged_when_it_is_flushed(tmp_path, monkeypatch):
+    flush = raster_writer.flush
+
+    def and_damages(path):
+        flush(path)
+        if path.name == "run.json":
+            path.write_text("[]")
+
+    monkeypatch.setattr(raster_writer, "flush", and_damages)
+    with writer(tmp_path) as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        with pytest.raises(OutputError, match=r"run\.json cannot be written: the content read back differs"):
+            output.publish(("run.json", "{}"))
     assert not list(tmp_path.glob("*.*"))
 
 
