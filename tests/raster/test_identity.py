@@ -354,3 +354,22 @@ def test_read_window__sees_the_mask_of_a_server_that_is_busy_every_other_time(we
     # GDAL waits 30 seconds if it is not told otherwise
     done = subprocess.run([sys.executable, "-c", STATE, name], capture_output=True, text=True, timeout=100)
     assert (done.stdout, next(asked) > 2) == ("True\n", True)
+
+
+def test_identity__hashes_the_file_that_it_names(tmp_path, monkeypatch):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "left.tif").write_text(name)
+    link, resolve = tmp_path / "link", Path.resolve
+    link.symlink_to("b")
+
+    def and_leads_elsewhere(path):
+        found = resolve(path)
+        link.unlink(missing_ok=True)
+        link.symlink_to("a")
+        return found
+
+    monkeypatch.setattr(Path, "resolve", and_leads_elsewhere)
+    found = identity(str(link / "left.tif"))
+    assert found["path"] == str(tmp_path / "b" / "left.tif")
+    assert found["sha256"] == hashlib.sha256(b"b").hexdigest()
