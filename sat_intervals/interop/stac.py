@@ -22,6 +22,7 @@ from sat_intervals.raster import (
     read_place,
     read_shape,
     read_tags,
+    stamps,
     whole_file,
 )
 from sat_intervals.raster.published import check_points
@@ -68,10 +69,11 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     run = open_run(out)
     file = run.out / "stac.json"
     run.check_kept([file])
+    there = stamps(run.out, [file.name])
     _check_own(file)
     with run.unchanged("points.tif", "dsm.tif", "overview.png"):
         item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
-    with whole_file(file) as new:
+    with whole_file(file, there) as new:
         new.write_text(json.dumps(item, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         _check_own(file)  # again: a file may have appeared meanwhile
     return file

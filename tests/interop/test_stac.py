@@ -174,3 +174,18 @@ def test_write_item__ends_where_a_surface_is_replaced_meanwhile(made, tmp_path, 
     done = invoke("stac", out)
     assert done.exit_code == 1
     assert re.search(r"dsm.tif was replaced or changed while it was read: rerun the command", done.stderr)
+
+
+def test_write_item__keeps_an_item_that_appears_meanwhile(tmp_path, monkeypatch):
+    out, item = write_run(tmp_path, *random_bands(20, 30)), stac._item
+    edited = json.dumps({"properties": {"processing:software": {"sat-intervals": "1", "mine": "2"}}})
+
+    def and_appears(*arguments):
+        (out / "stac.json").write_text(edited)
+        return item(*arguments)
+
+    monkeypatch.setattr(stac, "_item", and_appears)
+    done = invoke("stac", out)
+    assert done.exit_code == 2
+    assert done.stderr.count("\n") == 1
+    assert (out / "stac.json").read_text() == edited
