@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 from urllib.request import Request, urlopen
 
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
+from sat_intervals.raster.moves import moves
 from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
@@ -110,13 +111,13 @@ def _stamp(file: str | Path) -> str:
 
 
 class _Place(NamedTuple):
-    """State of a file, link or folder on the way to an input: inode, times in nanoseconds, the parent's change time."""
+    """State of a file, link or folder on the way to an input: inode, times in nanoseconds, and its `moves`."""
 
     inode: int
     modified: int
     changed: int
-    parent_changed: int
     is_folder: bool
+    moves: tuple[int, int]
 
 
 class _Moment(NamedTuple):
@@ -131,15 +132,8 @@ class _Moment(NamedTuple):
         A folder that gets a new file has both times of that moment, one that is renamed only the change time.
         """
         return (self.stamp, len(self.places)) != (later.stamp, len(later.places)) or any(
-            before.inode != now.inode
+            (before.inode, before.moves) != (now.inode, now.moves)
             or (before.changed != now.changed and not (now.is_folder and now.modified == now.changed))
-            for before, now in zip(self.places, later.places, strict=True)
-        )
-
-    def may_be_touched(self, later: "_Moment") -> bool:
-        """Return whether a folder on the path may have been renamed and then got a file: its parent changed, too."""
-        return any(
-            before.changed != now.changed and before.parent_changed != now.parent_changed
             for before, now in zip(self.places, later.places, strict=True)
         )
 
@@ -150,13 +144,12 @@ def _moment(path: str) -> _Moment:
 
 
 def _way_to(path: Path) -> Iterator[_Place]:
-    places = path, *path.parents
-    statuses = [place.lstat() for place in places]
-    for place, status, parent in zip(places, statuses, (*statuses[1:], statuses[-1]), strict=True):
-        is_folder = stat.S_ISDIR(status.st_mode)
-        if is_folder or stat.S_ISLNK(status.st_mode):
-            yield _Place(status.st_ino, status.st_mtime_ns, status.st_ctime_ns, parent.st_ctime_ns, is_folder)
-        if stat.S_ISLNK(status.st_mode):
+    for place in (path, *path.parents):
+        counted, status = moves(place), place.lstat()  # in this order: what comes between them changes the inode
+        is_folder, is_link = stat.S_ISDIR(status.st_mode), stat.S_ISLNK(status.st_mode)
+        if is_folder or is_link:
+            yield _Place(status.st_ino, status.st_mtime_ns, status.st_ctime_ns, is_folder, counted)
+        if is_link:
             yield from _way_to(place.parent / place.readlink())
 
 
@@ -268,10 +261,8 @@ def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _R
             check_unchanged(files)
         now = {name: _moment(name) for name in files}
         touched = [name for name in files if before[name].is_touched(now[name])]
-        if not touched and not any(before[name].may_be_touched(now[name]) for name in files):
+        if not touched:
             return content
-    if not touched:  # both folders get new files all the time
-        return content
     raise RunError(
         f"{touched[0]} keeps changing while it is read: stop the program that writes it and rerun the same command"
     )

@@ -1,0 +1,106 @@
+import os
+import subprocess
+import sys
+
+import pytest
+from helpers import exchanged
+
+from sat_intervals.errors import ChangedInputError
+from sat_intervals.raster import moves
+from sat_intervals.raster.identity import watched
+
+
+@pytest.fixture
+def folders(tmp_path):
+    for name in ("own", "other"):
+        (tmp_path / name / "models").mkdir(parents=True)
+        (tmp_path / name / "models" / "left.geom").write_text(name)
+    return tmp_path / "own", tmp_path / "other"
+
+
+def make_others(own):
+    """What other programs do beside inputs, in all folders above them."""
+    for place in (own / "models", own, own.parent):
+        (place / "new.txt").touch()
+        (place / "folder" / "inner").mkdir(parents=True)
+        (place / "folder" / "inner").rename(place / "folder" / "renamed")
+        (place / "folder").rename(place / "results")
+        (place / "new.txt").unlink()
+
+
+def there_and_back(own, other):
+    for _ in range(2):
+        exchanged(own, other)
+    (own / "new.txt").touch()
+
+
+@pytest.mark.parametrize("which", ["own", "own/models"])
+def test_watched__raises_if_a_folder_was_another_before_it_got_a_file(folders, which):
+    check = watched([folders[0] / "models" / "left.geom"])
+    make_others(folders[0])
+    check()
+    there_and_back(*(folder.parent / which.replace("own", folder.name) for folder in folders))
+    with pytest.raises(ChangedInputError, match=r"left\.geom was replaced or changed while it was read"):
+        check()
+
+
+def test_watched__raises_if_the_folder_that_a_link_leads_to_was_another(folders, tmp_path):
+    (tmp_path / "link").symlink_to(folders[0])
+    check = watched([tmp_path / "link" / "models" / "left.geom"])
+    make_others(folders[0])
+    check()
+    there_and_back(*folders)
+    with pytest.raises(ChangedInputError):
+        check()
+
+
+def test_watched__knows_a_renamed_folder_by_its_times_where_the_system_cannot_watch_it(folders, monkeypatch):
+    monkeypatch.setattr(moves, "_of_process", lambda _: queue)
+    queue = moves._Queue()
+    os.close(queue._queue)
+    queue._queue = -1
+    assert moves.moves(folders[0]) == (-1, 0)
+    check = watched([folders[0] / "models" / "left.geom"])
+    make_others(folders[0])
+    check()
+    for _ in range(2):
+        exchanged(*folders)
+    with pytest.raises(ChangedInputError):
+        check()
+
+
+def test_watched__raises_if_renamings_were_lost(folders, monkeypatch):
+    """The system keeps some thousand of them for a process."""
+    check = watched([folders[0] / "models" / "left.geom"])
+    for folder in folders:
+        moves.moves(folder)
+    with open("/proc/sys/fs/inotify/max_queued_events", encoding="ascii") as file:
+        most = int(file.read())
+    for folder in folders * (most // 2 + 1):  # in turn: equal ones are counted once
+        folder.rename(folder.with_name("aside"))
+        folder.with_name("aside").rename(folder)
+    (folders[0] / "new.txt").touch()
+    with pytest.raises(ChangedInputError):
+        check()
+
+
+_FORKED = """
+import os, sys
+from pathlib import Path
+from sat_intervals.raster.moves import moves
+
+folder = Path(sys.argv[1])
+_, before = moves(folder)
+process = os.fork()
+if not process:
+    folder.rename(folder.with_name("aside")).rename(folder)
+moves(folder)
+if process:
+    os.waitpid(process, 0)
+    print(moves(folder)[1] - before)
+"""
+
+
+def test_moves__are_not_taken_from_a_process_by_one_that_it_forks(folders):
+    command = [sys.executable, "-c", _FORKED, str(folders[0])]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "1\n"
