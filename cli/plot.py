@@ -57,11 +57,10 @@ def plot(
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.raster import stamps, watched_images
     from sat_intervals.results import open_results
-    from sat_intervals.show.canvas import write_pictures
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
-    from sat_intervals.show.marks import check_made_here
+    from sat_intervals.show.marks import check_made_here, write_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
     from sat_intervals.show.search_range import draw_range, has_range
 
@@ -87,7 +86,8 @@ def plot(
         for name, draw in drawings.items():
             draw(pictures.setdefault(out / f"{name}.png", BytesIO()))
         check_unchanged()
-    write_pictures(pictures, there)
+    with results.unchanged():  # another run may come to the folder
+        write_made_here({path: drawn.getvalue() for path, drawn in pictures.items()}, there)
     for picture in pictures:
         click.echo(picture)
 

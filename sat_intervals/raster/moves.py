@@ -41,7 +41,8 @@ class _Queue:
 def moves(folder: Path) -> tuple[int, int]:
     """Return a number of the folder at a path in this process, and how often it was renamed since it was first asked.
 
-    The number is -1 for what is no folder, and where the system cannot watch it. On a network disk, only renamings by this machine count.
+    The number is -1 for what is no folder, and where the system cannot watch it. On a network disk, only renamings by
+    this machine count.
     """
     return _of_process(os.getpid()).moves(folder)
 

@@ -3,7 +3,7 @@
 Every picture imports this module, so it reports a missing matplotlib (the extra ``plot``).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import stamps, whole_file
-from sat_intervals.show.marks import check_made_here
+from sat_intervals.raster import stamps
+from sat_intervals.show.marks import write_made_here
 
 try:
     from matplotlib import rc_context
@@ -39,7 +39,7 @@ _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 
 
 @contextmanager
 def page(target: Target, size: tuple[float, float], dpi: int, title: str, run: str = "") -> Iterator[Figure]:
-    """Yield a figure of ``size`` inches and write it as PNG at the end, to a file as `write_pictures` does.
+    """Yield a figure of ``size`` inches and write it as PNG at the end, to a file as `write_made_here` does.
 
     The picture notes the ``finished`` of its ``run``.
     """
@@ -51,19 +51,7 @@ def page(target: Target, size: tuple[float, float], dpi: int, title: str, run: s
         yield figure
         figure.savefig(drawn, dpi=dpi, format="png", metadata={"Software": "sat-intervals", "Comment": run})
     if isinstance(target, Path):
-        write_pictures({target: drawn}, there)
-
-
-def write_pictures(pictures: Mapping[Path, BytesIO], there: Mapping[str, str]) -> None:
-    """Write pictures of one folder; files that have no stamp in ``there``, or that this tool did not make, are kept.
-
-    If there is such a file before the first is written, none is. ``there`` is that of `whole_file`.
-    """
-    check_made_here(pictures)
-    for path, drawn in pictures.items():
-        with whole_file(path, there) as new:
-            new.write_bytes(drawn.getvalue())
-            check_made_here([path])  # again: a file may have appeared meanwhile
+        write_made_here({target: drawn.getvalue()}, there)
 
 
 def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:

@@ -1,9 +1,10 @@
 """Keep files in the place of a picture, page, style or project that this tool did not make."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import whole_file
 
 XML_MARK = "made by sat-intervals"
 """Text of the comment in styles and projects; QGIS removes it when it writes the file again."""
@@ -49,3 +50,20 @@ def is_replaceable(path: Path) -> bool:
     except OSError as error:
         raise SatIntervalsError(f"{path} exists and cannot be read: {error.strerror}: move it away") from error
     return any(mark in beginning for mark in _MARKS)
+
+
+def write_made_here(files: Mapping[Path, bytes], there: Mapping[str, str]) -> None:
+    """Write files of one folder; those that have no stamp in ``there``, or that this tool did not make, are kept.
+
+    If there is such a file before the first is written, none is. ``there`` is that of `whole_file`.
+
+    Raises
+    ------
+    SatIntervalsError
+        Names the file that is kept, or cannot be written.
+    """
+    check_made_here(files)
+    for path, content in files.items():
+        with whole_file(path, there) as new:
+            new.write_bytes(content)
+            check_made_here([path])  # again: a file may have appeared meanwhile

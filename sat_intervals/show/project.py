@@ -5,6 +5,7 @@ import re
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
@@ -24,18 +25,16 @@ from sat_intervals.raster import (
     read_small_layers,
     read_tags,
     stamps,
-    whole_file,
 )
 from sat_intervals.raster.published import check_points
 from sat_intervals.results import Run, open_run
 from sat_intervals.show import styles
-from sat_intervals.show.marks import check_made_here, is_replaceable
+from sat_intervals.show.marks import check_made_here, is_replaceable, write_made_here
 from sat_intervals.tiling import Window
 
 # Longest side in pixels of what percentiles are taken from.
 _LONGEST = 1024
 _MULTIPLY = 6  # QGIS' blend mode
-_HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 _CHECKED = "Qt::Checked"
 # Names of rasters with a default style.
 _STYLED = "intervals", "width", "validity", "points", "dsm", "dsm_half_width"
@@ -77,9 +76,9 @@ class Layer:
 
 @dataclass(frozen=True)
 class Written:
-    """The files that were written, and lines about what was left out or kept."""
+    """The contents of the files that were written, and lines about what was left out or kept."""
 
-    files: list[Path]
+    files: dict[Path, bytes]
     notes: list[str]
 
 
@@ -97,22 +96,30 @@ def write_project(out: str | Path) -> Written:
     """
     run = open_run(out)
     file = run.out / "project.qgz"
-    run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
+    others = [run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt")]
+    run.check_kept([file, *others])
     check_made_here([file])
-    _check_places(run)
-    there = stamps(run.out, [file.name])
-    written = Written([], [])
+    there = stamps(run.out, [path.name for path in (file, *others)])
+    written = Written({}, [])
     with run.unchanged("points.tif", "dsm.tif"):
-        layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
-        _write_defaults(run, layers, written)
-        layers += _images(run, written)
-        project = styles.text_of(_project(run, layers), _HEAD)
-    with whole_file(file, there) as new:
-        with run.unchanged(), zipfile.ZipFile(new, "w") as archive:  # stored, so that the mark is in the first bytes
-            archive.writestr(zipfile.ZipInfo("project.qgs"), project)
-        check_made_here([file])  # again: files may have appeared meanwhile
         _check_places(run)
-    return Written([*written.files, file], written.notes)
+        layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
+        _add_defaults(run, layers, written)
+        layers += _images(run, written)
+        written.files[file] = _archive(styles.text_of(_project(run, layers), styles.HEAD))
+    with run.unchanged():  # another run may come to the folder
+        _check_places(run)
+        write_made_here(written.files, there)
+        _check_places(run)  # again: files may have appeared meanwhile
+    return written
+
+
+def _archive(project: bytes) -> bytes:
+    """Return an archive of a project; it is stored, so that the mark is in the first bytes."""
+    content = BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr(zipfile.ZipInfo("project.qgs"), project)
+    return content.getvalue()
 
 
 def _check_places(run: Run) -> None:
@@ -121,11 +128,10 @@ def _check_places(run: Run) -> None:
         check_place(run.out / f"{name}.vrt")
 
 
-def _write_defaults(run: Run, layers: list[Layer], written: Written) -> None:
+def _add_defaults(run: Run, layers: list[Layer], written: Written) -> None:
     for layer in layers:
         if layer.is_default and _is_free(style := run.out / f"{Path(layer.source).stem}.qml", written):
-            styles.write_style(style, layer.renderer)
-            written.files.append(style)
+            written.files[style] = styles.default_style(layer.renderer)
 
 
 def _is_free(file: Path, written: Written) -> bool:
@@ -149,8 +155,7 @@ def _results(run: Run, written: Written) -> Iterator[Layer]:
     yield Layer(group, "confidence", BANDS[3].meaning, file, place, run.shape, unclear)
     width = run.out / "width.vrt"
     if run.config.interval and _is_free(width, written):
-        styles.write_difference(width, (file.name, 3, 2), place, run.shape)
-        written.files.append(width)
+        written.files[width] = styles.difference((file.name, 3, 2), place, run.shape)
         wide = styles.widths(1, upper - lower, unit="px")
         yield Layer(group, "interval width", "upper - lower bound, pixels", width, place, run.shape, wide, True)
     ramp = styles.colours(1, disparity, styles.VIRIDIS, unit="px")
@@ -186,8 +191,7 @@ def _surface(run: Run, written: Written) -> Iterator[Layer]:
     bands = dict(zip((band.name for band in SURFACE), read_small_layers(file, _fitting(shape)), strict=True))
     half = run.out / "dsm_half_width.vrt"
     if _is_free(half, written):
-        styles.write_difference(half, (file.name, 3, 2), place, shape, 0.5)
-        written.files.append(half)
+        written.files[half] = styles.difference((file.name, 3, 2), place, shape, 0.5)
         wide = styles.widths(1, (bands["height_upper"] - bands["height_lower"]) / 2, unit="m")
         yield Layer(group, "half width", "half the width of the height's interval, m", half, place, shape, wide, True)
     unclear = styles.ramped(5, np.linspace(0, 1, len(styles.CIVIDIS)), styles.CIVIDIS)
@@ -297,7 +301,7 @@ def _extent(layer: Layer) -> tuple[float, float, float, float]:
 def _relative(source: str | Path, folder: Path) -> str:
     """Return a local file relative to the folder of the project, as QGIS writes it, and any other name as GDAL's."""
     name = str(source)
-    if not Path(name).exists():
+    if isinstance(source, str) and not Path(name).exists():
         return name.replace("s3://", "/vsis3/", 1) if name.startswith("s3://") else name
     relative = Path(os.path.relpath(Path(name).resolve(), folder.resolve())).as_posix()
     return relative if relative.startswith("../") else f"./{relative}"

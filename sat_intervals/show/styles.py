@@ -4,14 +4,13 @@ QGIS reads ``name.qml`` when it loads ``name.tif``. All XML is written by the st
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
 from sat_intervals.products import FLAGS, INVALID
-from sat_intervals.raster import Georeferencing, whole_file
+from sat_intervals.raster import Georeferencing
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
 from sat_intervals.show.marks import XML_MARK
 
@@ -21,6 +20,7 @@ MAGMA = "#000004", "#51127c", "#b73779", "#fc8961", "#fcfdbf"
 CIVIDIS = "#00224e", "#434e6c", "#7d7c78", "#bcaf6f", "#fee838"
 # QGIS 3.22 is the oldest version the styles are tried with.
 VERSION = "3.22.0"
+HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 # Sun of the hillshade: north-west, 45 degrees high. Heights are flattened: noise of 0.1 m is steep between small cells.
 _SUN = {"azimuth": "315", "angle": "45", "zfactor": "0.3", "multidirection": "0"}
 # Share of values below the first and above the last colour, in percent.
@@ -115,24 +115,22 @@ def add_style(parent: Element, renderer: Element, blend: int) -> None:
     SubElement(parent, "blendMode").text = str(blend)
 
 
-def write_style(path: Path, renderer: Element) -> None:
-    """Write the default style of the raster beside it."""
+def default_style(renderer: Element) -> bytes:
+    """Return the default style of the raster beside it."""
     root = Element("qgis", version=VERSION, styleCategories="Symbology")
     add_style(root, renderer, 0)
-    write_xml(path, root, "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n")
+    return text_of(root, HEAD)
 
 
-def write_difference(
-    path: Path, source: tuple[str, int, int], place: Georeferencing, shape: tuple[int, int], factor: float = 1.0
-) -> None:
-    """Write a virtual raster of the difference of two bands, which GDAL computes when it is read.
+def difference(
+    source: tuple[str, int, int], place: Georeferencing, shape: tuple[int, int], factor: float = 1.0
+) -> bytes:
+    """Return a virtual raster of the difference of two bands, which GDAL computes when it is read.
 
     Parameters
     ----------
-    path
-        The file, beside its source.
     source
-        Name of a raster, the band to subtract from, and the band to subtract, counted from 1.
+        Name of a raster beside it, the band to subtract from, and the band to subtract, counted from 1.
     place, shape
         Georeferencing, rows and columns of the source.
     factor
@@ -150,7 +148,7 @@ def write_difference(
         SubElement(of_band, "SourceBand").text = str(number)
         SubElement(of_band, "ScaleOffset").text = "0"
         SubElement(of_band, "ScaleRatio").text = f"{factor:g}"
-    write_xml(path, root)
+    return text_of(root)
 
 
 def _add_place(root: Element, place: Georeferencing) -> None:
@@ -175,9 +173,3 @@ def text_of(root: Element, head: str = "") -> bytes:
     root.insert(0, ElementTree.Comment(XML_MARK))
     ElementTree.indent(root, " ")
     return (head + ElementTree.tostring(root, encoding="unicode") + "\n").encode()
-
-
-def write_xml(path: Path, root: Element, head: str = "") -> None:
-    """Write XML with the mark of this tool; replaces the file."""
-    with whole_file(path) as new:
-        new.write_bytes(text_of(root, head))

@@ -12,7 +12,7 @@ from operator import getitem
 import numpy as np
 import pytest
 from finished import PLACE, no_bands, random_bands, without_intervals, write_file, write_run, write_surface
-from helpers import invoke, write_pair
+from helpers import exchanged, invoke, write_pair
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -38,7 +38,7 @@ from sat_intervals.products import (
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results, open_run
 from sat_intervals.run.statistics import Tally
-from sat_intervals.show import coverage, dsm, maps
+from sat_intervals.show import coverage, dsm, maps, marks
 from sat_intervals.show.canvas import widest
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.show.dsm import _relief, draw_surface
@@ -386,6 +386,21 @@ def test_plot__ends_where_a_surface_is_replaced_meanwhile(tmp_path, monkeypatch,
     assert done.exit_code == 1
     assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
     assert not [*out.glob("*.png")]  # the one of the surface may show both
+
+
+def test_plot__ends_where_another_run_takes_the_folders_name_before_pictures_are_written(tmp_path, monkeypatch):
+    out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    other = tmp_path / "other"
+    shutil.copytree(out, other)
+    write = marks.write_made_here
+
+    def and_exchanged(*arguments):
+        exchanged(out, other)
+        write(*arguments)
+
+    monkeypatch.setattr(marks, "write_made_here", and_exchanged)
+    done = invoke("plot", out, "--dpi", "40")
+    assert (done.exit_code, "was replaced while it was read: rerun the command" in done.stderr) == (1, True)
 
 
 def test_draw_surface__without_bounds(tmp_path, words):

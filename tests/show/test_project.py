@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import zipfile
 from collections import Counter
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import rasterio
 from finished import PLACE, no_bands, random_bands, without_intervals, write_points, write_run, write_surface
-from helpers import fail, flip_bit, invoke
+from helpers import exchanged, fail, flip_bit, invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from rasterio.crs import CRS
@@ -21,7 +22,7 @@ from sat_intervals.products import INVALID
 from sat_intervals.raster import ControlPoint, Georeferencing
 from sat_intervals.show import project
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
-from sat_intervals.show.styles import write_difference
+from sat_intervals.show.styles import difference
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 
@@ -111,12 +112,12 @@ def test_widths__are_differences_at_the_same_place(run):
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_write_difference__keeps_control_points(tmp_path, run):
+def test_difference__keeps_control_points(tmp_path, run):
     points = tuple(
         ControlPoint(row, column, 5 + column / 9, 44 - row / 9, 30.0) for row in (0, 60) for column in (0, 80)
     )
     place = Georeferencing(gcps=points, gcps_crs=CRS.from_epsg(4326))
-    write_difference(run[0] / "gcps.vrt", ("intervals.tif", 3, 2), place, (60, 80))
+    (run[0] / "gcps.vrt").write_bytes(difference(("intervals.tif", 3, 2), place, (60, 80)))
     with rasterio.open(run[0] / "gcps.vrt") as dataset:
         assert Georeferencing.of(dataset) == place
 
@@ -184,15 +185,40 @@ def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_
     assert invoke("project", write_run(tmp_path / "none", *no_bands(30, 20))).exit_code == 0
 
 
+def files_in(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("last", ["_project", "write_made_here"])
+def test_write_project__replaces_nothing_of_another_run_that_takes_the_folders_name(run, monkeypatch, last):
+    out, _, _ = run
+    other = out.with_name("other")
+    shutil.copytree(out, other)
+    assert invoke("project", out).exit_code == invoke("project", other).exit_code == 0
+    before = files_in(out), files_in(other)
+    step = getattr(project, last)
+
+    def and_exchanged(*arguments):
+        exchanged(out, other)
+        return step(*arguments)
+
+    monkeypatch.setattr(project, last, and_exchanged)
+    done = invoke("project", out)
+    assert (done.exit_code, "was replaced while it was read: rerun the command" in done.stderr) == (1, True), (
+        done.output
+    )
+    assert (files_in(other), files_in(out)) == before
+
+
 @pytest.mark.parametrize("name", ["width.vrt.msk", "dsm_half_width.vrt.ovr"])
 def test_project__ends_where_a_file_appears_beside_its_rasters(run, monkeypatch, name):
     out, _, _ = run
 
     def and_appears(*arguments):
         (out / name).write_text("mine")
-        return write_difference(*arguments)
+        return difference(*arguments)
 
-    monkeypatch.setattr(project.styles, "write_difference", and_appears)
+    monkeypatch.setattr(project.styles, "difference", and_appears)
     done = invoke("project", out)
     assert (done.exit_code, f"{name} changes what is read from" in done.stderr) == (2, True), done.output
     assert not (out / "project.qgz").exists()
