@@ -34,14 +34,14 @@ class Stream:
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
         with ExitStack() as files:
-            self._strips = [files.enter_context(TemporaryFile(dir=folder)) for _ in self._shapes]
+            self._strips = [files.enter_context(TemporaryFile(prefix="strips-", dir=folder)) for _ in self._shapes]
             self._buffers = [self._buffer(width) for _, width in self._shapes]
             self._files = files.pop_all()
         self.parts: list[list[Part]] = [[] for _ in self._shapes]
 
     def _buffer(self, width: int) -> np.ndarray:
         shape = len(self._file.bands), BLOCK, width
-        with TemporaryFile(dir=self._folder) as stream:
+        with TemporaryFile(prefix="strips-", dir=self._folder) as stream:
             # a full disk is an error here, not a signal later
             os.posix_fallocate(stream.fileno(), 0, int(np.prod(shape)) * np.dtype(self._file.dtype).itemsize)
             return np.memmap(stream, self._file.dtype, "r+", shape=shape)

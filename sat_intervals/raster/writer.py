@@ -34,7 +34,7 @@ from sat_intervals.store.folder import LocalFolder
 # of a killed process are replaced, others stay.
 _SCRATCH, _MADE = ".unpublished-{}", ".sat-intervals.files"
 # Names there: a final one, an unfinished one, and those of GDAL beside both.
-_UNFINISHED = r"(?:strips-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?"
+_UNFINISHED = r"(?:strips-(?:[0-9a-f]+-)?)?(?:{})(?:\.aux\.xml|(?:\.warped\.tif|\.msk)?(?:\.ovr)?\.tmp)?|strips-\w{{8}}"
 # Tags in the file itself, not in another beside it.
 _PNG = {"WRITE_METADATA_AS_TEXT": "YES"}
 # GDAL's block cache in bytes; the default is a twentieth of the memory.

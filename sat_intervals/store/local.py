@@ -10,15 +10,13 @@ import time
 import uuid
 import zlib
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from glob import escape
-from itertools import groupby
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, open_regular
-from sat_intervals.store.open_folder import empty, opened, read_small, write_new
+from sat_intervals.store.open_folder import empty, opened, read_small, remove_empty, write_new
 
 # File with the `mark` of the run that made a folder. Its name outlasts a power loss, which empties files.
 MADE = ".sat-intervals.tiles"
@@ -28,8 +26,6 @@ _LOCK = ".sat-intervals.lock"
 _FILES = "files"
 # Seconds to wait for a lock.
 _TIMEOUT = 0.2
-# Empty folders deleted at once.
-_AT_ONCE = 16
 # Status of the folders that this process has locked, by path.
 _LOCKED: dict[Path, os.stat_result] = {}
 
@@ -169,21 +165,13 @@ class LocalFolder:
                 raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
             yield folder, str(place.relative_to(top))
 
-    def _own(self, name: str) -> Path:
-        """Return the path of a folder that is made or deleted; raise if it would be somebody else's."""
-        with suppress(FileNotFoundError), self._entered(name):
-            pass
-        return self.path / name
-
     def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
         """See `Folder`."""
         for name in names:
             self.delete(name)
-        tops = [self._own(folder) for folder in folders]
-        places = [LocalFolder(Path(place)) for top in tops for place, _, _ in os.walk(top) if not top.is_symlink()]
-        with ThreadPoolExecutor(_AT_ONCE) as threads:  # one after another takes milliseconds each on some disks
-            for _, level in groupby(sorted(places, key=_depth, reverse=True), _depth):
-                list(threads.map(LocalFolder.delete_if_empty, level))
+        for folder in folders:
+            with suppress(FileNotFoundError), self._entered(folder) as (top, place):
+                remove_empty(top, place)
 
     def delete_if_empty(self) -> None:
         """See `Folder`."""
@@ -200,7 +188,9 @@ class LocalFolder:
 
     def make(self, folder: str) -> None:
         """See `Folder`."""
-        self._own(folder).mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError), self._entered(folder):
+            pass
+        (self.path / folder).mkdir(parents=True, exist_ok=True)
 
     def place(self, name: str) -> Path:
         """See `Folder`."""
@@ -301,19 +291,20 @@ class LocalFolder:
                 if not left.is_symlink() and LocalFolder(left).has_lock():
                     with LocalFolder(left)._emptied(pattern):
                         pass
-        with LocalFolder(Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path)))._emptied(pattern) as files:
-            files.mkdir()
-            yield files
+        made = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self.path))
+        with LocalFolder(made)._emptied(pattern) as folder:
+            os.mkdir(_FILES, dir_fd=folder)
+            yield made / _FILES
 
     @contextmanager
-    def _emptied(self, pattern: str) -> Iterator[Path]:
-        """Lock the folder for the block; yield the place of its temporary files, which are then deleted.
+    def _emptied(self, pattern: str) -> Iterator[int]:
+        """Lock and open the folder for the block; yield its descriptor, then delete its temporary files.
 
         They are deleted in this folder, even if a link has taken its place.
         """
         with self.locked(), opened(self.path) as folder:
             try:
-                yield self.path / _FILES
+                yield folder
             finally:
                 try:
                     empty(folder, _FILES, pattern)
@@ -331,10 +322,6 @@ def _raise_unless_missing(error: OSError) -> None:
 def mark(run: str) -> str:
     """Return the content of MADE: the digest of a run and its CRC-32, eight digits."""
     return f"{run}{zlib.crc32(run.encode()):08x}"
-
-
-def _depth(folder: LocalFolder) -> int:
-    return len(folder.path.parts)
 
 
 def _opened(file: Path, flags: int) -> int:

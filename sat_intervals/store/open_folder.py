@@ -6,9 +6,13 @@ import re
 import shutil
 import stat
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
+# Empty folders deleted at once.
+_AT_ONCE = 16
 _FLAGS = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 
 
@@ -54,4 +58,17 @@ def empty(folder: int, name: str, pattern: str) -> None:
                     shutil.rmtree(file, ignore_errors=True, dir_fd=files)
         finally:
             os.close(files)
+        os.rmdir(name, dir_fd=folder)
+
+
+def remove_empty(folder: int, name: str) -> None:
+    """Delete a folder inside an open one, and those in it, as far as they contain no file. Links are not followed."""
+    with suppress(OSError), ThreadPoolExecutor(_AT_ONCE) as threads:  # each takes milliseconds on some disks
+        for _, folders, _, place in os.fwalk(name, topdown=False, dir_fd=folder):
+            list(threads.map(partial(_remove, folder=place), folders))
+        _remove(name, folder)
+
+
+def _remove(name: str, folder: int) -> None:
+    with suppress(OSError):
         os.rmdir(name, dir_fd=folder)

@@ -7,10 +7,11 @@ import shutil
 from contextlib import contextmanager
 
 import pytest
-from helpers import contents
+from helpers import contents, exchanged
 
 from sat_intervals import errors
 from sat_intervals.errors import SatIntervalsError
+from sat_intervals.store import local
 from sat_intervals.store.local import LocalFolder
 
 LOCK = ".sat-intervals.lock"
@@ -177,3 +178,42 @@ def test_locked__nothing_is_changed_in_a_folder_that_took_the_place(tmp_path):
                 change()
         assert contents(tmp_path / "tiles") == before
     folder.write("manifest.json", "text")
+
+
+@pytest.mark.parametrize("taken", ["by a link", "by another folder"])
+def test_delete_all__removes_no_empty_folder_of_what_took_a_place(tmp_path, monkeypatch, taken):
+    (tmp_path / "tiles" / "records" / "empty").mkdir(parents=True)
+    (tmp_path / "mine" / "records" / "empty").mkdir(parents=True)
+    remove = local.remove_empty
+
+    def late(*arguments):
+        if "link" in taken:
+            (tmp_path / "tiles" / "records").rename(tmp_path / "aside")
+            (tmp_path / "tiles" / "records").symlink_to(tmp_path / "mine" / "records")
+        else:
+            exchanged(tmp_path / "tiles", tmp_path / "mine")
+        remove(*arguments)
+
+    monkeypatch.setattr(local, "remove_empty", late)
+    LocalFolder(tmp_path / "tiles").delete_all([], ["records"])
+    mine, own = ("mine", "tiles") if "link" in taken else ("tiles", "mine")
+    assert (tmp_path / mine / "records" / "empty").is_dir()
+    assert (tmp_path / own / "records").is_symlink() == ("link" in taken)
+    assert "link" in taken or not (tmp_path / own / "records").exists()
+
+
+def test_scratch__makes_nothing_behind_a_link_that_took_its_place(tmp_path, monkeypatch):
+    (tmp_path / "mine").mkdir()
+    opened = local.opened
+
+    @contextmanager
+    def late(folder):
+        with opened(folder) as descriptor:
+            folder.rename(tmp_path / "aside")
+            folder.symlink_to(tmp_path / "mine")
+            yield descriptor
+
+    monkeypatch.setattr(local, "opened", late)
+    with LocalFolder(tmp_path).scratch("work", "tiles"):
+        assert (tmp_path / "aside" / "files").is_dir()
+    assert not [*(tmp_path / "mine").iterdir()]
