@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, NonNegativeInt, PositiveInt, ValidationError
+from pydantic import BaseModel, Field, NonNegativeInt, PositiveInt, ValidationError
 
 from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import RunError, SatIntervalsError, open_regular
@@ -43,7 +43,7 @@ class _Section(BaseModel, strict=True):
 
 
 class _File(_Section):
-    path: str
+    path: str = Field(min_length=1)
 
 
 class _Input(_File):
@@ -293,8 +293,10 @@ def open_run(out: str | Path) -> Run:
         raise SatIntervalsError(
             f"{file} is not the report of a run{where}: move it away and match again with --overwrite"
         ) from error
-    places = [_checked_place(out / name, bands, region, files.get(name)) for name, bands in _BANDS.items()]
-    check_steady()
+    try:
+        places = [_checked_place(out / name, bands, region, files.get(name)) for name, bands in _BANDS.items()]
+    finally:
+        check_steady()  # the rasters of another run are not damaged
     return Run(out, report, config, region, which, places[-1])
 
 

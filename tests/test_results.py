@@ -7,10 +7,13 @@ from finished import random_bands, write_run
 from helpers import exchanged, invoke
 
 from sat_intervals import results
+from sat_intervals.errors import ChangedInputError
 
 EDITS = {
     "finished": 7,
     "inputs.left.path": "\ud800.tif",
+    "inputs.left.mask": {"path": ""},
+    "inputs.right.path": "",
     "inputs.right.width": True,
     "inputs.left.height": 10**400,
     "tiles.region.row": 10**400,
@@ -76,6 +79,22 @@ def test_commands__end_where_a_file_with_another_place_appears_beside_the_run(tm
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert "validity.tif.aux.xml changes what is read from" in done.stderr
     assert not [*out.glob("*.qgz"), *out.glob("stac*"), *tmp_path.glob("to/*.tif")]
+
+
+def test_open_run__does_not_call_the_rasters_of_another_run_damaged(tmp_path, monkeypatch):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    out, other = (write_run(tmp_path / name, *random_bands(20, size)) for name, size in (("a", 30), ("b", 31)))
+    which = results._which
+
+    def and_leaves(out):
+        found = which(out)
+        exchanged(out, other)
+        return found
+
+    monkeypatch.setattr(results, "_which", and_leaves)
+    with pytest.raises(ChangedInputError, match=r"was replaced or changed while it was read: rerun the command"):
+        results.open_run(out)
 
 
 @pytest.mark.parametrize("command", [["stac"], ["report"], ["export", "--to", "otb"]])

@@ -59,7 +59,7 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
     if not path.is_symlink():
         check_regular(path, "move it away")
     before = stamps(path.parent, [path.name]) if before is None else before
-    try:
+    with _named(path):
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         scratch = LocalFolder(path.parent).scratch(path.name, "[0-9a-f]{32}.*")
@@ -72,15 +72,27 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
                 os.fsync(file.fileno())  # after a power loss it could be empty
                 if os.fstat(file.fileno()).st_size != written.st_size:
                     raise OutputError(f"{path} was truncated while it was written: rerun the command")
-            if path.name in before and os.path.lexists(path):
-                replace_same(new, path, before[path.name])
-            else:
-                rename_new(new, path)
+            _put(new, path, before)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Turn errors of the block into an OutputError with the name of a file."""
+    try:
+        yield
     except FileExistsError as error:
         raise OutputError(f"{path} was written by another process meanwhile: move it away") from error
     except (*gdal.GDAL_ERRORS, OSError) as error:
         reason = getattr(error, "strerror", None) or gdal.reason(error)
         raise OutputError(f"{path} cannot be written: {reason}: make room or check its rights") from error
+
+
+def _put(new: Path, path: Path, before: Mapping[str, str]) -> None:
+    """Give a file its name; one that is there is replaced only if it has its stamp in ``before``."""
+    if path.name in before and os.path.lexists(path):
+        replace_same(new, path, before[path.name])
+    else:
+        rename_new(new, path)
 
 
 @contextmanager
@@ -114,9 +126,11 @@ def _settle(files: Sequence[Path], report: Path) -> None:
         ours = re.compile(rf"\.sat-intervals\.(?:[0-9a-f]+-[0-9a-f]+|none)\.{re.escape(file.name)}")
         for kept in [other for other in file.parent.iterdir() if ours.fullmatch(other.name)]:
             if kept == _aside(file, report):
+                there = stamps(file.parent, [file.name])
                 check_marked(file)  # of the user's, since the process was killed
-                os.replace(kept, file)
-            kept.unlink(missing_ok=True)  # os.replace does nothing between links to the same file
+                with _named(file):
+                    _put(kept, file, there)
+            kept.unlink(missing_ok=True)
 
 
 def _aside(file: Path, report: Path) -> Path:

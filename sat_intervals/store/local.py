@@ -106,6 +106,9 @@ class LocalFolder:
         """See `Folder`."""
         with self._written(name, content) as (folder, temporary, file):
             os.replace(temporary, file, src_dir_fd=folder, dst_dir_fd=folder)
+            if name == MADE:
+                with suppress(OSError):  # of file systems that flush no folders
+                    os.fsync(folder)
 
     def create(self, name: str, text: str) -> bool:
         """See `Folder`."""

@@ -2,10 +2,11 @@
 
 import os
 
+import numpy as np
 import pytest
 from helpers import contents
 
-from sat_intervals.raster import OutputError, layers, put_back, stamps
+from sat_intervals.raster import MARK, Georeferencing, OutputError, layers, put_back, stamps, write_layer
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -90,6 +91,27 @@ def test_put_back__leaves_what_is_published(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert contents(tmp_path) == {str(file): b"new", str(report): b"new"}
+
+
+def test_put_back__keeps_a_file_that_comes_at_the_last_moment(tmp_path, monkeypatch):
+    file, report = tmp_path / "left.tif", tmp_path / "run.json"
+    write_layer(file, np.zeros((8, 8), np.uint8), 0, Georeferencing(), MARK)
+    report.write_text("before")
+    check = layers.check_marked
+
+    def and_comes(path):
+        check(path)
+        (tmp_path / "mine").write_text("mine")
+        (tmp_path / "mine").replace(path)
+
+    def interrupted():
+        with put_back([file], report):
+            monkeypatch.setattr(layers, "check_marked", and_comes)
+            raise KeyboardInterrupt
+
+    with pytest.raises(OutputError, match=r"left\.tif was written by another process meanwhile: move it away"):
+        interrupted()
+    assert file.read_text() == "mine"
 
 
 def test_whole_file__is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ from helpers import contents, exchanged
 from sat_intervals import errors
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store import local
-from sat_intervals.store.local import LocalFolder
+from sat_intervals.store.local import MADE, LocalFolder
 
 LOCK = ".sat-intervals.lock"
 
@@ -217,3 +217,11 @@ def test_scratch__makes_nothing_behind_a_link_that_took_its_place(tmp_path, monk
     with LocalFolder(tmp_path).scratch("work", "tiles"):
         assert (tmp_path / "aside" / "files").is_dir()
     assert not [*(tmp_path / "mine").iterdir()]
+
+
+def test_write__of_the_mark_flushes_its_name(tmp_path, monkeypatch):
+    """Else files of a run could outlast a power loss without any sign that a run made them."""
+    flushed = []
+    monkeypatch.setattr(os, "fsync", lambda file: flushed.append((os.fstat(file).st_ino, os.listdir(file))))
+    LocalFolder(tmp_path).write(MADE, "mark")
+    assert flushed == [(tmp_path.stat().st_ino, [MADE])]
