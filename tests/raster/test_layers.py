@@ -106,6 +106,7 @@ def test_put_back__keeps_a_file_that_comes_at_the_last_moment(tmp_path, monkeypa
 
     def interrupted():
         with put_back([file], report):
+            write_layer(file, np.ones((8, 9), np.uint8), 0, Georeferencing(), MARK)
             monkeypatch.setattr(layers, "check_marked", and_comes)
             raise KeyboardInterrupt
 
