@@ -168,7 +168,9 @@ def _is_same(file: Path, new: Path) -> bool:
 
 
 def rename_new(source: Path, target: Path) -> None:
-    """Rename a file, but never over another."""
+    """Rename a file that is no folder, but never over another."""
+    if source.is_dir() and not source.is_symlink():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     try:
         os.link(source, target, follow_symlinks=False)
     except (FileExistsError, FileNotFoundError):

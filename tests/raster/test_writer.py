@@ -357,6 +357,17 @@ def test_put_back__of_a_killed_process_keeps_a_file_that_came_after_it(tmp_path)
     assert file.read_text() == "mine"
 
 
+def test_output_writer__leaves_a_folder_among_the_replaced_files_where_it_is(tmp_path):
+    mine = tmp_path / ".unpublished-intervals.tif" / "files" / "replaced" / "run.json" / "mine.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    (tmp_path / ".unpublished-intervals.tif" / ".sat-intervals.files").touch()
+    with writer(tmp_path) as output:
+        output.write(0, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+        output.publish(("run.json", "{}"))
+    assert ((tmp_path / "run.json").read_text(), mine.read_text()) == ("{}", "mine")
+
+
 def test_output_writer__deletes_no_file_with_a_name_like_that_of_its_own(tmp_path):
     place = tmp_path / ".unpublished-intervals.tif" / "files"
     (place / "replaced").mkdir(parents=True)
