@@ -197,8 +197,7 @@ class Results(Run):
     @property
     def images(self) -> list[Image]:
         """Return all images that were opened: left, right and, if known, the truth."""
-        images = [self.left, self.right]
-        return [*images, self.truth.image] if self.truth else images
+        return [self.left, self.right, *([self.truth.image] if self.truth else [])]
 
     def read(self, window: Window) -> Bands:
         """Read bands, left image and truth of a window of the results."""
@@ -213,8 +212,7 @@ class Results(Run):
 
     def strips(self) -> Iterator[tuple[int, Bands]]:
         """Yield the first row and the content (see `read`) of each strip, from the top."""
-        for window in self.windows():
-            yield window.row, self.read(window)
+        yield from ((window.row, self.read(window)) for window in self.windows())
 
     def read_small(self, shape: tuple[int, int]) -> Bands:
         """Read all bands and the left image at ``shape`` pixels: bands subsampled, the image averaged; no truth."""

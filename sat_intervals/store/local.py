@@ -16,10 +16,11 @@ from glob import escape
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, open_regular
-from sat_intervals.store.open_folder import empty, opened, read_small, remove_empty, write_new
+from sat_intervals.store.open_folder import empty, flush_names, opened, read_small, remove_empty, write_new
 
-# File with the `mark` of the run that made a folder. Its name outlasts a power loss, which empties files.
-MADE = ".sat-intervals.tiles"
+# Marks are few, and outlast a power loss. MADE has the `mark` of the run that made a folder.
+_MARKS = ".sat-intervals."
+MADE = f"{_MARKS}tiles"
 # The lock file is regular and empty; any other file of this name is left unchanged.
 _LOCK = ".sat-intervals.lock"
 # Folder of the files of `LocalFolder.scratch`, beside the lock.
@@ -106,9 +107,8 @@ class LocalFolder:
         """See `Folder`."""
         with self._written(name, content) as (folder, temporary, file):
             os.replace(temporary, file, src_dir_fd=folder, dst_dir_fd=folder)
-            if name == MADE:
-                with suppress(OSError):  # of file systems that flush no folders
-                    os.fsync(folder)
+            if name.startswith(_MARKS):
+                flush_names(folder)
 
     def create(self, name: str, text: str) -> bool:
         """See `Folder`."""
@@ -130,7 +130,7 @@ class LocalFolder:
             with self._entered(name) as (folder, file):
                 temporary = os.path.join(os.path.dirname(file), f".{os.path.basename(file)}.{uuid.uuid4().hex}")
                 try:
-                    write_new(temporary, content, folder)
+                    write_new(temporary, content, folder, is_flushed=name.startswith(_MARKS))
                     yield folder, temporary, file
                 finally:
                     with suppress(FileNotFoundError):

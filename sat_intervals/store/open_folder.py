@@ -26,10 +26,19 @@ def opened(folder: Path) -> Iterator[int]:
         os.close(descriptor)
 
 
-def write_new(name: str, content: bytes, folder: int) -> None:
+def write_new(name: str, content: bytes, folder: int, *, is_flushed: bool) -> None:
     """Write a new file in an open folder."""
     with open(name, "xb", opener=lambda path, flags: os.open(path, flags, 0o666, dir_fd=folder)) as stream:
         stream.write(content)
+        if is_flushed:
+            stream.flush()
+            os.fsync(stream.fileno())
+
+
+def flush_names(folder: int) -> None:
+    """Flush new names in an open folder to the disk, where its file system does that."""
+    with suppress(OSError):
+        os.fsync(folder)
 
 
 def read_small(name: str, folder: int) -> str | None:

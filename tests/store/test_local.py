@@ -4,6 +4,7 @@ import errno
 import os
 import resource
 import shutil
+import stat
 from contextlib import contextmanager
 
 import pytest
@@ -13,6 +14,7 @@ from sat_intervals import errors
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.store import local
 from sat_intervals.store.local import MADE, LocalFolder
+from sat_intervals.store.marks import FINISHED, REPLACING
 
 LOCK = ".sat-intervals.lock"
 
@@ -219,9 +221,16 @@ def test_scratch__makes_nothing_behind_a_link_that_took_its_place(tmp_path, monk
     assert not [*(tmp_path / "mine").iterdir()]
 
 
-def test_write__of_the_mark_flushes_its_name(tmp_path, monkeypatch):
-    """Else files of a run could outlast a power loss without any sign that a run made them."""
+@pytest.mark.parametrize("name", [MADE, FINISHED, REPLACING])
+def test_write__of_a_mark_flushes_its_content_and_then_its_name(tmp_path, monkeypatch, name):
+    """Else files of a run could outlast a power loss without any sign that a run made them, or has finished."""
     flushed = []
-    monkeypatch.setattr(os, "fsync", lambda file: flushed.append((os.fstat(file).st_ino, os.listdir(file))))
-    LocalFolder(tmp_path).write(MADE, "mark")
-    assert flushed == [(tmp_path.stat().st_ino, [MADE])]
+
+    def flush(file):
+        is_folder = stat.S_ISDIR(os.fstat(file).st_mode)
+        flushed.append(os.listdir(file) if is_folder else os.fstat(file).st_size)
+
+    monkeypatch.setattr(os, "fsync", flush)
+    LocalFolder(tmp_path).write(name, "mark")
+    LocalFolder(tmp_path).write("other", "text")
+    assert flushed == [4, [name]]
