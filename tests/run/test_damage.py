@@ -511,10 +511,10 @@ def test_write__changes_nothing_in_a_folder_that_takes_the_place_of_an_open_one(
         (tmp_path / "own").rename(tmp_path / "moved")
         (tmp_path / "mine").rename(tmp_path / "own")
 
-    def late(*arguments):
+    def late(*arguments, **named):
         if moment == "opened":
             exchange()
-        write_new(*arguments)
+        write_new(*arguments, **named)
         if moment == "written":
             exchange()
 
