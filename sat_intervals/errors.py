@@ -49,6 +49,13 @@ def check_regular(path: str | os.PathLike[str], way_out: str = "give a regular f
     _check_kind(path, status, way_out)
 
 
+def check_file(path: str | os.PathLike[str], way_out: str) -> None:
+    """Raise if a path is no file: it is missing, or a folder."""
+    if not os.path.isfile(path):
+        reason = "is a folder" if os.path.isdir(path) else "no such file"
+        raise SatIntervalsError(f"{os.fspath(path)}: {reason}: {way_out}")
+
+
 def open_regular(path: str | os.PathLike[str]) -> BufferedReader:
     """Open a file for reading; raise as `check_regular` also if something else takes its place meanwhile."""
     check_regular(path)

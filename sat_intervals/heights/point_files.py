@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_regular
+from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_file, check_regular
 from sat_intervals.raster import GROUND, Frame, Vertical, stamps
 from sat_intervals.raster.identity import watched
 
@@ -51,8 +51,7 @@ class PointFile:
     """
 
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
-        if not path.is_file():
-            raise SatIntervalsError(f"{path}: no such file: give a file of points")
+        check_file(path, "give a file of points")
         self._path, ending = path, path.suffix.lower()
         readers = {".csv": (_crs_of_table, _table), ".las": (_crs_of_las, _las), ".laz": (_crs_of_las, _las)}
         crs_of, self._parts = readers.get(ending, (_crs_of_vectors, _vectors))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.grids import read_grid
 from sat_intervals.kernels.lattice import interpolate
 from sat_intervals.raster import GROUND, Georeferencing, watched_rasters
@@ -109,8 +109,7 @@ class Sensors:
 
 
 def _read(path: Path, kind: str, reader: Any) -> Any:
-    if not path.is_file():
-        raise SatIntervalsError(f"{path}: no such file: give the {kind} of the image")
+    check_file(path, f"give the {kind} of the image")
     try:
         with warnings.catch_warnings(action="ignore"):
             return reader(str(path))

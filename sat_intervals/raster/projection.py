@@ -10,7 +10,7 @@ from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 from pyproj.exceptions import CRSError, ProjError
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.raster.georeferencing import Georeferencing
 
 _GEOGRAPHIC = "EPSG:4326"
@@ -141,8 +141,7 @@ def undulation(geoid: Transformer | None, longitude: np.ndarray, latitude: np.nd
 
 def geoid_grid(path: Path) -> Transformer:
     """Return a transformer from heights above the ellipsoid to heights above a geoid (degrees, metres)."""
-    if not path.is_file():
-        raise SatIntervalsError(f"{path}: no such file: give a grid of geoid heights")
+    check_file(path, "give a grid of geoid heights")
     if "," in str(path.resolve()):
         raise SatIntervalsError(f"{path.resolve()}: PROJ reads no file with a comma in its path: rename it")
     radians = "+proj=unitconvert +xy_in=deg +xy_out=rad"

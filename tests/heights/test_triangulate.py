@@ -452,7 +452,11 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     command = ["surface", *images, str(out), *sensors, *search, "--resolution", "1"]
     wrong = invoke(*command[:-1], "-1")
     assert (wrong.exit_code, wrong.stderr.count("\n"), out.exists()) == (2, 1, False)
-    for option, value, message in (("--crs", "4326", "is not a map in metres"), ("--geoid", "no.gtx", "no such file")):
+    for option, value, message in (
+        ("--crs", "4326", "is not a map in metres"),
+        ("--geoid", "no.gtx", "no.gtx: no such file"),
+        ("--geoid", str(tmp_path), f"{tmp_path}: is a folder: give a grid of geoid heights"),
+    ):
         wrong = invoke(*command, option, value)
         assert (wrong.exit_code, message in wrong.stderr, out.exists()) == (2, True, False)
     (tmp_path / "heights.yaml").write_text(
