@@ -31,9 +31,9 @@ def write(output: Path, head: str, content: dict[str, Any]) -> None:
     """Write a file; ``head`` is its explanation, lines of comments."""
     import yaml
 
-    from sat_intervals.raster import stamps, whole_file
+    from sat_intervals.raster import examined, whole_file
 
-    there = stamps(output.parent, [output.name])
-    checked_folder(output, head)  # again, after hours
+    with examined(output.parent, [output.name]) as there:
+        checked_folder(output, head)  # again, after hours
     with whole_file(output, there) as new:
         new.write_text(head + yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")

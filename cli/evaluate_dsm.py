@@ -104,7 +104,7 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     from sat_intervals.cli.tables import surface_markdown
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
     from sat_intervals.evaluate.dsm import read_profile
-    from sat_intervals.raster import whole_file
+    from sat_intervals.raster import examined, whole_file
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
 
     texts, paths = [folder / name for name in _TEXTS], [folder / name for name in _PICTURES]
@@ -112,8 +112,10 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
     content = json.dumps({"software": _SOFTWARE} | report, indent=1), surface_markdown(str(given.dsm), report)
+    with examined(folder, _TEXTS) as there:
+        _check_texts(folder)
     for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
-        with whole_file(path) as new:
+        with whole_file(path, there) as new:
             new.write_text(text, encoding="utf-8")
             _check_texts(folder)  # again: a file may have appeared meanwhile
     draw_reliability(report, paths[0], names[0])

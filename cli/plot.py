@@ -55,12 +55,12 @@ def plot(
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.raster import stamps, watched_images
+    from sat_intervals.raster import watched_images
     from sat_intervals.results import open_results
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
-    from sat_intervals.show.marks import check_made_here, write_made_here
+    from sat_intervals.show.marks import replaceable_here, write_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
     from sat_intervals.show.search_range import draw_range, has_range
 
@@ -78,11 +78,11 @@ def plot(
     if pixel:
         drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
     check_unchanged = watched_images(results.images, judging["mask"])
-    there, pictures = stamps(out, [f"{name}.png" for name in PICTURES]), dict[Path, BytesIO]()
+    pictures = dict[Path, BytesIO]()
     with results.unchanged("dsm.tif"):
         if _is_current(surface := out / "dsm.tif", results.report["finished"]):
             drawings["dsm"] = lambda target: draw_surface(surface, target, dpi)
-        check_made_here(out / f"{name}.png" for name in drawings)
+        there = replaceable_here(out, [f"{name}.png" for name in drawings])
         for name, draw in drawings.items():
             draw(pictures.setdefault(out / f"{name}.png", BytesIO()))
         check_unchanged()

@@ -93,8 +93,8 @@ def make_surface(
     path, geoid = Path(path), None if geoid is None else Path(geoid)
     inputs = [*(Path(out) / "points.tif" for out in outs), geoid, resolution if isinstance(resolution, Path) else None]
     check_unchanged = watched_rasters(inputs)
-    there = replaceable(path.parent, [surface_file(path.name)])
-    grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius, geoid)
+    with replaceable(path.parent, [surface_file(path.name)]) as there:
+        grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius, geoid)
     runs = _runs(outs, path, inputs)
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)

@@ -121,9 +121,9 @@ def make_truth(
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    there = replaceable(path.parent, [truth_file(path.name)])
-    check_made_by(path, "reference", "REFERENCE")
-    check_as_made(path)
+    with replaceable(path.parent, [truth_file(path.name)]) as there:
+        check_made_by(path, "reference", "REFERENCE")
+        check_as_made(path)
     check_place(path)
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
     check_rasters = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])

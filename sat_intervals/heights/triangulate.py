@@ -14,7 +14,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.progress import Progress
-from sat_intervals.raster import POINT_FILES, OutputWriter, read_tags
+from sat_intervals.raster import POINT_FILES, OutputWriter, examined, read_tags
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.published import POINTS_FILE, POINTS_REPORT, published_points
 from sat_intervals.results import Run, open_run
@@ -80,7 +80,8 @@ def triangulate(
     tags = {"RUN": run.report["finished"], "LEFT_MODEL": str(left_model), "RIGHT_MODEL": str(right_model)}
     tally = _Tally()
     with OutputWriter(run.out, POINT_FILES, *run.shape, run.georeferencing, tags) as writer:
-        _check_own(run.out)  # now that the writer knows which files there are: it replaces no others
+        with examined(run.out, [POINTS_FILE, POINTS_REPORT]) as there:
+            _check_own(run.out)
         for window, disparities in _strips(run):
             bands = _bands(lattice, window, disparities)
             writer.write(window.row, bands)
@@ -88,7 +89,7 @@ def triangulate(
             progress("points", window.row_stop, run.shape[0])
         progress("files", 0, 1)
         files = writer.build()
-        writer.publish((POINTS_REPORT, json.dumps({"files": files}, indent=1) + "\n"))
+        writer.publish((POINTS_REPORT, json.dumps({"files": files}, indent=1) + "\n"), replaceable=there)
         progress("files", 1, 1)
     more = {"file": files[POINTS_FILE], "median_residual": lattice.residual}
     return tally.report() | _beyond(sensors.left_grid, run) | more

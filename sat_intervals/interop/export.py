@@ -13,7 +13,7 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import LEFT_WINDOW, Band, Bands
-from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_made_by
+from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_made_by, examined
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window, strips
 
@@ -116,12 +116,13 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
     run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
     place = Georeferencing(transform=run.left_georeferencing.transform if form == "otb" else None)
     with OutputWriter(folder, files, *shape, place, {**MARK, _FORMAT: form}) as writer:
-        for file in files:  # now that the writer knows which files there are: it replaces no others
-            check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
+        with examined(folder, [file.name for file in files]) as there:
+            for file in files:
+                check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))
-        writer.publish()
+        writer.publish(replaceable=there)
     return [folder / file.name for file in files]
 
 

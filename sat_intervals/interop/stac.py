@@ -17,12 +17,12 @@ from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
 from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
 from sat_intervals.raster import (
     Georeferencing,
+    examined,
     footprint,
     read_layers,
     read_place,
     read_shape,
     read_tags,
-    stamps,
     whole_file,
 )
 from sat_intervals.raster.published import check_points
@@ -69,11 +69,11 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     run = open_run(out)
     file = run.out / "stac.json"
     run.check_kept([file])
-    there = stamps(run.out, [file.name])
-    _check_own(file)
+    with examined(run.out, [file.name]) as there:
+        _check_own(file)
     with run.unchanged("points.tif", "dsm.tif", "overview.png"):
         item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
-    with whole_file(file, there) as new:
+    with run.unchanged(), whole_file(file, there) as new:
         new.write_text(json.dumps(item, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         _check_own(file)  # again: a file may have appeared meanwhile
     return file

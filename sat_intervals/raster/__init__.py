@@ -9,6 +9,7 @@ from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
 from sat_intervals.raster.heightfield import GROUND, HeightRaster
+from sat_intervals.raster.hidden import remove_scratch, replaceable, restore
 from sat_intervals.raster.images import Image, check_as_opened, check_pair, open_image, watched_images
 from sat_intervals.raster.layers import (
     MARK,
@@ -30,7 +31,7 @@ from sat_intervals.raster.layers import (
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
-from sat_intervals.raster.publishing import OutputError, stamps
+from sat_intervals.raster.publishing import OutputError, examined, stamps
 from sat_intervals.raster.seal import check_place
 from sat_intervals.raster.space import check_space, file_bytes, part_bytes
 from sat_intervals.raster.surfaces import (
@@ -42,7 +43,7 @@ from sat_intervals.raster.surfaces import (
     resolution_of,
 )
 from sat_intervals.raster.windows import Layer, read_views, read_window
-from sat_intervals.raster.writer import OutputWriter, remove_scratch, replaceable, restore
+from sat_intervals.raster.writer import OutputWriter
 
 __all__ = [
     "BLOCK",
@@ -74,6 +75,7 @@ __all__ = [
     "codec_versions",
     "compressed",
     "covered_window",
+    "examined",
     "factors",
     "file_bytes",
     "footprint",

@@ -21,7 +21,7 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import OutputError, check_own, pinned, rename_new, replace_same, stamps
+from sat_intervals.raster.publishing import OutputError, check_own, examined, pinned, rename_new, replace_same, stamps
 from sat_intervals.raster.seal import check_beside, check_place, is_as_made
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
@@ -58,11 +58,11 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
     path = Path(path)
     if not path.is_symlink():
         check_regular(path, "move it away")
-    before = stamps(path.parent, [path.name]) if before is None else before
-    with _named(path):
+    with _named(path), pinned(path.parent.resolve()) as parent:  # nothing is done in a folder that takes its place
+        before = stamps(parent, [path.name]) if before is None else before
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        scratch = LocalFolder(path.parent).scratch(path.name, "[0-9a-f]{32}.*")
+        scratch = LocalFolder(parent).scratch(path.name, "[0-9a-f]{32}.*")
         with scratch as folder, pinned(folder) as own:
             new = own / f"{uuid.uuid4().hex}{path.suffix}"  # nobody can put a link there before
             yield new
@@ -72,7 +72,15 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
                 os.fsync(file.fileno())  # after a power loss it could be empty
                 if os.fstat(file.fileno()).st_size != written.st_size:
                     raise OutputError(f"{path} was truncated while it was written: rerun the command")
-            _put(new, path, before)
+            _check_folder(path, parent)
+            _put(new, parent / path.name, before)
+        _check_folder(path, parent)
+
+
+def _check_folder(path: Path, parent: Path) -> None:
+    """Raise if another folder has taken the place of the open one of a file."""
+    if not os.path.samestat(path.parent.stat(), parent.stat()):
+        raise OutputError(f"{path.parent} was replaced by another folder meanwhile: rerun the command")
 
 
 @contextmanager
@@ -126,8 +134,8 @@ def _settle(files: Sequence[Path], report: Path) -> None:
         ours = re.compile(rf"\.sat-intervals\.(?:[0-9a-f]+-[0-9a-f]+|none)\.{re.escape(file.name)}")
         for kept in [other for other in file.parent.iterdir() if ours.fullmatch(other.name)]:
             if kept == _aside(file, report):
-                there = stamps(file.parent, [file.name])
-                check_marked(file)  # of the user's, since the process was killed
+                with examined(file.parent, [file.name]) as there:
+                    check_marked(file)  # of the user's, since the process was killed
                 with _named(file):
                     _put(kept, file, there)
             kept.unlink(missing_ok=True)
@@ -213,14 +221,15 @@ def write_once(
         The file has other content, and ``overwrite`` is not set or the file has no mark; or see `check_place`.
     """
     check_place(path, has_transform=georeferencing.transform is not None)
-    if path.exists():
-        with suppress(SatIntervalsError):
-            if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
-                return
-        if not overwrite:
-            raise SatIntervalsError(f"{path} has other content: choose another folder or --overwrite")
-        check_marked(path)
-    write_layer(path, pixels, nodata, georeferencing, MARK)
+    with examined(path.parent, [path.name]) as there:
+        if path.exists():
+            with suppress(SatIntervalsError):
+                if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
+                    return
+            if not overwrite:
+                raise SatIntervalsError(f"{path} has other content: choose another folder or --overwrite")
+            check_marked(path)
+    _write(path, [pixels[np.newaxis]], pixels.dtype, (1, *pixels.shape), georeferencing, MARK, nodata, there)
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:

@@ -10,10 +10,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.raster.identity import watched
 
 # Reports that are published with files: of a run, and of its points.
-REPORTS = "run.json", "points.json"
+RUN_REPORT = "run.json"
+REPORTS = RUN_REPORT, "points.json"
 # Arguments of Linux' renameat2: paths are relative to the working directory; exchange two files.
 _HERE, _EXCHANGE = -100, 2
 # Folder of the replaced files, among the finished ones.
@@ -49,7 +51,7 @@ def check_own(file: Path) -> os.stat_result:
     """
     status = file.lstat()
     if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
-        raise OSError(errno.ESTALE, f"its temporary file {file.name} was replaced")
+        raise _replaced(file)
     return status
 
 
@@ -61,8 +63,17 @@ def open_own(file: Path, flags: int) -> int:
     OSError
         A link took its place, of either kind.
     """
-    check_own(file)
-    return os.open(file, flags | os.O_NOFOLLOW)
+    there = check_own(file)
+    descriptor = os.open(file, flags | os.O_NOFOLLOW)
+    status = os.fstat(descriptor)
+    if not os.path.samestat(there, status) or status.st_nlink > 1:
+        os.close(descriptor)
+        raise _replaced(file)
+    return descriptor
+
+
+def _replaced(file: Path) -> OSError:
+    return OSError(errno.ESTALE, f"its temporary file {file.name} was replaced")
 
 
 class OutputError(SatIntervalsError):
@@ -79,9 +90,28 @@ def stamps(folder: Path, names: Iterable[str]) -> dict[str, str]:
     return found
 
 
+@contextmanager
+def examined(folder: Path, names: Iterable[str]) -> Iterator[dict[str, str]]:
+    """Yield the `stamps` of files that the block examines, to replace them later.
+
+    Raises
+    ------
+    ChangedInputError
+        At the end of the block: one came, went or changed meanwhile, so that another one may have been examined.
+    """
+    names = tuple(names)
+    check = watched((folder / name for name in names), is_local=True)
+    there = stamps(folder, names)
+    yield there
+    check()
+    if stamps(folder, names) != there:
+        raise ChangedInputError(f"files in {folder} came or went while they were examined: rerun the command")
+
+
 def publish(
     finished: Path,
     folder: Path,
+    named: Path,
     names: Sequence[str],
     replaceable: Mapping[str, str],
     failing: Callable[[Path], AbstractContextManager[None]],
@@ -94,8 +124,10 @@ def publish(
     finished
         Folder of the finished files. Existing files are put aside in its folder ``replaced``. If the process is killed,
         `put_back` restores them.
-    folder, names
-        Their new folder, and their names in both.
+    folder, named
+        Their new folder, `pinned`, and its path for messages.
+    names
+        Their names in both.
     replaceable
         `stamps` of the files that may be replaced. A killed process may also have published some of the same files.
     failing
@@ -110,18 +142,21 @@ def publish(
     """
     own: dict[str, os.stat_result] = {}
     for name in names:
-        with failing(folder / name):
+        with failing(named / name):
             own[name] = check_own(finished / name)
     try:
         for name in reversed(names):
-            with failing(folder / name):
-                _put_aside(finished / name, folder / name, replaceable.get(name))
+            with failing(named / name):
+                if not _put_aside(finished / name, folder / name, replaceable.get(name)):
+                    raise OutputError(
+                        f"{named / name} is not of this run, or was changed since it started: move it away"
+                    )
         for name in names:
-            with failing(folder / name):
+            with failing(named / name):
                 rename_new(finished / name, folder / name)
         if stamps(folder, compared) != compared:
-            raise OutputError(f"another program changed temporary files in {folder}: rerun the command")
-        with failing(folder):
+            raise OutputError(f"another program changed temporary files in {named}: rerun the command")
+        with failing(named):
             _flush_names(folder)
     except BaseException:
         for name in names:
@@ -139,10 +174,10 @@ def put_back(finished: Path, folder: Path, names: Iterable[str]) -> None:
             rename_new(finished / REPLACED / name, folder / name)
 
 
-def _put_aside(new: Path, place: Path, stamp: str | None) -> None:
-    """Put a file aside, if it has the stamp or is equal to the new one."""
+def _put_aside(new: Path, place: Path, stamp: str | None) -> bool:
+    """Put a file aside, and return whether it has the stamp or is equal to the new one."""
     if not os.path.lexists(place):
-        return
+        return True
     if place.is_dir() and not place.is_symlink():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     aside = new.parent / REPLACED / new.name
@@ -151,9 +186,10 @@ def _put_aside(new: Path, place: Path, stamp: str | None) -> None:
         os.replace(place, aside)
     there = aside if is_first else place
     if stamps(there.parent, [there.name]).get(there.name) != stamp and not _is_same(there, new):
-        raise OutputError(f"{place} is not of this run, or was changed since it started: move it away")
+        return False
     if not is_first:
         os.unlink(place)
+    return True
 
 
 def _is_same(file: Path, new: Path) -> bool:

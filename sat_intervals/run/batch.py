@@ -17,7 +17,16 @@ from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds
-from sat_intervals.raster import Image, OutputError, open_image, other_files, stamps, watched_rasters, whole_file
+from sat_intervals.raster import (
+    Image,
+    OutputError,
+    examined,
+    open_image,
+    other_files,
+    stamps,
+    watched_rasters,
+    whole_file,
+)
 from sat_intervals.raster.identity import check_not_replaced, identifiers
 from sat_intervals.run.assemble import remove_tiles
 from sat_intervals.run.before import report_before, tidy
@@ -133,8 +142,8 @@ class _Report:
     def __init__(self, folder: Path) -> None:
         self.states: dict[str, dict[str, Any]] = {}
         self._file = folder / REPORT
-        self._there = stamps(folder, [REPORT])
-        read_report(folder)
+        with examined(folder, [REPORT]) as self._there:
+            read_report(folder)
 
     def note(self, states: Mapping[str, dict[str, Any]]) -> None:
         """Add states and write the file; raise if it is no longer the one written before."""

@@ -13,11 +13,11 @@ from sat_intervals.raster import (
     Image,
     check_made_by,
     check_place,
+    examined,
     open_image,
     other_files,
     read_shape,
     read_window,
-    stamps,
     watched_rasters,
     write_rows,
 )
@@ -71,10 +71,10 @@ def replaceable_ranges(path: Path, left: Image, right: Image) -> dict[str, str]:
     SatIntervalsError
         It is a file of the images, was not made by this tool, or GDAL would read another one with it.
     """
-    there = stamps(path.parent, [path.name])
     names = [name for image in (left, right) for name in (image.path, image.mask) if name]
     check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
-    check_made_by(path, "range", _OF)
+    with examined(path.parent, [path.name]) as there:
+        check_made_by(path, "range", _OF)
     check_place(path, has_transform=left.georeferencing.transform is not None)
     return there
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
-from sat_intervals.raster import RUN_FILES, is_marked, restore, stamps
+from sat_intervals.raster import RUN_FILES, examined, is_marked, restore, stamps
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.seal import check_place
 from sat_intervals.store.manifest import SEAL, unsealed
@@ -47,9 +47,9 @@ def replaceable(out: Path, *, overwrite: bool) -> dict[str, str]:
     With ``overwrite`` it does what `check_replaceable` does: files may have appeared or been restored since.
     """
     restore(out, RUN_FILES)
-    there = stamps(out, OUTPUTS)
-    if overwrite:
-        check_replaceable(out)
+    with examined(out, OUTPUTS) as there:
+        if overwrite:
+            check_replaceable(out)
     return there
 
 

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import stamps
-from sat_intervals.show.marks import write_made_here
+from sat_intervals.show.marks import replaceable_here, write_made_here
 
 try:
     from matplotlib import rc_context
@@ -43,7 +42,7 @@ def page(target: Target, size: tuple[float, float], dpi: int, title: str, run: s
 
     The picture notes the ``finished`` of its ``run``.
     """
-    there = stamps(target.parent, [target.name]) if isinstance(target, Path) else {}
+    there = replaceable_here(target.parent, [target.name]) if isinstance(target, Path) else {}
     drawn = BytesIO() if isinstance(target, Path) else target
     with rc_context(_STYLE):
         figure = Figure(size, layout="constrained")

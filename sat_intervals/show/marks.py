@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster import whole_file
+from sat_intervals.raster import examined, whole_file
 
 XML_MARK = "made by sat-intervals"
 """Text of the comment in styles and projects; QGIS removes it when it writes the file again."""
@@ -50,6 +50,20 @@ def is_replaceable(path: Path) -> bool:
     except OSError as error:
         raise SatIntervalsError(f"{path} exists and cannot be read: {error.strerror}: move it away") from error
     return any(mark in beginning for mark in _MARKS)
+
+
+def replaceable_here(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return the `stamps` of files in a folder that may be replaced, after `check_made_here`.
+
+    Raises
+    ------
+    SatIntervalsError
+        See `check_made_here` and `examined`.
+    """
+    names = tuple(names)
+    with examined(folder, names) as there:
+        check_made_here(folder / name for name in names)
+    return there
 
 
 def write_made_here(files: Mapping[Path, bytes], there: Mapping[str, str]) -> None:

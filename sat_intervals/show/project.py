@@ -16,6 +16,7 @@ from sat_intervals.products import BANDS, POINTS, SURFACE
 from sat_intervals.raster import (
     Georeferencing,
     check_place,
+    examined,
     is_surface,
     open_image,
     read_layers,
@@ -24,7 +25,6 @@ from sat_intervals.raster import (
     read_small_image,
     read_small_layers,
     read_tags,
-    stamps,
 )
 from sat_intervals.raster.published import check_points
 from sat_intervals.results import Run, open_run
@@ -76,10 +76,11 @@ class Layer:
 
 @dataclass(frozen=True)
 class Written:
-    """The contents of the files that were written, and lines about what was left out or kept."""
+    """The contents of the files that were written, lines about what was left out or kept, and the files of others."""
 
     files: dict[Path, bytes]
     notes: list[str]
+    kept: set[Path]
 
 
 def write_project(out: str | Path) -> Written:
@@ -98,9 +99,9 @@ def write_project(out: str | Path) -> Written:
     file = run.out / "project.qgz"
     others = [run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt")]
     run.check_kept([file, *others])
-    check_made_here([file])
-    there = stamps(run.out, [path.name for path in (file, *others)])
-    written = Written({}, [])
+    with examined(run.out, [path.name for path in (file, *others)]) as there:
+        check_made_here([file])
+        written = Written({}, [], {path for path in others if not is_replaceable(path)})
     with run.unchanged("points.tif", "dsm.tif"):
         _check_places(run)
         layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
@@ -136,10 +137,9 @@ def _add_defaults(run: Run, layers: list[Layer], written: Written) -> None:
 
 def _is_free(file: Path, written: Written) -> bool:
     """Return whether a file may be written; note if it is kept."""
-    is_free = is_replaceable(file)
-    if not is_free:
+    if is_kept := file in written.kept:
         written.notes.append(f"{file} was not made by sat-intervals and is kept")
-    return is_free
+    return not is_kept
 
 
 def _results(run: Run, written: Written) -> Iterator[Layer]:

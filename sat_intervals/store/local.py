@@ -16,7 +16,15 @@ from glob import escape
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, open_regular
-from sat_intervals.store.open_folder import empty, flush_names, opened, read_small, remove_empty, write_new
+from sat_intervals.store.open_folder import (
+    empty,
+    flush_names,
+    opened,
+    opened_inside,
+    read_small,
+    remove_empty,
+    write_new,
+)
 
 # Marks are few, and outlast a power loss. MADE has the `mark` of the run that made a folder.
 _MARKS = ".sat-intervals."
@@ -128,7 +136,7 @@ class LocalFolder:
         """Write a temporary file, deleted after the block; yield as `_entered`, with its name before the final one."""
         try:
             with self._entered(name) as (folder, file):
-                temporary = os.path.join(os.path.dirname(file), f".{os.path.basename(file)}.{uuid.uuid4().hex}")
+                temporary = f".{file}.{uuid.uuid4().hex}"
                 try:
                     write_new(temporary, content, folder, is_flushed=name.startswith(_MARKS))
                     yield folder, temporary, file
@@ -150,9 +158,9 @@ class LocalFolder:
 
     @contextmanager
     def _entered(self, name: str) -> Iterator[tuple[int, str]]:
-        """Open the folder of the store; yield it, and a name in it. Raise if what is changed would be somebody else's.
+        """Open the folder of a file; yield it, and the file's name in it. Raise if it would be somebody else's.
 
-        What takes the place of the folder meanwhile is not changed.
+        What takes the place of a folder on the way meanwhile is not changed.
         """
         place, top = self.path / name, self._top
         for above in place.parents[: self.depth + len(Path(name).parts)]:
@@ -166,7 +174,9 @@ class LocalFolder:
                 raise OSError(errno.ESTALE, f"{top} has been replaced by a folder that no run made", str(place))
             if made_by and made_by != mark(self.run) and made_by == mark(made_by[:-8]):  # otherwise it is damaged
                 raise OSError(errno.ESTALE, f"{top} has become the folder of another run", str(place))
-            yield folder, str(place.relative_to(top))
+            *way, last = place.relative_to(top).parts or (".",)
+            with opened_inside(folder, way) as inside:
+                yield inside, last
 
     def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
         """See `Folder`."""

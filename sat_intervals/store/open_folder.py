@@ -5,9 +5,9 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +24,17 @@ def opened(folder: Path) -> Iterator[int]:
         yield descriptor
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def opened_inside(folder: int, names: Sequence[str]) -> Iterator[int]:
+    """Open a folder inside an open one, by the names on the way to it, none of which may be a link; yield as above."""
+    with ExitStack() as way:
+        for name in names:
+            descriptor = os.open(name, _FLAGS, dir_fd=folder)
+            way.callback(os.close, descriptor)
+            folder = descriptor
+        yield folder
 
 
 def write_new(name: str, content: bytes, folder: int, *, is_flushed: bool) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers import contents
 
+from sat_intervals.errors import ChangedInputError
 from sat_intervals.raster import MARK, Georeferencing, OutputError, layers, put_back, stamps, write_layer
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -110,7 +111,7 @@ def test_put_back__keeps_a_file_that_comes_at_the_last_moment(tmp_path, monkeypa
             monkeypatch.setattr(layers, "check_marked", and_comes)
             raise KeyboardInterrupt
 
-    with pytest.raises(OutputError, match=r"left\.tif was written by another process meanwhile: move it away"):
+    with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed while it was read"):
         interrupted()
     assert file.read_text() == "mine"
 

@@ -46,6 +46,7 @@ from sat_intervals.raster import (
     publishing,
     read_layers,
     read_window,
+    stamps,
     surface_file,
     whole_file,
     write_layer,
@@ -650,7 +651,7 @@ def produce(folder: Path, products, *, where=None, rows=256, tags=None, publish=
         for row in range(0, len(validity), rows):
             output.write(row, intervals[:, row : row + rows], validity[row : row + rows])
         if publish:
-            output.publish(report)
+            output.publish(report, replaceable=stamps(folder, OUTPUTS))
 
 
 @pytest.mark.parametrize("rows", [37, 256, HEIGHT])
@@ -777,9 +778,10 @@ def publish_where_the_last_fails(folder: Path, products, report=None) -> None:
     intervals, validity = products
     with OutputWriter(folder, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
         output.write(0, intervals, validity)
+        there = stamps(folder, OUTPUTS)
         (folder / "validity.tif").mkdir()
         with pytest.raises(OutputError) as failure:
-            output.publish(report)
+            output.publish(report, replaceable=there)
     message(failure, folder / "validity.tif", "Is a directory")
 
 
@@ -874,7 +876,7 @@ def test_output_writer__publishes_no_file_that_was_damaged_since_it_was_made(tmp
 
     def damaging(writer):
         made = build(writer)
-        file = writer._scratch / "intervals.tif"
+        file = writer._hidden.files / "intervals.tif"
         length = file.stat().st_size
         os.truncate(file, length // 2)
         if damage == "zeroed":

@@ -19,6 +19,7 @@ from sat_intervals.raster import (
     Georeferencing,
     OutputError,
     OutputWriter,
+    hidden,
     layers,
     put_back,
     remove_scratch,
@@ -29,6 +30,7 @@ from sat_intervals.raster import (
 )
 from sat_intervals.raster import writer as raster_writer
 from sat_intervals.raster.files import File
+from sat_intervals.raster.hidden import HiddenFolder
 from sat_intervals.run.pair import match_pair
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -46,10 +48,15 @@ def test_output_writer__adopts_no_folder_through_a_link(tmp_path, inner):
         link.rmdir() if link.exists() else None
     (tmp_path / "out" / ".unpublished-intervals.tif" / inner).symlink_to(precious / inner)
     before = contents(precious)
-    for look in (replaceable, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
+    for look in (examine, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
         with pytest.raises(OutputError, match="is a symbolic link"):
             look(tmp_path / "out", RUN_FILES)
         assert contents(precious) == before
+
+
+def examine(out, files):
+    with replaceable(out, files):
+        pass
 
 
 def writer(out):
@@ -62,7 +69,7 @@ def test_output_writer__deletes_no_files_that_no_process_made(tmp_path):
     for file in (place / "intervals.tif", place.parent / "run.json"):
         file.write_text("mine")
         before = contents(tmp_path)
-        for look in (replaceable, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
+        for look in (examine, restore, remove_scratch, lambda out, files: writer(out).__enter__()):
             with pytest.raises(OutputError, match=f"{file.name} was not written by sat-intervals: move .* away"):
                 look(tmp_path, RUN_FILES)
             assert contents(tmp_path) == before
@@ -145,7 +152,7 @@ def test_output_writer__names_are_on_the_disk_before_replaced_files_are_deleted(
 
 def written(output, *rasters):
     output.write(0, *rasters)
-    output.publish(("run.json", "{}"))
+    output.publish(("run.json", "{}"), replaceable=stamps(output._folder, os.listdir(output._folder)))
 
 
 def test_output_writer__names_a_file_where_a_folder_of_temporary_ones_must_be(tmp_path):
@@ -196,7 +203,8 @@ def test_output_writer__draws_nothing_behind_a_link_with_the_name_of_its_picture
 
 def exchanged_for_run(monkeypatch, step, out, user):
     """Before a step of the writer, put a link to the folder of another run into the place of its finished files."""
-    work = getattr(raster_writer, step)
+    module = hidden if step == "publish" else raster_writer
+    work = getattr(module, step)
 
     def exchanged(*arguments, **named):
         files = out / ".unpublished-intervals.tif" / "files"
@@ -205,7 +213,7 @@ def exchanged_for_run(monkeypatch, step, out, user):
             files.symlink_to(user)
         return work(*arguments, **named)
 
-    monkeypatch.setattr(raster_writer, step, exchanged)
+    monkeypatch.setattr(module, step, exchanged)
 
 
 def test_output_writer__publishes_no_files_of_a_folder_that_took_the_place_of_its_own(tmp_path, monkeypatch):
@@ -383,7 +391,7 @@ def test_output_writer__deletes_no_file_with_a_name_like_that_of_its_own(tmp_pat
 
 @pytest.mark.parametrize("inner", ["files", "files/replaced"])
 def test_output_writer__deletes_nothing_behind_a_link_that_comes_before_it_cleans_up(tmp_path, monkeypatch, inner):
-    out, user, check = tmp_path / "out", tmp_path / "user", OutputWriter._check_folders
+    out, user, check = tmp_path / "out", tmp_path / "user", HiddenFolder.check
     (user / "replaced").mkdir(parents=True)
     for name in OUTPUTS:
         (user / name).write_text("mine")
@@ -393,11 +401,11 @@ def test_output_writer__deletes_nothing_behind_a_link_that_comes_before_it_clean
     def and_exchanged(output):
         check(output)
         folder = out / ".unpublished-intervals.tif" / inner
-        if output._is_published and not folder.is_symlink():
+        if output.is_published and not folder.is_symlink():
             folder.rename(tmp_path / "moved")
             folder.symlink_to(user)
 
-    monkeypatch.setattr(OutputWriter, "_check_folders", and_exchanged)
+    monkeypatch.setattr(HiddenFolder, "check", and_exchanged)
     with writer(out) as output:
         written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
     assert contents(user) == before

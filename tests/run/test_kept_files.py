@@ -825,7 +825,7 @@ def killed(number, *arguments, **options):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
-        patch.setattr("sat_intervals.raster.writer.publish", publish)
+        patch.setattr("sat_intervals.raster.hidden.publish", publish)
         if not number:
             patch.setattr(OutputWriter, "assemble", assemble)
         with pytest.raises(Killed):

@@ -35,7 +35,7 @@ from sat_intervals.products import (
     REGULARIZED,
     Bands,
 )
-from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
+from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, stamps, surface_file, write_layer
 from sat_intervals.results import open_results, open_run
 from sat_intervals.run.statistics import Tally
 from sat_intervals.show import coverage, dsm, maps, marks
@@ -430,7 +430,7 @@ def test_draw_curve__tells_of_what_lies_outside_and_shows_what_has_no_width(run,
         writer.write(0, bands, read_layers(out / "validity.tif")[0])
         report = open_run(out).report
         del report["files"]
-        writer.publish(("run.json", json.dumps(report)))
+        writer.publish(("run.json", json.dumps(report)), replaceable=stamps(out, os.listdir(out)))
     write_layer(tmp_path / "far.tif", np.full((130, 170), 999.5, np.float32), np.nan, PLACE)
     draw_curve(open_results(out, tmp_path / "far.tif"), tmp_path / "curve.png", 60, 90)
     assert "truth 999.50 px, outside the range shown" in words

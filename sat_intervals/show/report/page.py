@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.raster import stamps, watched_images, whole_file
+from sat_intervals.raster import watched_images, whole_file
 from sat_intervals.results import Results
 from sat_intervals.show.legend import PIXEL_CLASSES
-from sat_intervals.show.marks import check_made_here
+from sat_intervals.show.marks import check_made_here, replaceable_here
 from sat_intervals.show.report.contents import Counts, Pixels
 
 
@@ -31,13 +31,12 @@ def write_report(results: Results) -> Path:
     """
     path = results.out / "report.html"
     results.check_kept([path], [results.truth.image.path if results.truth else None])
-    there = stamps(path.parent, [path.name])
-    check_made_here([path])
+    there = replaceable_here(path.parent, [path.name])
     check_images = watched_images(results.images)
     with results.unchanged():  # over all that is read from the run
         page = _page(_contents(results))
     check_images()
-    with whole_file(path, there) as new:
+    with results.unchanged(), whole_file(path, there) as new:
         with results.unchanged():  # another run may have come to the folder
             new.write_text(page, encoding="utf-8")
         check_made_here([path])  # again: a file may have appeared meanwhile
