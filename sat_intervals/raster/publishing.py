@@ -6,6 +6,7 @@ import filecmp
 import json
 import os
 import stat
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
@@ -186,10 +187,20 @@ def _put_aside(new: Path, place: Path, stamp: str | None) -> bool:
         os.replace(place, aside)
     there = aside if is_first else place
     if stamps(there.parent, [there.name]).get(there.name) != stamp and not _is_same(there, new):
+        if is_first:
+            _give_back(aside, place)
         return False
     if not is_first:
         os.unlink(place)
     return True
+
+
+def _give_back(aside: Path, place: Path) -> None:
+    """Return a file that was there for a moment only; if its place is taken again, keep it under a name of its own."""
+    try:
+        rename_new(aside, place)
+    except FileExistsError:
+        os.replace(aside, aside.with_name(f"{aside.name}.{uuid.uuid4().hex}"))
 
 
 def _is_same(file: Path, new: Path) -> bool:

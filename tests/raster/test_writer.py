@@ -6,12 +6,13 @@ import shutil
 import stat
 from contextlib import nullcontext, suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import OUTPUTS, PLACE, STATISTICS, contents, exchanged_for_link
+from helpers import OUTPUTS, PLACE, STATISTICS, contents, exchanged, exchanged_for_link
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.products import BANDS
 from sat_intervals.raster import (
     MARK,
@@ -21,7 +22,9 @@ from sat_intervals.raster import (
     OutputWriter,
     hidden,
     layers,
+    publishing,
     put_back,
+    read_layers,
     remove_scratch,
     replaceable,
     restore,
@@ -410,3 +413,158 @@ def test_output_writer__deletes_nothing_behind_a_link_that_comes_before_it_clean
         written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
     assert contents(user) == before
     assert sorted(file.name for file in out.glob("*.*") if file.is_file()) == OUTPUTS
+
+
+def both(tmp_path):
+    """Two folders with results; return them and the contents of both, by name."""
+    for name, value in (("out", 1), ("other", 2)):
+        with writer(tmp_path / name) as output:
+            written(output, np.full((4, 4, 5), value, np.float32), np.zeros((4, 5), np.uint16))
+    out, other = tmp_path / "out", tmp_path / "other"
+    return out, other, named(out), named(other)
+
+
+def named(folder):
+    return {str(Path(file).relative_to(folder)): content for file, content in contents(folder).items()}
+
+
+def test_output_writer__publishes_in_the_folder_that_it_opened(tmp_path, monkeypatch):
+    out, other, before, mine = both(tmp_path)
+
+    def late(*arguments):
+        exchanged(out, other)
+        publish(*arguments)
+
+    publish = hidden.publish
+    monkeypatch.setattr(hidden, "publish", late)
+    with (
+        pytest.raises(OutputError, match=r"out was replaced by another folder meanwhile: rerun the command"),
+        writer(out) as output,
+    ):
+        written(output, np.full((4, 4, 5), 3, np.float32), np.zeros((4, 5), np.uint16))
+    assert named(out) == mine
+    assert named(other).keys() >= before.keys()
+    assert named(other)["intervals.tif"] != before["intervals.tif"]
+
+
+@pytest.mark.parametrize("moment", ["_put_aside", "rename_new"])
+def test_output_writer__puts_no_file_of_another_folder_aside_that_is_there_for_a_moment(tmp_path, monkeypatch, moment):
+    out, other, _, mine = both(tmp_path)
+    step = getattr(publishing, moment)
+
+    def there_and_back(*arguments):
+        exchanged(out, other)
+        try:
+            return step(*arguments)
+        finally:
+            exchanged(out, other)
+
+    monkeypatch.setattr(publishing, moment, there_and_back)
+    with writer(out) as output:
+        written(output, np.full((4, 4, 5), 3, np.float32), np.zeros((4, 5), np.uint16))
+    assert named(other) == mine
+    assert read_layers(out / "intervals.tif")[0, 0, 0] == 3
+
+
+def test_output_writer__keeps_a_file_that_is_in_the_place_of_a_result_for_a_moment(tmp_path, monkeypatch):
+    """A rerun deletes what was put aside."""
+    out, mine, before = tmp_path / "out", tmp_path / "mine", both(tmp_path)[2]
+    mine.write_text("mine")
+    replace = os.replace
+
+    def of_another(source, target):
+        if target.parent.name == "replaced" and target.name == "intervals.tif" and mine.exists():
+            source.rename(tmp_path / "aside")
+            mine.rename(source)
+            replace(source, target)
+            (tmp_path / "aside").rename(source)
+        else:
+            replace(source, target)
+
+    monkeypatch.setattr(publishing.os, "replace", of_another)
+    zeros = np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16)
+    with pytest.raises(OutputError, match=r"intervals\.tif is not of this run"), writer(out) as output:
+        written(output, *zeros)
+    assert before.items() <= named(out).items()
+    monkeypatch.undo()
+    with writer(out) as output:
+        written(output, *zeros)
+    assert "mine" in [file.read_text() for file in out.rglob("*.*") if file.is_file() and file.suffix != ".tif"]
+
+
+def test_remove_scratch__keeps_what_a_process_put_aside_that_was_killed_before_its_end(tmp_path):
+    """Another folder may have taken the place of the complete one that was to be tidied."""
+    replaced = tmp_path / ".unpublished-intervals.tif" / "files" / "replaced"
+    replaced.mkdir(parents=True)
+    (replaced.parents[1] / ".sat-intervals.files").touch()
+    for name in OUTPUTS:
+        (replaced / name).write_text("of the run before")
+    (tmp_path / "intervals.tif").write_text("of the killed one")
+    before = contents(tmp_path)
+    remove_scratch(tmp_path, RUN_FILES)
+    assert contents(tmp_path) == before
+    for name in OUTPUTS:
+        (tmp_path / name).write_text("complete")
+    remove_scratch(tmp_path, RUN_FILES)
+    assert named(tmp_path) == dict.fromkeys(OUTPUTS, b"complete")
+
+
+def test_open_own__opens_no_hard_link_that_comes_at_the_last_moment(tmp_path, monkeypatch):
+    (tmp_path / "mine").write_text("mine")
+    own = tmp_path / "strips"
+    own.write_text("")
+
+    def and_is_linked(file):
+        found = check(file)
+        own.unlink()
+        os.link(tmp_path / "mine", own)
+        return found
+
+    check = publishing.check_own
+    monkeypatch.setattr(publishing, "check_own", and_is_linked)
+    with pytest.raises(OSError, match="its temporary file strips was replaced"):
+        publishing.open_own(own, os.O_WRONLY)
+
+
+def away_and_back(folder, file):
+    file.rename(folder.parent / "away")
+    yield
+    (folder.parent / "away").rename(file)
+
+
+def exchanged_and_back(folder, file):
+    exchanged(folder, folder.with_name("other"))
+    yield
+    exchanged(folder, folder.with_name("other"))
+    (folder / "new").touch()
+
+
+def comes(folder, file):
+    yield
+    (folder / "new.tif").touch()
+
+
+def goes(folder, file):
+    yield
+    file.unlink()
+
+
+@pytest.mark.parametrize("way", [away_and_back, exchanged_and_back, comes, goes])
+def test_examined__raises_if_another_file_may_have_been_examined(tmp_path, way):
+    folder = tmp_path / "out"
+    for place in (folder, tmp_path / "other"):
+        place.mkdir()
+    (folder / "mine.tif").write_text("mine")
+    names = ["mine.tif", "new.tif"]
+    with publishing.examined(folder, names) as there:
+        (folder / "another").touch()
+    assert there == stamps(folder, names)
+    steps = way(folder, folder / "mine.tif")
+
+    def examine():
+        with publishing.examined(folder, names):
+            next(steps)
+            next(steps, None)
+
+    with pytest.raises(ChangedInputError, match="rerun the command"):
+        examine()

@@ -234,3 +234,24 @@ def test_write__of_a_mark_flushes_its_content_and_then_its_name(tmp_path, monkey
     LocalFolder(tmp_path).write(name, "mark")
     LocalFolder(tmp_path).write("other", "text")
     assert flushed == [4, [name]]
+
+
+@pytest.mark.parametrize("change", [LocalFolder.delete, lambda folder, name: folder.write(name, "own")])
+def test_changes__are_not_made_behind_a_link_that_takes_the_place_of_an_inner_folder(tmp_path, monkeypatch, change):
+    for place in (tmp_path / "tiles" / "records", tmp_path / "mine"):
+        place.mkdir(parents=True)
+        (place / "1_1.json").write_text("mine")
+    enter = local.opened_inside
+
+    @contextmanager
+    def late(*arguments):
+        (tmp_path / "tiles" / "records").rename(tmp_path / "aside")
+        (tmp_path / "tiles" / "records").symlink_to(tmp_path / "mine")
+        with enter(*arguments) as inside:
+            yield inside
+
+    monkeypatch.setattr(local, "opened_inside", late)
+    with pytest.raises(OSError, match="records"):
+        change(LocalFolder(tmp_path / "tiles"), "records/1_1.json")
+    assert (tmp_path / "mine" / "1_1.json").read_text() == "mine"
+    assert [*(tmp_path / "mine").iterdir()] == [tmp_path / "mine" / "1_1.json"]
