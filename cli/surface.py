@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
     from sat_intervals.config import Interval
     from sat_intervals.config.pairs import PairOfBatch
+    from sat_intervals.results import Run
     from sat_intervals.run.batch import Finish
 
 # What is made of a run, in its folder.
@@ -128,21 +129,23 @@ def _points_and_surface(
     from sat_intervals.heights.triangulate import triangulate
 
     check_unchanged()
-    _check_run(out, finished)
-    points = triangulate(out, *sensor_files, console.progress)
-    made = make_surface([out], out / "dsm.tif", **cells, progress=console.progress)
+    run = _opened(out, finished)
+    points = triangulate(run, *sensor_files, console.progress)
+    made = make_surface([run], out / "dsm.tif", **cells, progress=console.progress)
     check_unchanged()
     _check_of_run(out, finished, points["file"])
     return points, made
 
 
-def _check_run(out: Path, finished: str) -> None:
-    """Raise if a folder has no run that ended at this time: another one took its place."""
+def _opened(out: Path, finished: str) -> "Run":
+    """Open a run; raise if it is not the one that ended at this time: another one took its place."""
     from sat_intervals.errors import RunError
     from sat_intervals.results import open_run
 
-    if open_run(out).report["finished"] != finished:
+    run = open_run(out)
+    if run.report["finished"] != finished:
         raise RunError(f"the run in {out} was replaced before its points were made: rerun the command")
+    return run
 
 
 def _check_of_run(out: Path, finished: str, points: dict[str, int]) -> None:

@@ -361,13 +361,13 @@ def open_results(out: str | Path, truth: str | Path | None = None) -> Results:
         The folder is not a finished run, an image has changed since, or the truth has another size.
     """
     run = open_run(out)
-    left, right = (_opened(run.report["inputs"][side]) for side in ("left", "right"))
+    left, right = (open_input(run.report["inputs"][side]) for side in ("left", "right"))
     truth = truth or (run.truth_beside if run.truth_beside.exists() else None)
     layer = None if truth is None else run.layer(truth)
     return Results(**vars(run), left=left, right=right, truth=layer)
 
 
-def _opened(record: dict[str, Any]) -> Image:
+def open_input(record: dict[str, Any]) -> Image:
     """Reopen an input image; raise if it has changed since the run."""
     name, mask = record["path"], record["mask"]
     if name.startswith("/") and not name.startswith("/vsi") and not Path(name).exists():

@@ -45,7 +45,7 @@ _LARGEST = 10_000.0
 
 
 def make_surface(
-    outs: Sequence[str | Path],
+    outs: Sequence[str | Path | Run],
     path: str | Path,
     *,
     resolution: float | Path,
@@ -60,7 +60,7 @@ def make_surface(
     Parameters
     ----------
     outs
-        Folders of triangulated runs of the same place.
+        Folders of triangulated runs of the same place, or such runs as they were opened.
     path
         The Cloud-Optimized GeoTIFF to write.
     resolution
@@ -91,7 +91,8 @@ def make_surface(
         A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
-    inputs = [*(Path(out) / "points.tif" for out in outs), geoid, resolution if isinstance(resolution, Path) else None]
+    like = resolution if isinstance(resolution, Path) else None
+    inputs = [*((out.out if isinstance(out, Run) else Path(out)) / "points.tif" for out in outs), geoid, like]
     check_unchanged = watched_rasters(inputs)
     with replaceable(path.parent, [surface_file(path.name)]) as there:
         grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius, geoid)
@@ -130,8 +131,8 @@ def _counts(cells: Cells, clouds: Sequence[PointCloud]) -> dict[str, int]:
     return {"rows": cells.rows, "columns": cells.columns, **points}
 
 
-def _runs(outs: Sequence[str | Path], path: Path, inputs: Sequence[Path | None]) -> list[Run]:
-    runs = triangulated([Path(out) for out in outs])
+def _runs(outs: Sequence[str | Path | Run], path: Path, inputs: Sequence[Path | None]) -> list[Run]:
+    runs = triangulated(outs)
     read = [*inputs, *(file for name in inputs if name for file in other_files(str(name)))]
     for run in runs:
         run.check_kept([path], read)

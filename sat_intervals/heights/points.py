@@ -18,8 +18,8 @@ POINT = {band.name: index for index, band in enumerate(POINTS)}
 WINDOW = 512
 
 
-def triangulated(outs: Sequence[Path]) -> list[Run]:
-    """Open runs with points of their own.
+def triangulated(outs: Sequence[str | Path | Run]) -> list[Run]:
+    """Open runs with points of their own, unless they are open.
 
     Raises
     ------
@@ -27,9 +27,9 @@ def triangulated(outs: Sequence[Path]) -> list[Run]:
         A folder is not a run, is given twice, or has no points, those of an earlier run, or damaged ones.
     """
     runs: list[Run] = []
-    for out in outs:
-        run = open_run(out)
-        path = out / "points.tif"
+    for given in outs:
+        run = given if isinstance(given, Run) else open_run(given)
+        out, path = run.out, run.out / "points.tif"
         if not path.exists():
             raise SatIntervalsError(f"{out} has no points.tif: run sat-intervals triangulate on it first")
         if read_tags(path).get("RUN") != run.report["finished"] or read_shape(path) != (len(POINTS), *run.shape):

@@ -31,7 +31,7 @@ _DEGREES, _METRES = 2.0**-33, 2.0**-13
 
 
 def triangulate(
-    out: str | Path,
+    out: str | Path | Run,
     left_model: str | Path,
     right_model: str | Path,
     left_grid: str | Path,
@@ -43,7 +43,7 @@ def triangulate(
     Parameters
     ----------
     out
-        Folder of the finished run.
+        Folder of the finished run, or the run as it was opened: another one in its folder is then refused.
     left_model, right_model
         RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
     left_grid, right_grid
@@ -68,7 +68,7 @@ def triangulate(
     """
     from sat_intervals.heights.sensors import Lattice, Sensors  # needs the extra `dsm`
 
-    run = open_run(out)
+    run = out if isinstance(out, Run) else open_run(out)
     run.check_kept(
         [run.out / name for name in (POINTS_FILE, POINTS_REPORT)], [left_model, right_model, left_grid, right_grid]
     )

@@ -1,41 +1,50 @@
-"""Count the renamings of folders, which their times do not tell: a file that is made in one later sets them, too."""
+"""Count renamings and arrivals in folders, which their times do not tell: those of a later file hide an earlier one."""
 
 import ctypes
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from struct import iter_unpack
+from struct import calcsize, unpack_from
 from threading import Lock
 
-# Constants of Linux' inotify: a folder was renamed, only folders that are no links are watched, and events were lost.
-_MOVED = 0x800
+# Constants of Linux' inotify: a folder was renamed, a file was made in it or renamed to it, only folders that are no
+# links are watched, and events were lost.
+_RENAMED, _ARRIVED = 0x800, 0x100 | 0x80
 _WATCHED = 0x01000000 | 0x02000000
 _LOST = 0x4000
 _EVENT = "iIII"
-_AT_ONCE = 4096  # bytes
+_AT_ONCE = 1 << 16  # bytes
 
 
 class _Queue:
-    """Events of all folders that this process has asked for."""
+    """Events of a kind in all folders that this process has asked for."""
 
-    def __init__(self) -> None:
-        self._system = ctypes.CDLL(None)
+    def __init__(self, kind: int) -> None:
+        self._system, self._kind = ctypes.CDLL(None), kind
         self._queue = self._system.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._moves: Counter[int] = Counter()
+        self._counts: defaultdict[int, Counter[str]] = defaultdict(Counter)
         self._lost = 0
         self._lock = Lock()
 
-    def moves(self, folder: Path) -> tuple[int, int]:
+    def counts(self, folder: Path) -> tuple[int, int, Counter[str]]:
+        """Return the number of a folder, how often events of any were lost, and events by the name that they tell."""
         with self._lock:
-            number = self._system.inotify_add_watch(self._queue, os.fsencode(folder), _MOVED | _WATCHED)
+            number = self._system.inotify_add_watch(self._queue, os.fsencode(folder), self._kind | _WATCHED)
             with suppress(OSError):  # there are no more, or there is no queue
                 while events := os.read(self._queue, _AT_ONCE):
-                    for of_folder, kind, _, _ in iter_unpack(_EVENT, events):
-                        self._moves[of_folder] += bool(kind & _MOVED)
-                        self._lost += bool(kind & _LOST)
-            return number, self._moves[number] + self._lost
+                    self._add(events)
+            return number, self._lost, self._counts[number].copy()
+
+    def _add(self, events: bytes) -> None:
+        start = 0
+        while start < len(events):
+            number, kind, _, size = unpack_from(_EVENT, events, start)
+            start += calcsize(_EVENT) + size
+            self._lost += bool(kind & _LOST)
+            if kind & self._kind:
+                self._counts[number][os.fsdecode(events[start - size : start].rstrip(b"\0"))] += 1
 
 
 def moves(folder: Path) -> tuple[int, int]:
@@ -44,10 +53,19 @@ def moves(folder: Path) -> tuple[int, int]:
     The number is -1 for what is no folder, and where the system cannot watch it. On a network disk, only renamings by
     this machine count.
     """
-    return _of_process(os.getpid()).moves(folder)
+    number, lost, counts = _of_process(os.getpid(), _RENAMED).counts(folder)
+    return number, lost + counts[""]
 
 
-@lru_cache(maxsize=1)
-def _of_process(_: int) -> _Queue:
+def arrivals(folder: Path) -> Counter[str]:
+    """Return how often a file of each name was made in a folder or renamed to it, since it was first asked.
+
+    Empty where the system cannot watch the folder; some may be missing if there are thousands.
+    """
+    return _of_process(os.getpid(), _ARRIVED).counts(folder)[2]
+
+
+@lru_cache(maxsize=2)
+def _of_process(_: int, kind: int) -> _Queue:
     """Return the queue of a process; one that was forked would take the events of its parent."""
-    return _Queue()
+    return _Queue(kind)

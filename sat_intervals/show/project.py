@@ -25,9 +25,10 @@ from sat_intervals.raster import (
     read_small_image,
     read_small_layers,
     read_tags,
+    watched_images,
 )
 from sat_intervals.raster.published import check_points
-from sat_intervals.results import Run, open_run
+from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.show import styles
 from sat_intervals.show.marks import check_made_here, is_replaceable, write_made_here
 from sat_intervals.tiling import Window
@@ -202,17 +203,15 @@ def _surface(run: Run, written: Written) -> Iterator[Layer]:
 
 
 def _images(run: Run, written: Written) -> Iterator[Layer]:
-    """Yield truth and images; those that cannot be opened are left out."""
-    names: dict[str, tuple[str, int | None]] = {
-        side: (run.report["inputs"][side]["path"], run.report["inputs"][side]["band"]) for side in ("left", "right")
-    }
-    if run.truth_beside.exists():
-        names = {"truth": (str(run.truth_beside), 1)} | names
-    for name, (path, band) in names.items():
+    """Yield truth and images; those that cannot be opened, or were changed since the run, are left out."""
+    names = ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right")
+    for name in names:
         try:
-            image = open_image(path, band=band)
+            image = open_image(run.truth_beside, band=1) if name == "truth" else open_input(run.report["inputs"][name])
+            check_unchanged = watched_images([image])
             shape = image.height, image.width
             pixels = read_small_image(image, Window(0, 0, *shape), _fitting(shape))
+            check_unchanged()
         except SatIntervalsError as error:
             written.notes.append(f"the {name} image is left out: {error}")
             continue
@@ -220,7 +219,7 @@ def _images(run: Run, written: Written) -> Iterator[Layer]:
         if name == "truth":
             renderer = styles.colours(1, pixels, styles.VIRIDIS, unit="px")
         yield Layer(
-            "Images", name, f"{name} image", path, image.georeferencing, shape, renderer, is_shown=name == "left"
+            "Images", name, f"{name} image", image.path, image.georeferencing, shape, renderer, is_shown=name == "left"
         )
 
 

@@ -504,8 +504,8 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     }
 
     def late(*arguments, **options):
-        assert invoke("match", *images, str(out), *search[:2], "9", "--overwrite", "--quiet").exit_code == 0
-        return triangulate(*arguments, **options)
+        points = triangulate(*arguments, **options)
+        return points | {"file": points["file"] | {"crc32": 1}}  # as if points with other models came then
 
     monkeypatch.setattr("sat_intervals.heights.triangulate.triangulate", late)
     replaced = invoke(*command)

@@ -2,11 +2,12 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from helpers import exchanged
 
 from sat_intervals.errors import ChangedInputError
-from sat_intervals.raster import moves
+from sat_intervals.raster import Georeferencing, moves, watched_rasters, write_layer
 from sat_intervals.raster.identity import watched
 
 
@@ -55,8 +56,8 @@ def test_watched__raises_if_the_folder_that_a_link_leads_to_was_another(folders,
 
 
 def test_watched__knows_a_renamed_folder_by_its_times_where_the_system_cannot_watch_it(folders, monkeypatch):
-    monkeypatch.setattr(moves, "_of_process", lambda _: queue)
-    queue = moves._Queue()
+    monkeypatch.setattr(moves, "_of_process", lambda *_: queue)
+    queue = moves._Queue(moves._RENAMED)
     os.close(queue._queue)
     queue._queue = -1
     assert moves.moves(folders[0]) == (-1, 0)
@@ -81,6 +82,26 @@ def test_watched__raises_if_renamings_were_lost(folders, monkeypatch):
         folder.with_name("aside").rename(folder)
     (folders[0] / "new.txt").touch()
     with pytest.raises(ChangedInputError):
+        check()
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("name", ["left.tif.aux.xml", "left_RPC.TXT", "LEFT.tfw", "left.tif.msk"])
+def test_watched_rasters__raises_if_a_file_beside_one_comes_and_goes(folders, name):
+    image = folders[0] / "left.tif"
+    write_layer(image, np.zeros((8, 9), np.uint8), 0, Georeferencing())
+    for other in (name, "left.tif.ovr.tmp"):
+        (folders[0] / other).touch()
+        (folders[0] / other).unlink()
+    check = watched_rasters([image])
+    for other in ("another.tif.aux.xml", "left.tif.ovr.tmp", ".left.tif.swp"):
+        (folders[0] / other).touch()
+        (folders[0] / other).unlink()
+    check()
+    (folders[0] / "aside").touch()
+    (folders[0] / "aside").rename(folders[0] / name)
+    (folders[0] / name).unlink()
+    with pytest.raises(ChangedInputError, match=f"{name} was there for a moment while files were read"):
         check()
 
 
