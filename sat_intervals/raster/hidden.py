@@ -1,5 +1,6 @@
 """The hidden folder of a command's unfinished files, and what a killed process left there."""
 
+import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -7,7 +8,9 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from pathlib import Path
 
 from sat_intervals.raster.files import File
+from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.publishing import (
+    POINTS_REPORT,
     REPLACED,
     REPORTS,
     RUN_REPORT,
@@ -16,6 +19,7 @@ from sat_intervals.raster.publishing import (
     pinned,
     publish,
     put_back,
+    rename_new,
 )
 from sat_intervals.raster.space import way_out
 from sat_intervals.store.folder import LocalFolder
@@ -80,6 +84,7 @@ class HiddenFolder:
         """Make the folders for the block, after what a killed process left is restored and deleted."""
         self.put_back()
         self.remove()
+        self.is_published = False
         (self._inside(self._hidden) / _MADE).touch()
         self._inside(self._replaced).mkdir(parents=True, exist_ok=True)
         with pinned(self._inside(self.files)) as self.opened_files:
@@ -146,7 +151,17 @@ class HiddenFolder:
         self.check_folder()
 
     def put_back(self) -> None:
-        """Restore the files that a killed process put aside."""
+        """Restore the files that a killed process put aside; if it lacked only the name of its points' report, give it.
+
+        A run needs none: it resumes from its tiles.
+        """
+        report, place = (folder / POINTS_REPORT for folder in (self._inside(self.files), self.opened_folder))
+        with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
+            made = json.loads(report.read_text())["files"]
+            if made == {name: checksum_of(self.opened_folder / name) for name in made}:
+                rename_new(report, place)
+                self.is_published = True
+                return
         put_back(self._inside(self.files), self.opened_folder, self._names)
 
     def remove(self) -> None:

@@ -8,8 +8,9 @@ from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.layers import read_alone
+from sat_intervals.raster.publishing import POINTS_REPORT
 
-POINTS_FILE, POINTS_REPORT = POINT_FILES[0].name, "points.json"
+POINTS_FILE = POINT_FILES[0].name
 
 
 def check_points(out: Path) -> None:

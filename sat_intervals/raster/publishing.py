@@ -15,8 +15,8 @@ from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.raster.identity import watched
 
 # Reports that are published with files: of a run, and of its points.
-RUN_REPORT = "run.json"
-REPORTS = RUN_REPORT, "points.json"
+RUN_REPORT, POINTS_REPORT = "run.json", "points.json"
+REPORTS = RUN_REPORT, POINTS_REPORT
 # Arguments of Linux' renameat2: paths are relative to the working directory; exchange two files.
 _HERE, _EXCHANGE = -100, 2
 # Folder of the replaced files, among the finished ones.
