@@ -21,6 +21,7 @@ from rasterio.warp import reproject
 
 from sat_intervals import RunError, SatIntervalsError, match_pair
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
+from sat_intervals.errors import ChangedInputError
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
 from sat_intervals.raster import OutputWriter, hidden, publishing, stamps
@@ -29,6 +30,7 @@ from sat_intervals.tiling import Window
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
     from sat_intervals.heights import sensors as of_sensors
+    from sat_intervals.heights import triangulate as of_points
     from sat_intervals.heights.sensors import Lattice, Sensors
     from sat_intervals.heights.triangulate import triangulate
 
@@ -418,6 +420,22 @@ def test_triangulate__keeps_points_that_appear_after_the_models_are_read(level_r
     with pytest.raises(SatIntervalsError, match=r"points.tif exists and was not made by triangulate"):
         triangulate(out, *files)
     assert (out / "points.tif").read_bytes() == b"mine"
+
+
+def test_triangulate__keeps_points_that_are_away_while_files_are_examined(level_run, monkeypatch):
+    out, files = level_run
+    mine, check_own = out / "points.tif", of_points._check_own
+    mine.write_text("mine")
+
+    def away(folder):
+        mine.rename(out / "away")
+        check_own(folder)
+        (out / "away").rename(mine)
+
+    monkeypatch.setattr(of_points, "_check_own", away)
+    with pytest.raises(ChangedInputError, match=r"points\.tif was replaced or changed while it was read"):
+        triangulate(out, *files)
+    assert mine.read_text() == "mine"
 
 
 @pytest.mark.parametrize("place", range(4))

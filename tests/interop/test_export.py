@@ -11,7 +11,8 @@ from helpers import invoke
 from numpy.testing import assert_array_equal
 from rasterio.transform import Affine
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.interop import export as module
 from sat_intervals.interop.export import export
 from sat_intervals.products import INVALID
 from sat_intervals.results import Run
@@ -132,6 +133,21 @@ def test_export__keeps_a_file_that_appears_after_the_run_is_opened(run, tmp_path
 
     monkeypatch.setattr(Run, "check_kept", checked_late)
     with pytest.raises(SatIntervalsError, match=r"disparity.tif exists and was not made by sat-intervals"):
+        export(run[0], "otb", tmp_path)
+    assert mine.read_text() == "mine"
+
+
+def test_export__keeps_a_file_that_is_away_while_files_are_examined(run, tmp_path, monkeypatch):
+    mine, check_made_by = tmp_path / "disparity.tif", module.check_made_by
+    mine.write_text("mine")
+
+    def away(file, *arguments):
+        mine.rename(tmp_path / "away")
+        check_made_by(file, *arguments)
+        (tmp_path / "away").rename(mine)
+
+    monkeypatch.setattr(module, "check_made_by", away)
+    with pytest.raises(ChangedInputError, match=r"disparity\.tif was replaced or changed while it was read"):
         export(run[0], "otb", tmp_path)
     assert mine.read_text() == "mine"
 

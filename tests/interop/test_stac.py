@@ -1,6 +1,7 @@
 """STAC items, validated by pystac without a network."""
 
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 from finished import no_bands, random_bands, write_points, write_run, write_surface
-from helpers import flip_bit, invoke
+from helpers import contents, exchanged, flip_bit, invoke
 from numpy.testing import assert_allclose
 
 from sat_intervals.interop import stac
@@ -174,6 +175,26 @@ def test_write_item__ends_where_a_surface_is_replaced_meanwhile(made, tmp_path, 
     done = invoke("stac", out)
     assert done.exit_code == 1
     assert re.search(r"dsm.tif was replaced or changed while it was read: rerun the command", done.stderr)
+
+
+@pytest.mark.parametrize("moment", ["whole_file", "_check_own"])
+def test_stac__ends_where_another_run_takes_the_folders_name_while_it_writes(tmp_path, monkeypatch, moment):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    out, other = (write_run(tmp_path / name, *random_bands(20, 30)) for name in "ab")
+    assert invoke("stac", out).exit_code == invoke("stac", other).exit_code == 0
+    mine, calls = contents(other), itertools.count()
+    step = getattr(stac, moment)
+
+    def late(*arguments):
+        if next(calls) == (moment == "_check_own"):
+            exchanged(out, other)
+        return step(*arguments)
+
+    monkeypatch.setattr(stac, moment, late)
+    done = invoke("stac", out)
+    assert (done.exit_code, done.stderr.count("\n"), "was replaced" in done.stderr) == (1, 1, True), done.stderr
+    assert list(contents(out).values()) == list(mine.values())
 
 
 def test_write_item__keeps_an_item_that_appears_meanwhile(tmp_path, monkeypatch):

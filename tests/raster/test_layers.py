@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 import pytest
-from helpers import contents
+from helpers import contents, exchanged
 
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.raster import MARK, Georeferencing, OutputError, layers, put_back, stamps, write_layer
@@ -74,6 +74,26 @@ def test_whole_file__is_written_where_a_link_takes_the_place_of_its_temporary_fo
         files.symlink_to(mine.parent)
         new.write_text("new")
     assert ((tmp_path / "page.html").read_text(), mine.read_text()) == ("new", "mine")
+
+
+@pytest.mark.parametrize("is_back", [False, True])
+def test_whole_file__replaces_nothing_in_a_folder_that_takes_the_name_of_its_own(tmp_path, is_back):
+    out, other = tmp_path / "out", tmp_path / "other"
+    for folder in (out, other):
+        folder.mkdir()
+        (folder / "page.html").write_text(folder.name)
+
+    def write():
+        there = stamps(out, ["page.html"])
+        if is_back:
+            exchanged(out, other)
+        with layers.whole_file(out / "page.html", there) as new:
+            new.write_text("new")
+            exchanged(out, other)
+
+    with pytest.raises(OutputError, match=r"out was replaced by another folder meanwhile: rerun the command"):
+        write()
+    assert {file.read_text() for file in tmp_path.rglob("*.html")} == {"out", "other"}
 
 
 def test_put_back__leaves_what_is_published(tmp_path):

@@ -177,6 +177,28 @@ def test_write_project__ends_where_a_surface_is_replaced_meanwhile(run, monkeypa
     assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
 
 
+@pytest.mark.parametrize("name", ["left", "truth"])
+def test_write_project__leaves_out_an_image_that_is_another_for_a_moment(run, monkeypatch, name):
+    out, _, _ = run
+    image, other = out.parent / f"{name}.tif", out.parent / "other.tif"
+    shutil.copy(out.parent / "right.tif", other)
+    read = project.read_small_image
+
+    def of_the_other(opened, *arguments):
+        if opened.path != str(image):
+            return read(opened, *arguments)
+        exchanged(image, other)
+        found = read(opened, *arguments)
+        exchanged(image, other)
+        return found
+
+    monkeypatch.setattr(project, "read_small_image", of_the_other)
+    done = invoke("project", out)
+    assert done.exit_code == 0
+    assert f"the {name} image is left out: {image} was replaced or changed while it was read" in done.stderr
+    assert name not in [layer for _, layer, _ in layers_of(read_project(out))]
+
+
 def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_path):
     out = without_intervals(tmp_path)
     assert invoke("project", out).exit_code == 0
