@@ -311,7 +311,7 @@ def test_match_batch__keeps_a_file_that_appears_after_its_check(images, tmp_path
         (out / "batch.json").write_text("a user's")
 
     monkeypatch.setattr(batch, "read_report", and_appears)
-    with pytest.raises(RunError, match=r"batch\.json was written by another process meanwhile: move it away"):
+    with pytest.raises(RunError, match=r"batch\.json was replaced or changed while it was read: rerun the command"):
         match_batch(read_batch(rows(images)), tmp_path)
     assert (tmp_path / "batch.json").read_text() == "a user's"
 
