@@ -53,7 +53,8 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
     Raises
     ------
     OutputError
-        Names ``path`` and the system's reason, or says that another file came there meanwhile.
+        Names ``path`` and the system's reason, or says that another file, or a folder in the place of its own, came there
+        meanwhile.
     """
     path = Path(path)
     if not path.is_symlink():
