@@ -52,14 +52,14 @@ def demo(
     from sat_intervals.cli.console import Console
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.raster import north_up, put_back, write_once
+    from sat_intervals.raster import north_up, put_back, stamps, write_once
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS, check_output
     from sat_intervals.run.status import is_replacing
 
     check_output(out, run.overwrite)
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
-    overwrite = run.overwrite or is_replacing(out / "tiles")
+    overwrite, there = run.overwrite or is_replacing(out / "tiles"), stamps(out, [layer.name for layer in layers])
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
     with Console(run.quiet or as_json) as console, put_back(layers if overwrite else (), out / "run.json"):
         console.progress("scene", 0, 1)
@@ -68,7 +68,7 @@ def demo(
         config = settings.load(disparity=search)
         check_not_replaced([settings.file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
-            write_once(path, pixels, value, somewhere, overwrite=overwrite)
+            write_once(path, pixels, value, somewhere, there if overwrite else None)
         console.progress("scene", 1, 1)
         report = run.match(out / "left.tif", out / "right.tif", out, config, progress=console.progress)
     figures = evaluate_run(out, out / "truth.tif")["all"]

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -102,25 +103,35 @@ def surface_options(command: Command) -> Command:
 def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: dict[str, Any]) -> list[Path]:
     """Write figures and pictures of a surface model to a folder; return their paths."""
     from sat_intervals.cli.tables import surface_markdown
+    from sat_intervals.errors import RunError
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
     from sat_intervals.evaluate.dsm import read_profile
     from sat_intervals.raster import examined, whole_file
+    from sat_intervals.raster.moves import moves
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
+    from sat_intervals.show.marks import check_made_here, write_made_here
 
     texts, paths = [folder / name for name in _TEXTS], [folder / name for name in _PICTURES]
     names = given.dsm.name, given.reference.name
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
     content = json.dumps({"software": _SOFTWARE} | report, indent=1), surface_markdown(str(given.dsm), report)
-    with examined(folder, _TEXTS) as there:
+    with examined(folder, [*_TEXTS, *_PICTURES]) as there:
         _check_texts(folder)
+        check_made_here(paths)
+    pictures = {path: BytesIO() for path in paths}
+    reliability, errors, heights = pictures.values()
+    draw_reliability(report, reliability, names[0])
+    draw_error_map(compared, report["all"]["nmad"], errors)
+    draw_height_profile(profile, heights, names)
+    moved = moves(folder)
     for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
         with whole_file(path, there) as new:
             new.write_text(text, encoding="utf-8")
             _check_texts(folder)  # again: a file may have appeared meanwhile
-    draw_reliability(report, paths[0], names[0])
-    draw_error_map(compared, report["all"]["nmad"], paths[1])
-    draw_height_profile(profile, paths[2], names)
+    write_made_here({path: drawn.getvalue() for path, drawn in pictures.items()}, there)
+    if moves(folder) != moved:
+        raise RunError(f"{folder} was another folder while files were written: rerun the command")
     return [*texts, *paths]
 
 

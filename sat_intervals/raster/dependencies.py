@@ -12,16 +12,13 @@ from rasterio.io import DatasetReader
 from sat_intervals.errors import ChangedInputError, InputError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.identity import local_file, stamp_of, watched
-from sat_intervals.raster.moves import arrivals
+from sat_intervals.raster.moves import came_beside, is_beside
 from sat_intervals.raster.seal import is_read
 from sat_intervals.raster.virtual import sources_of
 
 # File systems of which GDAL does not say what it reads, or whether it has changed; archives on servers.
 _UNKNOWN = re.compile(r"/vsi(sparse/|cached\?|\w+_streaming/)")
 _IN_REMOTE = re.compile(r"(/?vsi(zip|tar|gzip|7z|rar|subfile)/(\d+(_\d+)?,)?\{?)+/?vsi(curl|s3|gs|az|adls|oss|swift)")
-
-# Endings of overviews and of files that a program has not finished.
-_UNREAD = ".ovr", ".tmp"
 
 
 def other_files(name: str) -> list[str]:
@@ -116,31 +113,35 @@ def watched_rasters(
     Nor may one come and go, where the system counts `arrivals`.
     """
     names = {str(file) for file in files if file is not None}
-    came = _came_beside(names)
+    came = came_beside(names)
     before = {name: files_of(name) for name in names}
-    check_files = watched(file for name in names for file in before[name])
+    sources = {file for name in names for file in before[name]}
+    came = came_beside(sources) | came
+    check_files = watched(sources)
 
     def check() -> None:
         check_files()
         for name in names:
             if files_of(name) != before[name]:
                 raise ChangedInputError(f"a file beside {name} appeared while it was read: rerun the command")
-        for file, count in _came_beside(names).items():
+        for file, count in came_beside(sources).items():
             if count > came.get(file, 0) + os.path.lexists(file):  # what is still there was compared
                 raise ChangedInputError(f"{file} was there for a moment while files were read: rerun the command")
 
     return check
 
 
-def _came_beside(names: Iterable[str]) -> dict[str, int]:
-    """Return how often files came that GDAL may read with rasters, by path, see `arrivals`."""
-    counts = {}
-    for name in filter(os.path.isfile, names):
-        folder, file = os.path.split(os.path.abspath(name))
-        for other, count in arrivals(Path(folder)).items():
-            if other != file and is_beside(other, file) and not other.lower().endswith(_UNREAD):
-                counts[os.path.join(folder, other)] = count
-    return counts
+def watched_image(*names: str | None) -> Callable[[], None]:
+    """Return what `watched` returns, for a local image and its mask while it is opened, and what comes beside them."""
+    files = [name for name in names if name is not None]
+    came, check_files = came_beside(files), watched(files, is_local=True)
+
+    def check() -> None:
+        check_files()
+        if new := came_beside(files).items() - came.items():
+            raise ChangedInputError(f"{min(new)[0]} came while an image was opened: rerun the command")
+
+    return check
 
 
 def stamps_of(*names: str | None) -> dict[str, str | None]:
@@ -162,12 +163,6 @@ def check_pipes_beside(path: str, listed: dict[str, list[str]] | None = None) ->
     for other in listed[folder]:
         if is_beside(other, name):
             check_regular(os.path.join(folder, other))
-
-
-def is_beside(other: str, name: str) -> bool:
-    """Return whether GDAL may read a file of one name with a raster of another in the same folder."""
-    stem = os.path.splitext(name)[0].lower()
-    return other.lower().startswith((f"{stem}.", f"{stem}_rpc."))
 
 
 def _check_watched(name: str, dataset: DatasetReader, sources: Iterable[str]) -> None:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 from urllib.request import Request, urlopen
 
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
-from sat_intervals.raster.moves import moves
+from sat_intervals.raster.moves import came_beside, moves
 from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
@@ -244,7 +244,7 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
 def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _Read]) -> _Read:
     """Read from the inputs of a run and return the result.
 
-    It reads again if an input was touched meanwhile: another file may have taken its place for a moment.
+    It reads again if an input was touched meanwhile, or a file came beside it: another one may have been read.
 
     Raises
     ------
@@ -254,13 +254,14 @@ def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _R
         An input is touched all the time.
     """
     for _ in range(_TRIES):
-        before = {name: _moment(name) for name in files}
+        came, before = came_beside(files), {name: _moment(name) for name in files}
         try:
             content = read()
         finally:  # a changed input explains a read error
             check_unchanged(files)
         now = {name: _moment(name) for name in files}
         touched = [name for name in files if before[name].is_touched(now[name])]
+        touched += [name for name, count in came_beside(files).items() if came.get(name) != count]
         if not touched:
             return content
     raise RunError(

@@ -13,9 +13,9 @@ from rasterio.io import DatasetReader
 
 from sat_intervals.errors import ChangedInputError, InputError, RunError, check_regular
 from sat_intervals.raster import gdal
-from sat_intervals.raster.dependencies import check_pipes_beside, pixel_files, stamps_of, watched_rasters
+from sat_intervals.raster.dependencies import check_pipes_beside, pixel_files, stamps_of, watched_image, watched_rasters
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.identity import stamp_of, watched
+from sat_intervals.raster.identity import stamp_of
 from sat_intervals.raster.seal import check_seal, is_read
 from sat_intervals.tiling import Window
 
@@ -114,7 +114,7 @@ def open_image(
     """
     name = _absolute(path)
     mask = None if mask is None else _absolute(mask)
-    check_steady = watched([name, mask], is_local=True)  # another folder may be there for a moment
+    check_steady = watched_image(name, mask)  # another folder may be there for a moment
     stamps = stamps_of(name, mask)
     with opened(name) as dataset:
         check_seal(name, dataset.files)

@@ -53,8 +53,7 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
     Raises
     ------
     OutputError
-        Names ``path`` and the system's reason, or says that another file, or a folder in the place of its own, came there
-        meanwhile.
+        Names ``path`` and the system's reason, or says that another file came there, or another folder in its place.
     """
     path = Path(path)
     if not path.is_symlink():
@@ -212,25 +211,27 @@ def sum_of_bits(bands: np.ndarray) -> int:
 
 
 def write_once(
-    path: Path, pixels: np.ndarray, nodata: float, georeferencing: Georeferencing, *, overwrite: bool
+    path: Path, pixels: np.ndarray, nodata: float, georeferencing: Georeferencing, before: Mapping[str, str] | None
 ) -> None:
     """Write a layer with `write_layer` and `MARK`, unless the file already has the same content.
+
+    ``before`` are the `stamps` of the files that may be replaced, None if none may.
 
     Raises
     ------
     SatIntervalsError
-        The file has other content, and ``overwrite`` is not set or the file has no mark; or see `check_place`.
+        The file has other content, and may not be replaced or has no mark; or see `check_place`.
     """
     check_place(path, has_transform=georeferencing.transform is not None)
-    with examined(path.parent, [path.name]) as there:
+    with examined(path.parent, [path.name]):
         if path.exists():
             with suppress(SatIntervalsError):
                 if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
                     return
-            if not overwrite:
+            if before is None:
                 raise SatIntervalsError(f"{path} has other content: choose another folder or --overwrite")
             check_marked(path)
-    _write(path, [pixels[np.newaxis]], pixels.dtype, (1, *pixels.shape), georeferencing, MARK, nodata, there)
+    _write(path, [pixels[np.newaxis]], pixels.dtype, (1, *pixels.shape), georeferencing, MARK, nodata, before or {})
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:

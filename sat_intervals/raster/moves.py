@@ -3,6 +3,7 @@
 import ctypes
 import os
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -16,6 +17,8 @@ _WATCHED = 0x01000000 | 0x02000000
 _LOST = 0x4000
 _EVENT = "iIII"
 _AT_ONCE = 1 << 16  # bytes
+# Endings of overviews and of files that a program has not finished.
+_UNREAD = ".ovr", ".tmp"
 
 
 class _Queue:
@@ -63,6 +66,23 @@ def arrivals(folder: Path) -> Counter[str]:
     Empty where the system cannot watch the folder; some may be missing if there are thousands.
     """
     return _of_process(os.getpid(), _ARRIVED).counts(folder)[2]
+
+
+def came_beside(files: Iterable[str]) -> dict[str, int]:
+    """Return how often files came that GDAL may read with rasters, by path, see `arrivals`."""
+    counts = {}
+    for file in filter(os.path.isfile, files):
+        folder, name = os.path.split(os.path.abspath(file))
+        for other, count in arrivals(Path(os.path.realpath(folder))).items():
+            if other != name and is_beside(other, name) and not other.lower().endswith(_UNREAD):
+                counts[os.path.join(folder, other)] = count
+    return counts
+
+
+def is_beside(other: str, name: str) -> bool:
+    """Return whether GDAL may read a file of one name with a raster of another in the same folder."""
+    stem = os.path.splitext(name)[0].lower()
+    return other.lower().startswith((f"{stem}.", f"{stem}_rpc."))
 
 
 @lru_cache(maxsize=2)

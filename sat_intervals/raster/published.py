@@ -35,7 +35,10 @@ def published_points(out: Path) -> dict[str, int] | None:
     file = out / POINTS_REPORT
     try:
         with open_regular(file) as stream:
-            known = json.loads(stream.read().decode())["files"][POINTS_FILE]
+            report = json.loads(stream.read().decode())
+        if report.keys() != {"files"}:  # it was edited
+            raise LookupError(file)
+        known = report["files"][POINTS_FILE]
         return {key: index(known[key]) for key in ("bytes", "crc32")}
     except FileNotFoundError:
         return None
@@ -43,7 +46,7 @@ def published_points(out: Path) -> dict[str, int] | None:
         raise
     except OSError as error:
         raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: move it away") from error
-    except (ValueError, LookupError, TypeError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise SatIntervalsError(
             f"{file} is not the report of {POINTS_FILE}: move it away and triangulate again"
         ) from error

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.raster.identity import watched
+from sat_intervals.store.manifest import unsealed
 
 # Reports that are published with files: of a run, and of its points.
 RUN_REPORT, POINTS_REPORT = "run.json", "points.json"
@@ -207,9 +208,10 @@ def _is_same(file: Path, new: Path) -> bool:
     """Return whether a file is equal to the new one of its name, and a report to that of the same files."""
     if file.is_symlink() or not file.is_file():
         return False
-    if new.name in REPORTS:
+    if new.name == RUN_REPORT:
         with suppress(ValueError, LookupError, TypeError, RecursionError):
-            return bool(json.loads(file.read_text())["files"] == json.loads(new.read_text())["files"])
+            there = unsealed(file.read_text())  # None if it was edited
+            return there is not None and bool(there["files"] == json.loads(new.read_text())["files"])
         return False
     return filecmp.cmp(file, new, shallow=False)
 
@@ -252,8 +254,9 @@ def replace_same(new: Path, place: Path, stamp: str) -> None:
 
 def _exchange(new: Path, place: Path) -> None:
     """Exchange two files in one step, so that the replaced one can be examined; replace it where that is impossible."""
-    rename = getattr(ctypes.CDLL(None), "renameat2", None)
-    if rename is None or rename(_HERE, os.fsencode(new), _HERE, os.fsencode(place), _EXCHANGE):
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    is_done = rename is not None and not rename(_HERE, os.fsencode(new), _HERE, os.fsencode(place), _EXCHANGE)
+    if rename is None or not (is_done or ctypes.get_errno() == errno.ENOENT):  # what was to be replaced may be away
         os.replace(new, place)
 
 

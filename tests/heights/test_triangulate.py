@@ -377,7 +377,10 @@ def test_triangulate__goes_on_after_a_kill_while_other_points_get_their_names(le
     assert not [*out.glob(".unpublished-*/files/*")]
 
 
-@pytest.mark.parametrize("text", ["mine", "[]", '{"files": {"points.tif": {"bytes": 1e999, "crc32": 0}}}'])
+_REPORT = '{"files": {"points.tif": {"bytes": %s, "crc32": 0}}%s}'
+
+
+@pytest.mark.parametrize("text", ["mine", "[]", _REPORT % ("1e999", ""), _REPORT % ("1", ', "note": "mine"')])
 def test_triangulate__keeps_a_foreign_report(level_run, tmp_path, text):
     out, files = level_run
     (out / "points.json").write_text(text)

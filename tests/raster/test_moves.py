@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 from helpers import exchanged
+from rasterio.shutil import copy
 
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.raster import Georeferencing, moves, watched_rasters, write_layer
@@ -86,10 +87,17 @@ def test_watched__raises_if_renamings_were_lost(folders, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("through", ["own", "link", "virtual"])
 @pytest.mark.parametrize("name", ["left.tif.aux.xml", "left_RPC.TXT", "LEFT.tfw", "left.tif.msk"])
-def test_watched_rasters__raises_if_a_file_beside_one_comes_and_goes(folders, name):
+def test_watched_rasters__raises_if_a_file_beside_one_comes_and_goes(folders, tmp_path, name, through):
     image = folders[0] / "left.tif"
     write_layer(image, np.zeros((8, 9), np.uint8), 0, Georeferencing())
+    (tmp_path / "link").symlink_to(folders[0])
+    if through == "link":
+        image = tmp_path / "link" / "left.tif"
+    elif through == "virtual":
+        copy(image, tmp_path / "of.vrt", driver="VRT")
+        image = tmp_path / "of.vrt"
     for other in (name, "left.tif.ovr.tmp"):
         (folders[0] / other).touch()
         (folders[0] / other).unlink()

@@ -1,5 +1,6 @@
 """Reading and writing of rasters, on real files: refusals, pixels, metadata, temporary files."""
 
+import ctypes
 import itertools
 import json
 import os
@@ -13,6 +14,7 @@ import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -160,6 +162,22 @@ def test_open_image__raises_if_its_folder_is_another_for_a_moment(tmp_path, monk
     monkeypatch.setattr(images, "opened", of_the_other)
     with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed while it was read"):
         open_image(tmp_path / "a" / "left.tif")
+
+
+def test_open_image__raises_if_a_file_beside_it_comes_and_goes(tmp_path, monkeypatch):
+    make(tmp_path / "left.tif", RAMP)
+
+    @contextmanager
+    def with_world_file(path, *arguments):
+        (tmp_path / "left.tfw").write_text("1\n0\n0\n-1\n0\n0\n")
+        with opened(path, *arguments) as dataset:
+            (tmp_path / "left.tfw").unlink()
+            yield dataset
+
+    opened = images.opened
+    monkeypatch.setattr(images, "opened", with_world_file)
+    with pytest.raises(ChangedInputError, match=r"left\.tfw came while an image was opened: rerun the command"):
+        open_image(tmp_path / "left.tif")
 
 
 def test_open_image__finds_a_relative_path_from_anywhere(tmp_path, monkeypatch):
@@ -970,6 +988,22 @@ def test_whole_file__keeps_a_file_that_appears_meanwhile(tmp_path, was_there):
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
 
 
+def test_whole_file__keeps_a_file_that_comes_where_its_own_is_away(tmp_path, monkeypatch):
+    path, library = tmp_path / "new.yaml", ctypes.CDLL(None, use_errno=True)
+    path.write_text("before")
+
+    def away(*arguments):
+        path.rename(tmp_path / "away")
+        failed = library.renameat2(*arguments)
+        path.write_text("of the user")
+        return failed
+
+    monkeypatch.setattr(publishing.ctypes, "CDLL", lambda *_, **named: SimpleNamespace(renameat2=away))
+    with pytest.raises(OutputError, match=r"new\.yaml was written by another process"), whole_file(path) as new:
+        new.write_text("new")
+    assert (path.read_text(), (tmp_path / "away").read_text()) == ("of the user", "before")
+
+
 @pytest.mark.parametrize("how", ["late", "late and interrupted", "no exchange"])
 def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monkeypatch, how):
     path = tmp_path / "new.yaml"
@@ -990,7 +1024,7 @@ def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monk
             new.write_text("new")
 
     if how == "no exchange":
-        monkeypatch.setattr(publishing.ctypes, "CDLL", lambda name: None)
+        monkeypatch.setattr(publishing.ctypes, "CDLL", lambda name, **_: None)
         write()
         assert path.read_text() == "new"
         return

@@ -144,6 +144,26 @@ def test_match_pair__reads_again_where_an_input_was_another_one_for_a_moment(sma
     assert hashes(folder / "out") == hashes(folder / "once")
 
 
+def test_match_pair__reads_again_where_a_mask_beside_a_source_was_there_for_a_moment(small_pair, monkeypatch):
+    folder, settings = small_pair
+    copy(folder / "right.tif", folder / "right.vrt", driver="VRT")
+    match_pair(folder / "left.tif", folder / "right.vrt", folder / "once", settings)
+    read_views, moments = source.read_views, iter(range(2))
+
+    def with_mask(*arguments):
+        if next(moments, None) is None:
+            return read_views(*arguments)
+        (folder / "right.tif.msk").touch()
+        views = read_views(*arguments)
+        (folder / "right.tif.msk").unlink()
+        return views[::-1]  # as if another image had been read
+
+    monkeypatch.setattr(source, "read_views", with_mask)
+    match_pair(folder / "left.tif", folder / "right.vrt", folder / "out", settings)
+    assert next(moments, None) is None
+    assert hashes(folder / "out") == hashes(folder / "once")
+
+
 @pytest.mark.parametrize("kind", ["/vsizip/{}", "/vsizip/{{{}}}"])
 def test_match_pair__knows_an_image_in_an_archive(small_pair, kind):
     folder, settings = small_pair
