@@ -7,7 +7,17 @@ import pytest
 from helpers import contents, exchanged
 
 from sat_intervals.errors import ChangedInputError
-from sat_intervals.raster import MARK, Georeferencing, OutputError, layers, put_back, stamps, write_layer
+from sat_intervals.raster import (
+    MARK,
+    Georeferencing,
+    OutputError,
+    layers,
+    put_back,
+    read_layers,
+    stamps,
+    write_layer,
+    write_once,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -94,6 +104,18 @@ def test_whole_file__replaces_nothing_in_a_folder_that_takes_the_name_of_its_own
     with pytest.raises(OutputError, match=r"out was replaced by another folder meanwhile: rerun the command"):
         write()
     assert {file.read_text() for file in tmp_path.rglob("*.html")} == {"out", "other"}
+
+
+def test_write_once__replaces_only_what_was_there_at_the_start(tmp_path):
+    """Another demo may have taken the folder's name since."""
+    file, ones = tmp_path / "left.tif", np.ones((8, 9), np.uint8)
+    write_layer(file, 0 * ones, 0, Georeferencing(), MARK)
+    there, before = stamps(tmp_path, [file.name]), file.read_bytes()
+    with pytest.raises(OutputError, match=r"left\.tif was written by another process meanwhile"):
+        write_once(file, ones, 0, Georeferencing(), {})
+    assert file.read_bytes() == before
+    write_once(file, ones, 0, Georeferencing(), there)
+    assert read_layers(file).all()
 
 
 def test_put_back__leaves_what_is_published(tmp_path):

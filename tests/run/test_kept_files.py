@@ -878,6 +878,20 @@ def test_match__keeps_a_file_of_the_user_that_appears_during_the_run(runs, tmp_p
     assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
 
 
+def test_match__keeps_the_edited_report_of_an_equal_run_that_appears_during_it(runs, tmp_path):
+    folder, images, settings, _ = runs
+    report = tmp_path / "out" / "run.json"
+    edited = json.dumps(json.loads((folder / "one" / "run.json").read_text()) | {"note": "mine"})
+
+    def progress(stage, done, total):
+        if stage == "bands" and not done < total:
+            report.write_text(edited)
+
+    with pytest.raises(RunError, match=r"run\.json is not of this run"):
+        match_pair(*images, report.parent, settings, progress=progress)
+    assert report.read_text() == edited
+
+
 @pytest.mark.parametrize("number", range(1, 7))
 def test_match__goes_on_after_a_kill_between_the_names_of_its_files(runs, tmp_path, number):
     folder, images, settings, _ = runs
