@@ -9,6 +9,7 @@ import stat
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
@@ -164,7 +165,7 @@ def publish(
         for name in names:
             with suppress(OSError):
                 if os.path.samestat(own[name], (folder / name).lstat()):
-                    os.unlink(folder / name)
+                    _remove(folder / name, finished, partial(_is_file, own[name]))
         put_back(finished, folder, names)
         raise
 
@@ -182,17 +183,28 @@ def _put_aside(new: Path, place: Path, stamp: str | None) -> bool:
         return True
     if place.is_dir() and not place.is_symlink():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+
+    def may_go(file: Path) -> bool:
+        return stamps(file.parent, [file.name]).get(file.name) == stamp or _is_same(file, new)
+
     aside = new.parent / REPLACED / new.name
-    is_first = not os.path.lexists(aside)  # otherwise a killed process has put aside the one to restore
-    if is_first:
-        os.replace(place, aside)
-    there = aside if is_first else place
-    if stamps(there.parent, [there.name]).get(there.name) != stamp and not _is_same(there, new):
-        if is_first:
-            _give_back(aside, place)
+    if os.path.lexists(aside):  # a killed process has put aside the one to restore
+        return _remove(place, new.parent, may_go)
+    os.replace(place, aside)
+    if may_go(aside):
+        return True
+    _give_back(aside, place)
+    return False
+
+
+def _remove(place: Path, folder: Path, may_go: Callable[[Path], bool]) -> bool:
+    """Delete a file if it may go, and return whether it did: it is looked at where nothing can take its place."""
+    aside = folder / f"strips-{uuid.uuid4().hex}-{place.name}"
+    os.rename(place, aside)
+    if not may_go(aside):
+        _give_back(aside, place)
         return False
-    if not is_first:
-        os.unlink(place)
+    os.unlink(aside)
     return True
 
 
@@ -201,7 +213,11 @@ def _give_back(aside: Path, place: Path) -> None:
     try:
         rename_new(aside, place)
     except FileExistsError:
-        os.replace(aside, aside.with_name(f"{aside.name}.{uuid.uuid4().hex}"))
+        os.replace(aside, aside.with_name(f"{place.name}.{uuid.uuid4().hex}"))
+
+
+def _is_file(own: os.stat_result, file: Path) -> bool:
+    return os.path.samestat(own, file.lstat())
 
 
 def _is_same(file: Path, new: Path) -> bool:

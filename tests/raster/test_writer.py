@@ -492,6 +492,34 @@ def test_output_writer__keeps_a_file_that_is_in_the_place_of_a_result_for_a_mome
     assert "mine" in [file.read_text() for file in out.rglob("*.*") if file.is_file() and file.suffix != ".tif"]
 
 
+@pytest.mark.parametrize("moment", ["takes back", "resumes"])
+def test_output_writer__removes_no_file_that_takes_the_place_of_one_that_it_removes(tmp_path, monkeypatch, moment):
+    out, mine = both(tmp_path)[0], tmp_path / "mine"
+    mine.write_text("mine")
+    if moment == "resumes":  # after a process that was killed when it had published the first file
+        hidden_files = out / ".unpublished-intervals.tif" / "files"
+        (hidden_files / "replaced").mkdir(parents=True)
+        (hidden_files.parent / ".sat-intervals.files").touch()
+        shutil.copy(out / "intervals.tif", hidden_files / "replaced" / "intervals.tif")
+    remove, rename_new = publishing._remove, publishing.rename_new
+
+    def late(place, *arguments):
+        place.rename(tmp_path / "moved")
+        mine.rename(place)
+        return remove(place, *arguments)
+
+    def failing(source, target):
+        if moment == "takes back" and source.name == "validity.tif" and source.parent.name != "replaced":
+            raise OSError(errno.EIO, "Input/output error")
+        rename_new(source, target)
+
+    monkeypatch.setattr(publishing, "_remove", late)
+    monkeypatch.setattr(publishing, "rename_new", failing)
+    with pytest.raises(OutputError), writer(out) as output:
+        written(output, np.full((4, 4, 5), 3, np.float32), np.zeros((4, 5), np.uint16))
+    assert (out / "intervals.tif").read_text() == "mine"
+
+
 def test_remove_scratch__keeps_what_a_process_put_aside_that_was_killed_before_its_end(tmp_path):
     """Another folder may have taken the place of the complete one that was to be tidied."""
     replaced = tmp_path / ".unpublished-intervals.tif" / "files" / "replaced"
