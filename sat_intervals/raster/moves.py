@@ -10,9 +10,12 @@ from pathlib import Path
 from struct import calcsize, unpack_from
 from threading import Lock
 
-# Constants of Linux' inotify: a folder was renamed, a file was made in it or renamed to it, only folders that are no
-# links are watched, and events were lost.
-_RENAMED, _ARRIVED = 0x800, 0x100 | 0x80
+# Constants of Linux' inotify: a folder was renamed, a file was made in it, written, or renamed to it, only folders that
+# are no links are watched, and events were lost.
+_RENAMED = 0x800
+_MADE, _WRITTEN, _NAMED = 0x100, 0x8, 0x80
+# Part of a file was written: Linux counts equal events once that follow each other, and this comes between them.
+_MODIFIED = 0x2
 _WATCHED = 0x01000000 | 0x02000000
 _LOST = 0x4000
 _EVENT = "iIII"
@@ -27,12 +30,12 @@ class _Queue:
     def __init__(self, kind: int) -> None:
         self._system, self._kind = ctypes.CDLL(None), kind
         self._queue = self._system.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._counts: defaultdict[int, Counter[str]] = defaultdict(Counter)
+        self._counts: defaultdict[int, Counter[tuple[int, str]]] = defaultdict(Counter)
         self._lost = 0
         self._lock = Lock()
 
-    def counts(self, folder: Path) -> tuple[int, int, Counter[str]]:
-        """Return the number of a folder, how often events of any were lost, and events by the name that they tell."""
+    def counts(self, folder: Path) -> tuple[int, int, Counter[tuple[int, str]]]:
+        """Return the number of a folder, how often events of any were lost, and its events by kind and name."""
         with self._lock:
             number = self._system.inotify_add_watch(self._queue, os.fsencode(folder), self._kind | _WATCHED)
             with suppress(OSError):  # there are no more, or there is no queue
@@ -46,8 +49,8 @@ class _Queue:
             number, kind, _, size = unpack_from(_EVENT, events, start)
             start += calcsize(_EVENT) + size
             self._lost += bool(kind & _LOST)
-            if kind & self._kind:
-                self._counts[number][os.fsdecode(events[start - size : start].rstrip(b"\0"))] += 1
+            if kind := kind & self._kind:
+                self._counts[number][kind, os.fsdecode(events[start - size : start].rstrip(b"\0"))] += 1
 
 
 def moves(folder: Path) -> tuple[int, int]:
@@ -57,15 +60,17 @@ def moves(folder: Path) -> tuple[int, int]:
     this machine count.
     """
     number, lost, counts = _of_process(os.getpid(), _RENAMED).counts(folder)
-    return number, lost + counts[""]
+    return number, lost + counts[_RENAMED, ""]
 
 
-def arrivals(folder: Path) -> Counter[str]:
-    """Return how often a file of each name was made in a folder or renamed to it, since it was first asked.
+def arrivals(folder: Path) -> dict[str, int]:
+    """Return how often a file of each name was made, written or renamed to in a folder, since it was first asked.
 
-    Empty where the system cannot watch the folder; some may be missing if there are thousands.
+    Making and writing one counts once. Empty where the system cannot watch the folder; some may be missing if there are
+    thousands.
     """
-    return _of_process(os.getpid(), _ARRIVED).counts(folder)[2]
+    counts = _of_process(os.getpid(), _MADE | _WRITTEN | _NAMED | _MODIFIED).counts(folder)[2]
+    return {name: max(counts[_MADE, name], counts[_WRITTEN, name]) + counts[_NAMED, name] for _, name in list(counts)}
 
 
 def came_beside(files: Iterable[str]) -> dict[str, int]:

@@ -113,6 +113,31 @@ def test_watched_rasters__raises_if_a_file_beside_one_comes_and_goes(folders, tm
         check()
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("way", ["made", "renamed"])
+def test_watched_rasters__allows_statistics_that_come_but_not_other_content_before_them(folders, way):
+    image = folders[0] / "left.tif"
+    beside = folders[0] / "left.tif.aux.xml"
+    write_layer(image, np.zeros((8, 9), np.uint8), 0, Georeferencing())
+    statistics = "<PAMDataset><PAMRasterBand band='1'><Metadata><MDI key='STATISTICS_MEAN'>0</MDI></Metadata>"
+    statistics += "</PAMRasterBand></PAMDataset>"
+
+    def write(text):
+        (beside if way == "made" else folders[0] / "new").write_text(text)
+        if way == "renamed":
+            (folders[0] / "new").rename(beside)
+
+    check = watched_rasters([image])
+    write(statistics)
+    check()
+    beside.unlink()
+    check = watched_rasters([image])
+    write("<PAMDataset><GeoTransform>1, 1, 0, 0, 0, -1</GeoTransform></PAMDataset>")
+    write(statistics)
+    with pytest.raises(ChangedInputError, match=r"left\.tif\.aux\.xml was there for a moment"):
+        check()
+
+
 _FORKED = """
 import os, sys
 from pathlib import Path
