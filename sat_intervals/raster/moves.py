@@ -70,7 +70,8 @@ def arrivals(folder: Path) -> dict[str, int]:
     thousands.
     """
     counts = _of_process(os.getpid(), _MADE | _WRITTEN | _NAMED | _MODIFIED).counts(folder)[2]
-    return {name: max(counts[_MADE, name], counts[_WRITTEN, name]) + counts[_NAMED, name] for _, name in list(counts)}
+    names = {name for kind, name in counts if kind != _MODIFIED}
+    return {name: max(counts[_MADE, name], counts[_WRITTEN, name]) + counts[_NAMED, name] for name in names}
 
 
 def came_beside(files: Iterable[str]) -> dict[str, int]:

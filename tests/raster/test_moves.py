@@ -138,6 +138,20 @@ def test_watched_rasters__allows_statistics_that_come_but_not_other_content_befo
         check()
 
 
+def test_arrivals__counts_neither_files_that_are_only_read_nor_parts_of_one_that_is_being_written(tmp_path):
+    (tmp_path / "left.tif").touch()
+    assert moves.arrivals(tmp_path) == {}
+    with open(tmp_path / "left.tif", "r+") as file:
+        file.write("part")
+        file.flush()
+        assert moves.arrivals(tmp_path) == {}
+    assert moves.arrivals(tmp_path) == {"left.tif": 1}
+    (tmp_path / "left.tif").read_text()
+    (tmp_path / "link").symlink_to("left.tif")
+    os.link(tmp_path / "left.tif", tmp_path / "hard")
+    assert moves.arrivals(tmp_path) == {"left.tif": 1, "link": 1, "hard": 1}
+
+
 _FORKED = """
 import os, sys
 from pathlib import Path
