@@ -363,7 +363,7 @@ def test_triangulate__goes_on_after_a_kill_while_other_points_get_their_names(le
         return call
 
     def publish(*arguments):
-        changing = {name: counted(getattr(os, name)) for name in ("replace", "link", "unlink")}
+        changing = {name: counted(getattr(os, name)) for name in ("replace", "rename", "link", "unlink")}
         patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
         publishing.publish(*arguments)
 
