@@ -59,9 +59,10 @@ def demo(
 
     check_output(out, run.overwrite)
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
-    overwrite, there = run.overwrite or is_replacing(out / "tiles"), stamps(out, [layer.name for layer in layers])
+    overwrite = run.overwrite or is_replacing(out / "tiles")
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
     with Console(run.quiet or as_json) as console, put_back(layers if overwrite else (), out / "run.json"):
+        there = stamps(out, [layer.name for layer in layers])  # what a killed demo left is restored
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
         search = {"minimum": scene.minimum, "maximum": scene.maximum} | ({"local": True} if local_range else {})
