@@ -1,14 +1,19 @@
 """Functions shared by test modules: write a pair, run a command, wait, compare runs."""
 
 import hashlib
+import itertools
 import json
+import os
 import sysconfig
 import time
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 import rasterio
 import reference
 import yaml
@@ -22,7 +27,7 @@ from sat_intervals.kernels.cost import between, census
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import INVALID
-from sat_intervals.raster import north_up, whole_file, write_layer
+from sat_intervals.raster import OutputWriter, hidden, north_up, publishing, whole_file, write_layer
 from sat_intervals.tiling import Window
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
@@ -145,3 +150,31 @@ def exchanged_for_link(file, mine, way="symlink_to"):
 
 def fail(*arguments, **options):
     raise OSError(5, "Input/output error")
+
+
+class Killed(BaseException):
+    """As a kill by the system: nothing is tidied up."""
+
+
+@contextmanager
+def killed_while_publishing(number):
+    """Let the n-th change of a name by a publication, and all after it, raise Killed."""
+    calls, publish = itertools.count(1), publishing.publish
+
+    def counted(function):
+        def call(*arguments, **options):
+            if next(calls) >= number:
+                raise Killed
+            return function(*arguments, **options)
+
+        return call
+
+    def killed(*arguments):
+        changing = {name: counted(getattr(os, name)) for name in ("replace", "rename", "link", "unlink")}
+        patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
+        publish(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
+        patch.setattr(hidden, "publish", killed)
+        yield

@@ -15,6 +15,7 @@ from sat_intervals.raster.publishing import (
     REPORTS,
     RUN_REPORT,
     OutputError,
+    check_opened,
     examined,
     pinned,
     publish,
@@ -101,10 +102,8 @@ class HiddenFolder:
 
     def check_folder(self, *others: Path) -> None:
         """Raise if the output folder, or another one in it, is not the one that is open: others took its place."""
-        with suppress(FileNotFoundError):
-            if all(os.path.samestat(place.stat(), self._inside(place).stat()) for place in (self._folder, *others)):
-                return
-        raise OutputError(f"{self._folder} was replaced by another folder meanwhile: rerun the command")
+        for place in (self._folder, *others):
+            check_opened(place, self._inside(place), self._folder)
 
     def check(self) -> None:
         """Raise if folders of temporary files are not folders, are links, or are not those that were made."""

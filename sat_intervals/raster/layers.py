@@ -21,7 +21,16 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.publishing import OutputError, check_own, examined, pinned, rename_new, replace_same, stamps
+from sat_intervals.raster.publishing import (
+    OutputError,
+    check_opened,
+    check_own,
+    examined,
+    pinned,
+    rename_new,
+    replace_same,
+    stamps,
+)
 from sat_intervals.raster.seal import check_beside, check_place, is_as_made
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
@@ -72,15 +81,9 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
                 os.fsync(file.fileno())  # after a power loss it could be empty
                 if os.fstat(file.fileno()).st_size != written.st_size:
                     raise OutputError(f"{path} was truncated while it was written: rerun the command")
-            _check_folder(path, parent)
+            check_opened(path.parent, parent, path.parent)
             _put(new, parent / path.name, before)
-        _check_folder(path, parent)
-
-
-def _check_folder(path: Path, parent: Path) -> None:
-    """Raise if another folder has taken the place of the open one of a file."""
-    if not os.path.samestat(path.parent.stat(), parent.stat()):
-        raise OutputError(f"{path.parent} was replaced by another folder meanwhile: rerun the command")
+        check_opened(path.parent, parent, path.parent)
 
 
 @contextmanager

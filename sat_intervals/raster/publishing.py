@@ -83,6 +83,14 @@ class OutputError(SatIntervalsError):
     """An output that cannot be written."""
 
 
+def check_opened(place: Path, opened: Path, folder: Path) -> None:
+    """Raise if a place in a folder, or this itself, is not the one that was opened: another folder took its place."""
+    with suppress(FileNotFoundError):
+        if os.path.samestat(place.stat(), opened.stat()):
+            return
+    raise OutputError(f"{folder} was replaced by another folder meanwhile: rerun the command")
+
+
 def stamps(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """Return sizes and modification times of the files that exist, by name; a file that is moved keeps them."""
     found = {}

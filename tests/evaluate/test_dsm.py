@@ -2,21 +2,23 @@
 
 import json
 import os
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import invoke, late_file
+from helpers import contents, exchanged, invoke, late_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
-from sat_intervals import SatIntervalsError
+from sat_intervals import SatIntervalsError, raster
 from sat_intervals.errors import RunError
 from sat_intervals.evaluate import dsm
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.match.histogram import Histogram
+from sat_intervals.show import marks
 
 
 def test_evaluate_surface__worked_example(tmp_path):
@@ -309,6 +311,47 @@ def test_evaluate_command__ends_where_a_surface_is_replaced_before_its_pictures(
     done = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register", "--pictures", tmp_path)
     assert done.exit_code == 1
     assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
+
+
+@pytest.mark.peer("matplotlib")
+@pytest.mark.parametrize("name", ["dsm-accuracy.json", "dsm-errors.png"])
+@pytest.mark.parametrize("is_empty", [False, True])
+def test_evaluate_command__pictures_are_not_mixed_with_those_of_another_folder(tmp_path, monkeypatch, name, is_empty):
+    row, column = np.indices((60, 70)).astype(np.float64)
+    truth = relief(row, column)
+    model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
+    words = (
+        "evaluate",
+        "--dsm",
+        model,
+        "--reference",
+        write_raster(tmp_path / "reference.tif", [truth]),
+        "--no-register",
+    )
+    for folder in ("own", "other"):
+        (tmp_path / folder).mkdir()
+        if not (is_empty and folder == "other"):
+            assert invoke(*words, "--pictures", tmp_path / folder).exit_code == 0
+    mine = contents(tmp_path / "other")
+
+    @contextmanager
+    def there_for_one(path, there):
+        is_one = path.name == name
+        if is_one:
+            exchanged(tmp_path / "own", tmp_path / "other")
+        try:
+            with whole_file(path, there) as new:
+                yield new
+        finally:
+            if is_one:
+                exchanged(tmp_path / "own", tmp_path / "other")
+
+    whole_file = raster.whole_file
+    monkeypatch.setattr(raster, "whole_file", there_for_one)
+    monkeypatch.setattr(marks, "whole_file", there_for_one)
+    done = invoke(*words, "--pictures", tmp_path / "own")
+    assert (done.exit_code in (1, 2), done.stderr.count("\n")) == (True, 1), done.output
+    assert mine.items() <= contents(tmp_path / "other").items()
 
 
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):

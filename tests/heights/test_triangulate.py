@@ -1,20 +1,17 @@
 """Points and heights: cameras of known geometry, shareloc's own points, and a real pair with the surface of a peer."""
 
 import csv
-import itertools
 import json
-import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rasterio
 from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid, sensor_words
 from finished import MAXIMUM, MINIMUM, write_run
-from helpers import invoke, write_pair
+from helpers import Killed, invoke, killed_while_publishing, write_pair
 from rasterio.shutil import copy
 from rasterio.transform import Affine
 from rasterio.warp import reproject
@@ -24,7 +21,7 @@ from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
-from sat_intervals.raster import OutputWriter, hidden, publishing, stamps
+from sat_intervals.raster import stamps
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
@@ -343,35 +340,13 @@ def test_triangulate__protects_the_points_by_a_checksum(level_run, tmp_path):
     assert not list(out.glob(".unpublished-*/files"))
 
 
-class Killed(BaseException):
-    """What ends a process at once."""
-
-
 @pytest.mark.parametrize("number", range(1, 8))
-def test_triangulate__goes_on_after_a_kill_while_other_points_get_their_names(level_run, monkeypatch, number):
+def test_triangulate__goes_on_after_a_kill_while_other_points_get_their_names(level_run, number):
     """New points beside the old report would be taken for damaged."""
     out, files = level_run
     triangulate(out, *files)
-    calls = itertools.count(1)
-
-    def counted(function):
-        def call(*arguments, **named):
-            if next(calls) >= number:
-                raise Killed
-            return function(*arguments, **named)
-
-        return call
-
-    def publish(*arguments):
-        changing = {name: counted(getattr(os, name)) for name in ("replace", "rename", "link", "unlink")}
-        patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
-        publishing.publish(*arguments)
-
-    with monkeypatch.context() as patch, suppress(Killed):
-        patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
-        patch.setattr(hidden, "publish", publish)
+    with suppress(Killed), killed_while_publishing(number):
         triangulate(out, files[1], files[0], *files[2:])
-    assert next(calls) >= number
     triangulate(out, *files)
     make_surface([out], out / "dsm.tif", resolution=1.0)
     assert not [*out.glob(".unpublished-*/files/*")]

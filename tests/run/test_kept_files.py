@@ -1,6 +1,5 @@
 """Files of the user are never lost: inputs, unrelated files in a folder, and a finished run."""
 
-import itertools
 import json
 import os
 import re
@@ -12,7 +11,6 @@ import tempfile
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,11 +22,13 @@ from helpers import (
     OUTPUTS,
     PLACE,
     VRT,
+    Killed,
     contents,
     exchanged_for_link,
     fail,
     hashes,
     invoke,
+    killed_while_publishing,
     refused,
     write_pair,
 )
@@ -45,7 +45,6 @@ from sat_intervals.raster import (
     OutputError,
     OutputWriter,
     layers,
-    publishing,
     put_back,
     read_layers,
     write_layer,
@@ -799,37 +798,16 @@ def test_plot__needs_no_temporary_folder_of_the_system(finished, monkeypatch):
 NAMES = "intervals.tif", "validity.tif", "run.json"
 
 
-class Killed(BaseException):
-    """As a kill by the system: nothing is tidied up."""
-
-
 def killed(number, *arguments, **options):
     """`match_pair` that is killed at its n-th change of names; at 0 before it writes any file of the run."""
-    calls = itertools.count(1)
-
-    def counted(function):
-        def call(*arguments, **options):
-            if next(calls) >= number:
-                raise Killed
-            return function(*arguments, **options)
-
-        return call
-
-    def publish(*arguments):
-        changing = {name: counted(getattr(os, name)) for name in ("replace", "link", "unlink")}
-        patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
-        publishing.publish(*arguments)
 
     def assemble(*arguments):
         raise Killed
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
-        patch.setattr("sat_intervals.raster.hidden.publish", publish)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed), killed_while_publishing(number):
         if not number:
             patch.setattr(OutputWriter, "assemble", assemble)
-        with pytest.raises(Killed):
-            match_pair(*arguments, **options)
+        match_pair(*arguments, **options)
 
 
 @pytest.fixture(scope="module")
