@@ -7,11 +7,14 @@ only the file of a kernel, not the files of the kernels that it calls.
 import hashlib
 import os
 import threading
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 
 from numba import config, njit
+from numba.core.caching import IndexDataCacheFile
 
 
 def fingerprint(package: Path) -> str:
@@ -45,31 +48,47 @@ def cached(kernel):
     with _LOCK:
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         try:
-            return _healing(njit(nogil=True, cache=True)(kernel))
+            return _checked(njit(nogil=True, cache=True)(kernel))
         finally:
             config.CACHE_DIR = before
 
 
-def _healing(kernel):
-    """Let a kernel be compiled again if its cache is damaged, as after a power loss; numba would fail for good."""
-    cached = getattr(kernel, "_cache", None)
-    if cached is None:  # numba compiles nothing, with NUMBA_DISABLE_JIT
-        return kernel
-    load = cached.load_overload
+class _CheckedFiles(IndexDataCacheFile):
+    """Files of cached machine code with digests: numba executes what it finds, also damaged, as after a power loss.
 
-    def load_or_drop(*arguments):
-        try:
-            return load(*arguments)
-        except OSError:
-            raise
-        except Exception as error:  # whatever unpickling damaged bytes raises
-            with suppress(OSError):  # then the next process compiles it again, too
-                cached.flush()
-            if isinstance(error, MemoryError):
-                raise
-            return None
+    A kernel whose files are damaged is compiled and saved again.
+    """
 
-    cached.load_overload = load_or_drop
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:
+        with super()._open_for_write(filepath) as file:
+            yield (made := BytesIO())
+            content = made.getvalue()
+            file.write(content + hashlib.sha256(content).digest())
+
+    def _load_index(self) -> dict[object, str]:
+        with suppress(FileNotFoundError):
+            if not _is_intact(self._index_path):
+                return {}
+        return super()._load_index()
+
+    def _load_data(self, name: str) -> object:
+        if not _is_intact(path := self._data_path(name)):
+            raise FileNotFoundError(path)  # which numba takes for one to make
+        return super()._load_data(name)
+
+
+def _is_intact(file: str) -> bool:
+    """Return whether a file ends with the digest of what comes before."""
+    content = Path(file).read_bytes()
+    size = hashlib.sha256().digest_size
+    return hashlib.sha256(content[:-size]).digest() == content[-size:]
+
+
+def _checked(kernel):
+    """Let a cached kernel keep its machine code in checked files."""
+    if place := getattr(kernel, "_cache", None):  # numba compiles nothing, with NUMBA_DISABLE_JIT
+        place._cache_file.__class__ = _CheckedFiles  # the only part that reads and writes
     return kernel
 
 

@@ -100,12 +100,15 @@ if __name__ == "__main__":
 
 @pytest.mark.process
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
-@pytest.mark.parametrize("how", ["empty", "zeros", "short"])
+@pytest.mark.parametrize("how", ["empty", "zeros", "short", "flipped"])
 def test_cached__a_damaged_kernel_is_compiled_again(tmp_path, kind, how):
     use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(tmp_path))
     for file in tmp_path.rglob(f"*.{kind}"):
         content = file.read_bytes()
-        file.write_bytes({"empty": b"", "zeros": bytes(len(content)), "short": content[: len(content) // 2]}[how])
+        middle = len(content) // 2
+        flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+        damaged = {"empty": b"", "zeros": bytes(len(content)), "short": content[:middle], "flipped": flipped}
+        file.write_bytes(damaged[how])
     again, after = (use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
     assert again[:2] == ["0", "1"]
     assert after[:2] == ["1", "0"]
