@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -119,23 +120,29 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
     if log_file.is_file() or not log_file.exists():  # a pipe or terminal is none of these, and is not replaced
         check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
     try:
-        if log_file.is_file() and not _is_log(log_file):
-            raise SatIntervalsError(f"{log_file} exists and is not a log: choose another --log-file")
         file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1, opener=_at_once)  # noqa: SIM115
     except OSError as error:
         raise SatIntervalsError(f"{log_file} cannot be written: {error.strerror}: choose another --log-file") from error
     try:
+        if not _is_log(log_file, file):
+            raise SatIntervalsError(f"{log_file} exists and is not a log: choose another --log-file")
         yield file
     finally:
         with suppress(OSError):  # a full disk, already reported
             file.close()
 
 
-def _is_log(file: Path) -> bool:
-    """Return whether a file is empty or begins with a line of a log. Another may be an input, as a VRT's source."""
-    with file.open("rb") as stream:
-        head = stream.read(24)
-    return not head or _TIME.match(head) is not None
+def _is_log(log_file: Path, opened: IO[str]) -> bool:
+    """Return whether an opened file is empty or begins with a line of a log; pipes and terminals are no files.
+
+    Another may be an input, as a VRT's source, or have taken the name of the log meanwhile.
+    """
+    status = os.fstat(opened.fileno())
+    if not stat.S_ISREG(status.st_mode) or not status.st_size:
+        return True
+    with suppress(OSError), log_file.open("rb") as stream:
+        return os.path.samestat(status, os.fstat(stream.fileno())) and _TIME.match(stream.read(24)) is not None
+    return False
 
 
 def _at_once(path: str, flags: int) -> int:

@@ -78,6 +78,7 @@ class HiddenFolder:
             self.check_is_own()
             stack.enter_context(LocalFolder(self._hidden).locked())
             self.check_folder(self._hidden)
+            self._made = {self._hidden: self._inside(self._hidden).lstat()}
             yield
 
     @contextmanager
@@ -89,7 +90,9 @@ class HiddenFolder:
         (self._inside(self._hidden) / _MADE).touch()
         self._inside(self._replaced).mkdir(parents=True, exist_ok=True)
         with pinned(self._inside(self.files)) as self.opened_files:
-            self._made = {place: self._inside(place).lstat() for place in (self._hidden, self.files, self._replaced)}
+            self._made[self.files] = self.opened_files.stat()
+            self._made[self._replaced] = (self.opened_files / self._replaced.name).lstat()
+            self.check()
             yield
 
     def exists(self) -> bool:

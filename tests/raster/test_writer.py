@@ -125,6 +125,27 @@ def test_output_writer__deletes_nothing_in_a_folder_that_took_the_place_of_its_o
         shutil.rmtree(tmp_path / "moved")
 
 
+def test_output_writer__deletes_nothing_of_a_killed_process_whose_hidden_folder_takes_the_place_of_its_own(
+    tmp_path, monkeypatch
+):
+    """What that process had put aside is nowhere else."""
+    killed = tmp_path / "killed"
+    (killed / "files" / "replaced").mkdir(parents=True)
+    (killed / ".sat-intervals.files").touch()
+    (killed / "files" / "replaced" / "intervals.tif").write_text("mine")
+    remove = HiddenFolder.remove
+
+    def and_exchanged(output):
+        remove(output)
+        if killed.exists():
+            exchanged(output.files.parent, killed)
+
+    monkeypatch.setattr(HiddenFolder, "remove", and_exchanged)
+    with pytest.raises(OutputError, match=r"was replaced: move it away and rerun"), writer(tmp_path / "out") as output:
+        written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+    assert "mine" in map(bytes.decode, contents(tmp_path).values())
+
+
 @pytest.mark.parametrize("error", [None, errno.EINVAL, errno.EIO])
 def test_output_writer__names_are_on_the_disk_before_replaced_files_are_deleted(tmp_path, monkeypatch, error):
     """Else a power loss could take both; some file systems flush no folders."""

@@ -35,6 +35,7 @@ from helpers import (
 from matplotlib.figure import Figure
 from rasterio.shutil import copy
 
+from sat_intervals.cli import logs
 from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -508,6 +509,19 @@ def test_log_file__is_not_added_to_what_is_no_log(finished, tmp_path, content):
     file.write_bytes(content)
     refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", file], "is not a log", "--log-file")
     assert file.read_bytes() == content
+
+
+def test_log_file__is_not_added_to_what_takes_its_name_while_it_is_opened(finished, tmp_path, monkeypatch):
+    log, mine, at_once = tmp_path / "log", tmp_path / "mine", logs._at_once
+    mine.write_text("mine\n")
+
+    def late(*arguments):
+        mine.rename(log)
+        return at_once(*arguments)
+
+    monkeypatch.setattr(logs, "_at_once", late)
+    refused(["export", finished, tmp_path / "target", "--to", "otb", "--log-file", log], "is not a log", "--log-file")
+    assert log.read_text() == "mine\n"
 
 
 @pytest.fixture
