@@ -11,7 +11,7 @@ from sat_intervals.raster.publishing import OutputError
 
 WAY_OUT = "free disk space or choose another folder"
 # Errors of the path: more space does not help.
-_OF_PATH = FileExistsError, NotADirectoryError, FileNotFoundError, PermissionError
+_OF_PATH = FileExistsError, NotADirectoryError, PermissionError
 # Bytes of compressed pixels in those of the pixels, at most: noisy bands take a quarter, see `blocks`.
 _SHARE = 0.5
 
@@ -51,4 +51,6 @@ def _size(count: int) -> str:
 
 def way_out(error: Exception) -> str:
     """Return what to do about an error of writing."""
+    if isinstance(error, FileNotFoundError):  # the folder was moved away meanwhile, or nothing can be made there
+        return "rerun the command or choose another folder"
     return "choose another folder" if isinstance(error, _OF_PATH) else WAY_OUT
