@@ -54,10 +54,18 @@ def cached(kernel):
 
 
 class _CheckedFiles(IndexDataCacheFile):
-    """Files of cached machine code with digests: numba executes what it finds, also damaged, as after a power loss.
+    """Files of cached machine code, with digests: numba executes what it finds, also damaged, as after a power loss.
 
-    A kernel whose files are damaged is compiled and saved again.
+    The code says for which signature and processor it was made: two processes that save at once may leave the index of
+    one with the code of the other. A kernel without right files is compiled and saved again.
     """
+
+    def save(self, key: object, data: object) -> None:
+        super().save(key, (str(key), data))
+
+    def load(self, key: object) -> object:
+        made_for, data = super().load(key) or ("", None)
+        return data if made_for == str(key) else None
 
     @contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:
@@ -67,14 +75,14 @@ class _CheckedFiles(IndexDataCacheFile):
             file.write(content + hashlib.sha256(content).digest())
 
     def _load_index(self) -> dict[object, str]:
-        with suppress(FileNotFoundError):
-            if not _is_intact(self._index_path):
-                return {}
-        return super()._load_index()
+        with suppress(OSError):  # there is none, or it cannot be read
+            if _is_intact(self._index_path):
+                return super()._load_index()
+        return {}
 
     def _load_data(self, name: str) -> object:
         if not _is_intact(path := self._data_path(name)):
-            raise FileNotFoundError(path)  # which numba takes for one to make
+            raise FileNotFoundError(path)  # numba then compiles the kernel
         return super()._load_data(name)
 
 

@@ -114,6 +114,29 @@ def test_cached__a_damaged_kernel_is_compiled_again(tmp_path, kind, how):
     assert after[:2] == ["1", "0"]
 
 
+# Another signature of the same kernel.
+OF_SINGLE = """
+import numpy as np
+from sat_intervals.kernels.lattice import interpolate
+interpolate(np.zeros((2, 2, 2, 1), np.float32), np.ones(3), np.zeros(3), np.zeros((2, 2), np.float32))
+"""
+
+
+@pytest.mark.process
+def test_cached__machine_code_of_another_signature_is_not_executed(tmp_path):
+    """Two processes that save at once may leave the index of one with the code of the other."""
+    caches = {name: tmp_path / name for name in ("double", "single")}
+    use_a_kernel("use()", NUMBA_CACHE_DIR=str(caches["double"]))
+    use_a_kernel(OF_SINGLE, NUMBA_CACHE_DIR=str(caches["single"]))
+    (other,) = caches["single"].rglob("*interpolate*.nbc")
+    (own,) = caches["double"].rglob("*interpolate*.nbc")
+    assert own.name == other.name
+    own.write_bytes(other.read_bytes())
+    again, after = (use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(caches["double"])) for _ in range(2))
+    assert again[:2] == ["0", "1"]
+    assert after[:2] == ["1", "0"]
+
+
 @pytest.mark.process
 def test_cached__functions_of_others_stay_out_of_its_folder(tmp_path):
     (tmp_path / "stranger.py").write_text(
