@@ -103,11 +103,10 @@ def surface_options(command: Command) -> Command:
 def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: dict[str, Any]) -> list[Path]:
     """Write figures and pictures of a surface model to a folder; return their paths."""
     from sat_intervals.cli.tables import surface_markdown
-    from sat_intervals.errors import RunError
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
     from sat_intervals.evaluate.dsm import read_profile
     from sat_intervals.raster import examined, whole_file
-    from sat_intervals.raster.moves import moves
+    from sat_intervals.raster.identity import watched_folder
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
     from sat_intervals.show.marks import check_made_here, write_made_here
 
@@ -124,14 +123,13 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     draw_reliability(report, reliability, names[0])
     draw_error_map(compared, report["all"]["nmad"], errors)
     draw_height_profile(profile, heights, names)
-    moved = moves(folder)
+    check_folder = watched_folder(folder)
     for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
         with whole_file(path, there) as new:
             new.write_text(text, encoding="utf-8")
             _check_texts(folder)  # again: a file may have appeared meanwhile
     write_made_here({path: drawn.getvalue() for path, drawn in pictures.items()}, there)
-    if moves(folder) != moved:
-        raise RunError(f"{folder} was another folder while files were written: rerun the command")
+    check_folder()
     return [*texts, *paths]
 
 

@@ -1,6 +1,7 @@
 """Read and write GeoTIFF: images, their georeferencing, and the files of a run. Only this folder imports rasterio."""
 
 from sat_intervals.errors import InputError
+from sat_intervals.raster.beside import check_place
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.dependencies import other_files, pixel_files, read_files, survey, watched_rasters
@@ -32,7 +33,6 @@ from sat_intervals.raster.layers import (
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
 from sat_intervals.raster.publishing import OutputError, examined, stamps
-from sat_intervals.raster.seal import check_place
 from sat_intervals.raster.space import check_space, file_bytes, part_bytes
 from sat_intervals.raster.surfaces import (
     check_reference,

@@ -11,9 +11,8 @@ from rasterio.io import DatasetReader
 
 from sat_intervals.errors import ChangedInputError, InputError, check_regular
 from sat_intervals.raster import gdal
+from sat_intervals.raster.beside import came_beside, is_read, names_beside
 from sat_intervals.raster.identity import local_file, stamp_of, watched
-from sat_intervals.raster.moves import came_beside, is_beside
-from sat_intervals.raster.seal import is_read
 from sat_intervals.raster.virtual import sources_of
 
 # File systems of which GDAL does not say what it reads, or whether it has changed; archives on servers.
@@ -126,7 +125,9 @@ def watched_rasters(
                 raise ChangedInputError(f"a file beside {name} appeared while it was read: rerun the command")
         for file, count in came_beside(sources).items():
             if count > came.get(file, 0) + os.path.lexists(file):  # what is still there was compared
-                raise ChangedInputError(f"{file} was there for a moment while files were read: rerun the command")
+                raise ChangedInputError(
+                    f"{file} came, and went or was replaced, while files were read: rerun the command"
+                )
 
     return check
 
@@ -161,7 +162,7 @@ def check_pipes_beside(path: str, listed: dict[str, list[str]] | None = None) ->
         with suppress(OSError), os.scandir(folder or ".") as files:
             listed[folder] = [file.name for file in files if not (file.is_file() or file.is_dir())]
     for other in listed[folder]:
-        if is_beside(other, name):
+        if other.lower() in names_beside(name):
             check_regular(os.path.join(folder, other))
 
 

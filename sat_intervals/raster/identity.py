@@ -5,7 +5,7 @@ import os
 import re
 import stat
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -17,7 +17,8 @@ from typing import Any, NamedTuple, TypeVar
 from urllib.request import Request, urlopen
 
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
-from sat_intervals.raster.moves import came_beside, moves
+from sat_intervals.raster.beside import came_beside
+from sat_intervals.raster.moves import moves
 from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
@@ -111,13 +112,22 @@ def _stamp(file: str | Path) -> str:
 
 
 class _Place(NamedTuple):
-    """State of a file, link or folder on the way to an input: inode, times in nanoseconds, and its `moves`."""
+    """State of a file, link or folder on a path: inode, times in nanoseconds, and its `moves`."""
 
     inode: int
     modified: int
     changed: int
     is_folder: bool
-    moves: tuple[int, int]
+    moves: tuple[int, int] | None
+
+    def is_touched(self, later: "_Place") -> bool:
+        """Return whether a file or link changed, or a folder was exchanged.
+
+        A folder that gets a new file has both times of that moment, one that is renamed only the change time.
+        """
+        is_moved = None not in (self.moves, later.moves) and self.moves != later.moves
+        has_other_time = self.changed != later.changed and not (later.is_folder and later.modified == later.changed)
+        return self.inode != later.inode or is_moved or has_other_time
 
 
 class _Moment(NamedTuple):
@@ -127,15 +137,8 @@ class _Moment(NamedTuple):
     places: list[_Place]
 
     def is_touched(self, later: "_Moment") -> bool:
-        """Return whether the file, or a link or folder on its path, was changed or exchanged since.
-
-        A folder that gets a new file has both times of that moment, one that is renamed only the change time.
-        """
-        return (self.stamp, len(self.places)) != (later.stamp, len(later.places)) or any(
-            (before.inode, before.moves) != (now.inode, now.moves)
-            or (before.changed != now.changed and not (now.is_folder and now.modified == now.changed))
-            for before, now in zip(self.places, later.places, strict=True)
-        )
+        """Return whether the file, or a link or folder on its path, was changed or exchanged since."""
+        return self.stamp != later.stamp or _is_other_way(self.places, later.places)
 
 
 def _moment(path: str) -> _Moment:
@@ -151,6 +154,10 @@ def _way_to(path: Path) -> Iterator[_Place]:
             yield _Place(status.st_ino, status.st_mtime_ns, status.st_ctime_ns, is_folder, counted)
         if is_link:
             yield from _way_to(place.parent / place.readlink())
+
+
+def _is_other_way(before: Sequence[_Place], later: Sequence[_Place]) -> bool:
+    return len(before) != len(later) or any(map(_Place.is_touched, before, later))
 
 
 def _hashed(file: str | Path) -> tuple[str, str]:
@@ -316,6 +323,17 @@ def watched(files: Iterable[str | Path | None], *, is_local: bool = False) -> Ca
             now = None if is_local else stamp_of(file)
             if moment.is_touched(_moment(file)) or (None not in (stamp, now) and stamp != now):
                 raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
+
+    return check
+
+
+def watched_folder(folder: Path) -> Callable[[], None]:
+    """Return a function that raises if a folder was another one for a moment since, while files were written there."""
+    before = [*_way_to(folder.absolute())]
+
+    def check() -> None:
+        if _is_other_way(before, [*_way_to(folder.absolute())]):
+            raise ChangedInputError(f"{folder} was another folder while files were written: rerun the command")
 
     return check
 

@@ -13,10 +13,11 @@ from rasterio.io import DatasetReader
 
 from sat_intervals.errors import ChangedInputError, InputError, RunError, check_regular
 from sat_intervals.raster import gdal
+from sat_intervals.raster.beside import is_read
 from sat_intervals.raster.dependencies import check_pipes_beside, pixel_files, stamps_of, watched_image, watched_rasters
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.identity import stamp_of
-from sat_intervals.raster.seal import check_seal, is_read
+from sat_intervals.raster.seal import check_seal
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.

@@ -19,6 +19,7 @@ from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
+from sat_intervals.raster.beside import check_beside, check_place
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import opened
 from sat_intervals.raster.publishing import (
@@ -31,7 +32,7 @@ from sat_intervals.raster.publishing import (
     replace_same,
     stamps,
 )
-from sat_intervals.raster.seal import check_beside, check_place, is_as_made
+from sat_intervals.raster.seal import is_as_made
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window, strips
 

@@ -1,11 +1,10 @@
-"""Count renamings and arrivals in folders, which their times do not tell: those of a later file hide an earlier one."""
+"""Count renamings of folders and arrivals of files: times do not tell, since a later change hides an earlier one."""
 
 import ctypes
 import os
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Mapping
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
 from struct import calcsize, unpack_from
 from threading import Lock
@@ -20,8 +19,6 @@ _WATCHED = 0x01000000 | 0x02000000
 _LOST = 0x4000
 _EVENT = "iIII"
 _AT_ONCE = 1 << 16  # bytes
-# Endings of overviews and of files that a program has not finished.
-_UNREAD = ".ovr", ".tmp"
 
 
 class _Queue:
@@ -29,69 +26,66 @@ class _Queue:
 
     def __init__(self, kind: int) -> None:
         self._system, self._kind = ctypes.CDLL(None), kind
-        self._queue = self._system.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._queue = -1
+        self._begin()
+        os.register_at_fork(after_in_child=self._begin)
+
+    def _begin(self) -> None:
+        """Forget everything: a forked process would take the events of its parent."""
+        if self._queue >= 0:
+            os.close(self._queue)
+        self._queue = -1
+        self._asked: defaultdict[int, set[str]] = defaultdict(set)
         self._counts: defaultdict[int, Counter[tuple[int, str]]] = defaultdict(Counter)
         self._lost = 0
         self._lock = Lock()
 
-    def counts(self, folder: Path) -> tuple[int, int, Counter[tuple[int, str]]]:
-        """Return the number of a folder, how often events of any were lost, and its events by kind and name."""
+    def counts(self, folder: Path, names: Collection[str]) -> tuple[int, int, Mapping[tuple[int, str], int]]:
+        """Return the number of a folder, how often events of any were lost, and its events by kind and name.
+
+        ``names`` are those that count, in lower case: others have no end.
+        """
         with self._lock:
+            if self._queue < 0:
+                self._queue = self._system.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
             number = self._system.inotify_add_watch(self._queue, os.fsencode(folder), self._kind | _WATCHED)
+            self._asked[number].update(names)
             with suppress(OSError):  # there are no more, or there is no queue
                 while events := os.read(self._queue, _AT_ONCE):
                     self._add(events)
-            return number, self._lost, self._counts[number].copy()
+            counts = {event: count for event, count in self._counts[number].items() if event[1].lower() in names}
+            return number, self._lost, Counter(counts)
 
     def _add(self, events: bytes) -> None:
         start = 0
         while start < len(events):
             number, kind, _, size = unpack_from(_EVENT, events, start)
             start += calcsize(_EVENT) + size
+            name = os.fsdecode(events[start - size : start].rstrip(b"\0"))
             self._lost += bool(kind & _LOST)
-            if kind := kind & self._kind:
-                self._counts[number][kind, os.fsdecode(events[start - size : start].rstrip(b"\0"))] += 1
+            if (kind := kind & self._kind) and name.lower() in self._asked[number]:
+                self._counts[number][kind, name] += 1
 
 
-def moves(folder: Path) -> tuple[int, int]:
+_RENAMINGS, _ARRIVALS = _Queue(_RENAMED), _Queue(_MADE | _WRITTEN | _NAMED | _MODIFIED)
+
+
+def moves(folder: Path) -> tuple[int, int] | None:
     """Return a number of the folder at a path in this process, and how often it was renamed since it was first asked.
 
-    The number is -1 for what is no folder, and where the system cannot watch it. On a network disk, only renamings by
-    this machine count.
+    None for what is no folder, and where the system cannot watch it. On a network disk, only renamings by this machine
+    count.
     """
-    number, lost, counts = _of_process(os.getpid(), _RENAMED).counts(folder)
-    return number, lost + counts[_RENAMED, ""]
+    number, lost, counts = _RENAMINGS.counts(folder, ("",))
+    return None if number < 0 else (number, lost + counts[_RENAMED, ""])
 
 
-def arrivals(folder: Path) -> dict[str, int]:
-    """Return how often a file of each name was made, written or renamed to in a folder, since it was first asked.
+def arrivals(folder: Path, names: Collection[str]) -> dict[str, int]:
+    """Return how often files were made, written or renamed to in a folder, since they were first asked for, by name.
 
-    Making and writing one counts once. Empty where the system cannot watch the folder; some may be missing if there are
-    thousands.
+    Making and writing one counts once. ``names`` are in lower case, and count in any case. Empty where the system
+    cannot watch the folder; some may be missing if there are thousands.
     """
-    counts = _of_process(os.getpid(), _MADE | _WRITTEN | _NAMED | _MODIFIED).counts(folder)[2]
-    names = {name for kind, name in counts if kind != _MODIFIED}
-    return {name: max(counts[_MADE, name], counts[_WRITTEN, name]) + counts[_NAMED, name] for name in names}
-
-
-def came_beside(files: Iterable[str]) -> dict[str, int]:
-    """Return how often files came that GDAL may read with rasters, by path, see `arrivals`."""
-    counts = {}
-    for file in filter(os.path.isfile, files):
-        folder, name = os.path.split(os.path.abspath(file))
-        for other, count in arrivals(Path(os.path.realpath(folder))).items():
-            if other != name and is_beside(other, name) and not other.lower().endswith(_UNREAD):
-                counts[os.path.join(folder, other)] = count
-    return counts
-
-
-def is_beside(other: str, name: str) -> bool:
-    """Return whether GDAL may read a file of one name with a raster of another in the same folder."""
-    stem = os.path.splitext(name)[0].lower()
-    return other.lower().startswith((f"{stem}.", f"{stem}_rpc."))
-
-
-@lru_cache(maxsize=2)
-def _of_process(_: int, kind: int) -> _Queue:
-    """Return the queue of a process; one that was forked would take the events of its parent."""
-    return _Queue(kind)
+    counts = _ARRIVALS.counts(folder, names)[2]
+    came = {name for kind, name in counts if kind != _MODIFIED}
+    return {name: max(counts[_MADE, name], counts[_WRITTEN, name]) + counts[_NAMED, name] for name in came}

@@ -18,6 +18,7 @@ from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
+from sat_intervals.raster.beside import check_place
 from sat_intervals.raster.cog import CopyParts, Part, assemble, template
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
@@ -25,7 +26,6 @@ from sat_intervals.raster.hidden import HiddenFolder
 from sat_intervals.raster.identity import checksum_of, checksum_of_text
 from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
 from sat_intervals.raster.publishing import OutputError, flush, stamps
-from sat_intervals.raster.seal import check_place
 from sat_intervals.raster.space import check_space, file_bytes, way_out
 from sat_intervals.raster.streaming import Stream
 

@@ -13,8 +13,8 @@ from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.raster import Image, check_as_opened, pixel_files, survey
+from sat_intervals.raster.beside import SIDECARS, is_read
 from sat_intervals.raster.identity import identity
-from sat_intervals.raster.seal import SIDECARS, is_read
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.store.manifest import differences
 from sat_intervals.tiling import Window

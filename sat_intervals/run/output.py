@@ -9,8 +9,8 @@ from typing import Any
 
 from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
 from sat_intervals.raster import RUN_FILES, examined, is_marked, restore, stamps
+from sat_intervals.raster.beside import check_place
 from sat_intervals.raster.identity import checksum_of
-from sat_intervals.raster.seal import check_place
 from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.store.marks import finished_run, is_replacing
 from sat_intervals.store.removal import has_begun

@@ -1,7 +1,5 @@
 """The CRC-32 inside surface models and true disparities: whatever reads a damaged one refuses it."""
 
-import os
-
 import numpy as np
 import pytest
 import rasterio
@@ -15,7 +13,7 @@ from surfaces import write_raster
 from sat_intervals import SatIntervalsError
 from sat_intervals.products import SURFACE
 from sat_intervals.raster import OutputWriter, cog, surface_file, truth_file
-from sat_intervals.raster.seal import check_place, check_seal
+from sat_intervals.raster.seal import check_seal
 
 
 def write(path, file, bands, tags=None):
@@ -135,9 +133,3 @@ def test_commands__refuse_files_beside_ours_that_change_them(whole, name):
         dataset.update_tags(INTERNAL_MASK_FLAGS_1="2")
     assert f"{mask} changes what is read" in invoke(*command).stderr
     mask.unlink()
-
-
-def test_check_place__does_not_wait_for_a_pipe_with_the_name_of_statistics(tmp_path):
-    os.mkfifo(tmp_path / "dsm.tif.aux.xml")
-    with pytest.raises(SatIntervalsError, match=r"dsm\.tif\.aux\.xml changes what is read from .*: move it away"):
-        check_place(tmp_path / "dsm.tif")
