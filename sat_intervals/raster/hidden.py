@@ -17,6 +17,7 @@ from sat_intervals.raster.publishing import (
     OutputError,
     check_opened,
     examined,
+    flush_folder,
     pinned,
     publish,
     put_back,
@@ -162,6 +163,7 @@ class HiddenFolder:
             made = json.loads(report.read_text())["files"]
             if made == {name: checksum_of(self.opened_folder / name) for name in made}:
                 rename_new(report, place)
+                flush_folder(self.opened_folder)
                 self.is_published = True
                 return
         put_back(self._inside(self.files), self.opened_folder, self._names)
@@ -198,7 +200,10 @@ def remove_scratch(folder: Path, files: Sequence[File]) -> None:
     """Delete temporary files of a killed process; those that it put aside only if all final files exist."""
     with _killed(folder, files) as hidden:
         names = *(file.name for file in files), RUN_REPORT
-        hidden.is_published = all((hidden.opened_folder / name).is_file() for name in names)
+        if all((hidden.opened_folder / name).is_file() for name in names):
+            with suppress(OSError):
+                flush_folder(hidden.opened_folder)
+                hidden.is_published = True
 
 
 def restore(folder: Path, files: Sequence[File]) -> None:
@@ -209,7 +214,7 @@ def restore(folder: Path, files: Sequence[File]) -> None:
 
 @contextmanager
 def replaceable(folder: Path, files: Sequence[File]) -> Iterator[dict[str, str]]:
-    """Yield what `examined` yields of files that a command replaces, after `restore`."""
+    """Restore what a killed process put aside; then yield the stamps of the files to replace, see `examined`."""
     restore(folder, files)
     with examined(folder, [file.name for file in files]) as there:
         yield there

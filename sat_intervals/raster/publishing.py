@@ -4,6 +4,7 @@ import ctypes
 import errno
 import filecmp
 import json
+import logging
 import os
 import stat
 import uuid
@@ -15,12 +16,15 @@ from pathlib import Path
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.raster.identity import watched
 from sat_intervals.store.manifest import unsealed
+from sat_intervals.store.open_folder import flush_names
+
+_LOG = logging.getLogger(__name__)
 
 # Reports that are published with files: of a run, and of its points.
 RUN_REPORT, POINTS_REPORT = "run.json", "points.json"
 REPORTS = RUN_REPORT, POINTS_REPORT
-# Arguments of Linux' renameat2: paths are relative to the working directory; exchange two files.
-_HERE, _EXCHANGE = -100, 2
+# Arguments of Linux' renameat2: paths are relative to the working directory; replace nothing; exchange two files.
+_HERE, _REPLACE_NOTHING, _EXCHANGE = -100, 1, 2
 # Folder of the replaced files, among the finished ones.
 REPLACED = "replaced"
 
@@ -168,7 +172,7 @@ def publish(
         if stamps(folder, compared) != compared:
             raise OutputError(f"another program changed temporary files in {named}: rerun the command")
         with failing(named):
-            _flush_names(folder)
+            flush_folder(folder)
     except BaseException:
         for name in names:
             with suppress(OSError):
@@ -217,11 +221,13 @@ def _remove(place: Path, folder: Path, may_go: Callable[[Path], bool]) -> bool:
 
 
 def _give_back(aside: Path, place: Path) -> None:
-    """Return a file that was there for a moment only; if its place is taken again, keep it under a name of its own."""
+    """Return what was there for a moment only; if its place is taken again, keep it under a name of its own."""
     try:
-        rename_new(aside, place)
+        _rename_free(aside, place)
     except FileExistsError:
-        os.replace(aside, aside.with_name(f"{place.name}.{uuid.uuid4().hex}"))
+        kept = aside.with_name(f"{place.name}.{uuid.uuid4().hex}")
+        os.rename(aside, kept)
+        _LOG.warning("a file of another program was %s for a moment: it is kept as %s", place.resolve(), kept.resolve())
 
 
 def _is_file(own: os.stat_result, file: Path) -> bool:
@@ -244,16 +250,36 @@ def rename_new(source: Path, target: Path) -> None:
     """Rename a file that is no folder, but never over another."""
     if source.is_dir() and not source.is_symlink():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    _rename_free(source, target)
+
+
+def _rename_free(source: Path, target: Path) -> None:
+    """Rename a file or folder, but never over another; on disks with neither way to do so, one may come meanwhile."""
+    if _is_renamed(source, target, _REPLACE_NOTHING):
+        return
     try:
         os.link(source, target, follow_symlinks=False)
     except (FileExistsError, FileNotFoundError):
         raise
-    except OSError:  # a file system without hard links
+    except OSError:  # a file system without hard links, or a folder
         if os.path.lexists(target):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
-        os.replace(source, target)
+        os.rename(source, target)
     else:
         os.unlink(source)
+
+
+def _is_renamed(source: Path, target: Path, flag: int) -> bool:
+    """Rename with a flag of Linux' renameat2 and return True; False where the system or the disk has no such flag."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    if not rename(_HERE, os.fsencode(source), _HERE, os.fsencode(target), flag):
+        return True
+    error = ctypes.get_errno()
+    if error in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
+        return False
+    raise OSError(error, os.strerror(error), str(source))
 
 
 def replace_same(new: Path, place: Path, stamp: str) -> None:
@@ -278,20 +304,16 @@ def replace_same(new: Path, place: Path, stamp: str) -> None:
 
 def _exchange(new: Path, place: Path) -> None:
     """Exchange two files in one step, so that the replaced one can be examined; replace it where that is impossible."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    is_done = rename is not None and not rename(_HERE, os.fsencode(new), _HERE, os.fsencode(place), _EXCHANGE)
-    if rename is None or not (is_done or ctypes.get_errno() == errno.ENOENT):  # what was to be replaced may be away
-        os.replace(new, place)
+    with suppress(FileNotFoundError):  # what was to be replaced may be away
+        if not _is_renamed(new, place, _EXCHANGE):
+            os.replace(new, place)
 
 
-def _flush_names(folder: Path) -> None:
+def flush_folder(folder: Path) -> None:
     """Flush new names in a folder to the disk, before what they replace is deleted: a power loss could take both."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        os.fsync(descriptor)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # of file systems that flush no folders
-            raise
+        flush_names(descriptor)
     finally:
         os.close(descriptor)
 

@@ -1,5 +1,6 @@
 """Disk space that files need at most."""
 
+import errno
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,4 +54,8 @@ def way_out(error: Exception) -> str:
     """Return what to do about an error of writing."""
     if isinstance(error, FileNotFoundError):  # the folder was moved away meanwhile, or nothing can be made there
         return "rerun the command or choose another folder"
+    if isinstance(error, IsADirectoryError):
+        return "move it away"
+    if getattr(error, "errno", None) == errno.ESTALE:
+        return "rerun the command"
     return "choose another folder" if isinstance(error, _OF_PATH) else WAY_OUT

@@ -48,8 +48,11 @@ def write_new(name: str, content: bytes, folder: int, *, is_flushed: bool) -> No
 
 def flush_names(folder: int) -> None:
     """Flush new names in an open folder to the disk, where its file system does that."""
-    with suppress(OSError):
+    try:
         os.fsync(folder)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
 
 
 def read_small(name: str, folder: int) -> str | None:

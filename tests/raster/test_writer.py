@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import OUTPUTS, PLACE, STATISTICS, contents, exchanged, exchanged_for_link
+from helpers import OUTPUTS, PLACE, STATISTICS, contents, exchanged, exchanged_for_link, fail
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.products import BANDS
@@ -34,6 +34,7 @@ from sat_intervals.raster import (
 from sat_intervals.raster import writer as raster_writer
 from sat_intervals.raster.files import File
 from sat_intervals.raster.hidden import HiddenFolder
+from sat_intervals.raster.space import way_out
 from sat_intervals.run.pair import match_pair
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -487,7 +488,7 @@ def test_output_writer__puts_no_file_of_another_folder_aside_that_is_there_for_a
     assert read_layers(out / "intervals.tif")[0, 0, 0] == 3
 
 
-def test_output_writer__keeps_a_file_that_is_in_the_place_of_a_result_for_a_moment(tmp_path, monkeypatch):
+def test_output_writer__keeps_a_file_that_is_in_the_place_of_a_result_for_a_moment(tmp_path, monkeypatch, caplog):
     """A rerun deletes what was put aside."""
     out, mine, before = tmp_path / "out", tmp_path / "mine", both(tmp_path)[2]
     mine.write_text("mine")
@@ -507,10 +508,29 @@ def test_output_writer__keeps_a_file_that_is_in_the_place_of_a_result_for_a_mome
     with pytest.raises(OutputError, match=r"intervals\.tif is not of this run"), writer(out) as output:
         written(output, *zeros)
     assert before.items() <= named(out).items()
+    (kept,) = (file for file in out.rglob("intervals.tif.*") if file.read_text() == "mine")
+    assert f"{out}/intervals.tif for a moment: it is kept as {kept}" in caplog.text
     monkeypatch.undo()
     with writer(out) as output:
         written(output, *zeros)
     assert "mine" in [file.read_text() for file in out.rglob("*.*") if file.is_file() and file.suffix != ".tif"]
+
+
+def test_output_writer__gives_a_folder_back_that_takes_the_place_of_a_result(tmp_path, monkeypatch):
+    out, mine = both(tmp_path)[0], tmp_path / "mine"
+    mine.mkdir()
+    (mine / "notes.txt").write_text("mine")
+    replace = os.replace
+
+    def of_another(source, target):
+        if target.parent.name == "replaced" and mine.exists():
+            exchanged(source, mine)
+        replace(source, target)
+
+    monkeypatch.setattr(publishing.os, "replace", of_another)
+    with pytest.raises(OutputError, match=r"is not of this run, or was changed"), writer(out) as output:
+        written(output, np.zeros((4, 4, 5), np.float32), np.zeros((4, 5), np.uint16))
+    assert [file.read_text() for file in out.glob("*/notes.txt")] == ["mine"]
 
 
 @pytest.mark.parametrize("moment", ["takes back", "resumes"])
@@ -617,3 +637,28 @@ def test_examined__raises_if_another_file_may_have_been_examined(tmp_path, way):
 
     with pytest.raises(ChangedInputError, match="rerun the command"):
         examine()
+
+
+def test_rename_new__replaces_nothing_where_there_are_no_hard_links(tmp_path, monkeypatch):
+    """A file may come at any moment."""
+    for name in ("new", "mine"):
+        (tmp_path / name).write_text(name)
+    monkeypatch.setattr(publishing.os, "link", fail)
+    monkeypatch.setattr(publishing.os.path, "lexists", lambda _: False)
+    with pytest.raises(FileExistsError):
+        publishing.rename_new(tmp_path / "new", tmp_path / "mine")
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (errno.ENOENT, "rerun the command or choose another folder"),
+        (errno.ESTALE, "rerun the command"),
+        (errno.EISDIR, "move it away"),
+        (errno.EACCES, "choose another folder"),
+        (errno.ENOSPC, "free disk space or choose another folder"),
+    ],
+)
+def test_way_out__fits_the_error(number, words):
+    assert way_out(OSError(number, os.strerror(number))) == words

@@ -5,7 +5,7 @@ import os
 import resource
 import shutil
 import stat
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import pytest
 from helpers import contents, exchanged
@@ -234,6 +234,19 @@ def test_write__of_a_mark_flushes_its_content_and_then_its_name(tmp_path, monkey
     LocalFolder(tmp_path).write(name, "mark")
     LocalFolder(tmp_path).write("other", "text")
     assert flushed == [4, [name]]
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EINVAL])
+def test_write__of_a_mark_fails_with_a_disk_that_does_not_keep_its_name(tmp_path, monkeypatch, number):
+    """Some file systems flush no folders."""
+
+    def flush(file):
+        if stat.S_ISDIR(os.fstat(file).st_mode):
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", flush)
+    with nullcontext() if number == errno.EINVAL else pytest.raises(OSError, match="Input/output error"):
+        LocalFolder(tmp_path).write(MADE, "mark")
 
 
 @pytest.mark.parametrize("change", [LocalFolder.delete, lambda folder, name: folder.write(name, "own")])
