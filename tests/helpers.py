@@ -172,6 +172,7 @@ def killed_while_publishing(number):
     def killed(*arguments):
         changing = {name: counted(getattr(os, name)) for name in ("replace", "rename", "link", "unlink")}
         patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
+        patch.setattr(publishing, "_is_renamed", counted(publishing._is_renamed))
         publish(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -639,15 +639,20 @@ def test_examined__raises_if_another_file_may_have_been_examined(tmp_path, way):
         examine()
 
 
-def test_rename_new__replaces_nothing_where_there_are_no_hard_links(tmp_path, monkeypatch):
-    """A file may come at any moment."""
+@pytest.mark.parametrize("way", ["flag", "link", "neither"])
+def test_rename_new__replaces_nothing_on_any_disk(tmp_path, monkeypatch, way):
     for name in ("new", "mine"):
         (tmp_path / name).write_text(name)
-    monkeypatch.setattr(publishing.os, "link", fail)
-    monkeypatch.setattr(publishing.os.path, "lexists", lambda _: False)
+    if way != "flag":
+        monkeypatch.setattr(publishing, "_is_renamed", lambda *_: False)
+    if way == "neither":
+        monkeypatch.setattr(publishing.os, "link", fail)
+    else:  # a file may come at any moment
+        monkeypatch.setattr(publishing.os.path, "lexists", lambda _: False)
     with pytest.raises(FileExistsError):
         publishing.rename_new(tmp_path / "new", tmp_path / "mine")
-    assert (tmp_path / "mine").read_text() == "mine"
+    publishing.rename_new(tmp_path / "new", tmp_path / "free")
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {"free": "new", "mine": "mine"}
 
 
 @pytest.mark.parametrize(

@@ -885,7 +885,7 @@ def test_match__keeps_the_edited_report_of_an_equal_run_that_appears_during_it(r
     assert report.read_text() == edited
 
 
-@pytest.mark.parametrize("number", range(1, 7))
+@pytest.mark.parametrize("number", [1, 2, 3])
 def test_match__goes_on_after_a_kill_between_the_names_of_its_files(runs, tmp_path, number):
     folder, images, settings, _ = runs
     out = tmp_path / "out"
@@ -898,7 +898,7 @@ def test_match__goes_on_after_a_kill_between_the_names_of_its_files(runs, tmp_pa
     assert sorted(path.name for path in out.iterdir()) == sorted(NAMES)
 
 
-@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 8, 9])
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 6])
 def test_match__keeps_the_run_to_replace_until_the_new_one_exists(runs, tmp_path, number):
     folder, images, settings, _ = runs
     out = tmp_path / "out"
