@@ -26,7 +26,8 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.surface import surfaces_of
     from sat_intervals.config.pairs import REPORT, read_batch
-    from sat_intervals.raster.identity import check_not_replaced, watched
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.raster.watching import watched
     from sat_intervals.run.batch import match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])

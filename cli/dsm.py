@@ -66,7 +66,7 @@ def cell_options(command: Command) -> Command:
             raise click.UsageError("give either --resolution or --grid-like.")
         from sat_intervals.config import load_height_calibration
         from sat_intervals.heights.choices import SurfaceChoices
-        from sat_intervals.raster.identity import watched
+        from sat_intervals.raster.watching import watched
 
         check_calibration = watched([calibration])
         choices["calibration"] = calibration and load_height_calibration(calibration)

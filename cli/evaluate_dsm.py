@@ -106,7 +106,7 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
     from sat_intervals.evaluate.dsm import read_profile
     from sat_intervals.raster import examined, whole_file
-    from sat_intervals.raster.identity import watched_folder
+    from sat_intervals.raster.watching import watched_folder
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
     from sat_intervals.show.marks import check_made_here, write_made_here
 

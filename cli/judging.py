@@ -97,7 +97,7 @@ def watched_arguments(pairs: Iterable[Path], settings: Path | None) -> Callable[
 
     Call this before they are read. Of a pair, its CSV file or meta.json is meant, not its images; of a run, its files.
     """
-    from sat_intervals.raster.identity import watched
+    from sat_intervals.raster.watching import watched
     from sat_intervals.run.output import OUTPUTS
 
     check_files = watched(pair / name if pair.is_dir() else pair for pair in pairs for name in ("meta.json", *OUTPUTS))

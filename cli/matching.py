@@ -82,7 +82,7 @@ def watched_settings(file: Path | None, sections: Mapping[str, Any] | None = Non
     """
     from sat_intervals.config import named_files
     from sat_intervals.raster import watched_rasters
-    from sat_intervals.raster.identity import watched
+    from sat_intervals.raster.watching import watched
 
     check_file = watched([file])
     check_named = watched_rasters([*named_by(file), *named_files(sections)])  # one of ranges may be virtual

@@ -26,7 +26,8 @@ from sat_intervals.raster import (
     read_small_layers,
     read_tags,
 )
-from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, stamp_of, watched
+from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, known_checksum, stamp_of
+from sat_intervals.raster.watching import watched
 from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.tiling import Window, strips
 
@@ -278,10 +279,7 @@ def open_run(out: str | Path) -> Run:
         for image in images.values():
             _nodata(image)
         region = Window(**{name: index(report["tiles"]["region"][name]) for name in _REGION})
-        files = {
-            name: {key: index(file[key]) for key in ("bytes", "crc32")}
-            for name, file in report.get("files", {}).items()
-        }
+        files = {name: known_checksum(file) for name, file in report.get("files", {}).items()}
     except OSError as error:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:

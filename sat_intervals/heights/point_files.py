@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_file, check_regular
 from sat_intervals.raster import GROUND, Frame, Vertical, stamps
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster.watching import watched
 
 # Bytes in which GDAL looks for what a file is.
 _HEAD = 4096

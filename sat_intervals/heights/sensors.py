@@ -11,14 +11,16 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.grids import read_grid
+from sat_intervals.kernels.compiled import checked_cache
 from sat_intervals.kernels.lattice import interpolate
 from sat_intervals.raster import GROUND, Georeferencing, watched_rasters
 from sat_intervals.tiling import Window
 
 try:
-    from shareloc.geofunctions.rectification_grid import RectificationGrid
-    from shareloc.geofunctions.triangulation import epipolar_triangulation
-    from shareloc.geomodels import GeoModel
+    with checked_cache():
+        from shareloc.geofunctions.rectification_grid import RectificationGrid
+        from shareloc.geofunctions.triangulation import epipolar_triangulation
+        from shareloc.geomodels import GeoModel
 except ModuleNotFoundError as error:
     raise SatIntervalsError("triangulation needs shareloc: pip install 'sat-intervals[dsm]'") from error
 

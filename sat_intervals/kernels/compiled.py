@@ -14,6 +14,7 @@ from io import BytesIO
 from pathlib import Path
 
 from numba import config, njit
+from numba.core import caching
 from numba.core.caching import IndexDataCacheFile
 
 
@@ -35,24 +36,6 @@ FINGERPRINT = fingerprint(Path(__file__).parents[1])
 _LOCK = threading.Lock()
 
 
-def cached(kernel):
-    """Compile a kernel that releases the GIL, and cache its machine code on disk.
-
-    numba reads the cache folder from its global configuration while it decorates. The configuration is restored at
-    once, because it applies to the cached functions of other packages too. Without a writable folder, every process
-    compiles the kernels again.
-    """
-    folder = _folder()
-    if folder is None:
-        return njit(nogil=True)(kernel)
-    with _LOCK:
-        before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
-        try:
-            return _checked(njit(nogil=True, cache=True)(kernel))
-        finally:
-            config.CACHE_DIR = before
-
-
 class _CheckedFiles(IndexDataCacheFile):
     """Files of cached machine code, with digests: numba executes what it finds, also damaged, as after a power loss.
 
@@ -61,7 +44,8 @@ class _CheckedFiles(IndexDataCacheFile):
     """
 
     def save(self, key: object, data: object) -> None:
-        super().save(key, (str(key), data))
+        with suppress(OSError):  # a full disk: the next process compiles it again
+            super().save(key, (str(key), data))
 
     def load(self, key: object) -> object:
         made_for, data = super().load(key) or ("", None)
@@ -93,11 +77,33 @@ def _is_intact(file: str) -> bool:
     return hashlib.sha256(content[:-size]).digest() == content[-size:]
 
 
-def _checked(kernel):
-    """Let a cached kernel keep its machine code in checked files."""
-    if place := getattr(kernel, "_cache", None):  # numba compiles nothing, with NUMBA_DISABLE_JIT
-        place._cache_file.__class__ = _CheckedFiles  # the only part that reads and writes
-    return kernel
+@contextmanager
+def checked_cache() -> Iterator[None]:
+    """Let functions that are decorated in the block, also by other packages, keep their machine code in checked files.
+
+    numba reads the folder, and the class of the files, from its globals while it decorates. They are restored, because
+    they apply to all packages. Nothing is changed without a writable folder.
+    """
+    folder = _folder()
+    if folder is None:
+        yield
+        return
+    with _LOCK:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        caching.IndexDataCacheFile = _CheckedFiles
+        try:
+            yield
+        finally:
+            config.CACHE_DIR, caching.IndexDataCacheFile = before, IndexDataCacheFile
+
+
+def cached(kernel):
+    """Compile a kernel that releases the GIL, and cache its machine code on disk.
+
+    Without a writable folder, every process compiles the kernels again.
+    """
+    with checked_cache():
+        return njit(nogil=True, cache=_folder() is not None)(kernel)
 
 
 @cache

@@ -16,6 +16,8 @@ SIDECARS, _OF_STEM = (".aux.xml", ".aux", ".msk", ".ovr"), (".aux", ".rpb", ".rp
 _WORLD_FILES = ".wld", ".tab"
 # Others, which it reads with some formats, or that have a sensor model if their content is right.
 _OF_SOME = ".hdr", ".prj", ".xml"
+# Images of Pleiades and SPOT, whose sensor model has the name of all their tiles, in lower case.
+_PLEIADES = re.compile(r"img_(.*?)(_r\d+c\d+)?")
 # Elements and keys of a file of GDAL beside a raster that has only statistics, as QGIS and ArcGIS write. Names of bands
 # are repeated.
 _STATISTICS = {
@@ -67,7 +69,9 @@ def _world_files(path: Path) -> list[str]:
 def names_beside(name: str) -> frozenset[str]:
     """Return the names, in lower case, of all files that GDAL may read with a raster of this name."""
     path = Path(name.lower())
-    return frozenset(_names(path, (*_OF_STEM, *_world_files(path), *_OF_SOME))) - {path.name}
+    product = _PLEIADES.fullmatch(path.stem)
+    of_product = [f"{kind}_{product[1]}.xml" for kind in ("dim", "rpc")] if product else []
+    return frozenset([*_names(path, (*_OF_STEM, *_world_files(path), *_OF_SOME)), *of_product]) - {path.name}
 
 
 def came_beside(files: Iterable[str]) -> dict[str, int]:

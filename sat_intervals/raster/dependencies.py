@@ -12,8 +12,9 @@ from rasterio.io import DatasetReader
 from sat_intervals.errors import ChangedInputError, InputError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.beside import came_beside, is_read, names_beside
-from sat_intervals.raster.identity import local_file, stamp_of, watched
+from sat_intervals.raster.identity import local_file, stamp_of
 from sat_intervals.raster.virtual import sources_of
+from sat_intervals.raster.watching import watched
 
 # File systems of which GDAL does not say what it reads, or whether it has changed; archives on servers.
 _UNKNOWN = re.compile(r"/vsi(sparse/|cached\?|\w+_streaming/)")

@@ -3,34 +3,34 @@
 import hashlib
 import os
 import re
-import stat
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from functools import lru_cache
 from http.client import HTTPException
+from operator import index
 from pathlib import Path
 from threading import Event
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 from urllib.request import Request, urlopen
 
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
-from sat_intervals.raster.beside import came_beside
-from sat_intervals.raster.moves import moves
 from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
 _STORES = {"/vsis3/": "s3://", "/vsigs/": "gs://", "/vsiaz/": "az://"}
 # GDAL's prefix to read inside a file: an archive, or a part given by offset and size.
 _INSIDE = re.compile(r"/vsi\w+/(\d+(_\d+)?,)?")
+# Names that are no paths: GDAL's file systems and subdatasets, and URLs.
+_NO_PATH = re.compile(r"/vsi|\w+:")
+# Stamps of archives when this process read them first.
+_ARCHIVES: dict[str, str] = {}
 # Seconds until a server must answer.
 _TIMEOUT = 30
-# Attempts to hash or read a file that changes meanwhile.
+# Attempts to hash a file that changes meanwhile.
 _TRIES = 3
-
-_Read = TypeVar("_Read")
 
 
 def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:
@@ -53,12 +53,12 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     Raises
     ------
     ChangedInputError
-        The file is being written.
+        The file is missing or being written, or is an archive that was replaced since this process read it first.
     SatIntervalsError
         The path is a pipe or a device, a server does not say which file it sends, or GDAL hides the URL in a query.
     """
     check_regular(path)
-    if file := local_file(path):
+    if file := _current_file(path):
         if file == Path(path):
             file = file.resolve()  # once: a link may lead elsewhere later
             path = str(file)
@@ -71,6 +71,8 @@ def identity(path: str, known: Mapping[str, Mapping[str, Any]] | None = None) ->
     for prefix, scheme in _STORES.items():
         if path.startswith((prefix, scheme)):
             return {"path": path} | object_tag(path.replace(prefix, scheme, 1))
+    if not _NO_PATH.match(path):  # GDAL lists links to nothing, too
+        raise ChangedInputError(f"{path} cannot be read: it is missing, or a link to nothing: restore or remove it")
     return {"path": path}
 
 
@@ -79,8 +81,10 @@ def stamp_of(path: str) -> str | None:
 
     None if a server gives none or does not answer, "missing" for a local file that does not exist.
     """
-    if file := local_file(path):
-        return _stamp(file)
+    if file := _current_file(path):
+        return local_stamp(file)
+    if not _NO_PATH.match(path):
+        return "missing"
     now = identity(path)
     if now.get("etag"):
         return f"{now['bytes']}-{now['etag']}"
@@ -98,75 +102,39 @@ def local_file(path: str) -> Path | None:
     return next((file for file in (place, *place.parents) if os.path.isfile(file)), None)
 
 
+def _current_file(path: str) -> Path | None:
+    """Return the `local_file`; raise if it is an archive that was replaced: GDAL may keep its old index."""
+    file = local_file(path)
+    if file is not None and file != Path(path):
+        stamp = local_stamp(file)
+        if _ARCHIVES.setdefault(str(file), stamp) != stamp:
+            raise ChangedInputError(
+                f"{file} was replaced since this process read it first, and GDAL may read it at old places: extract it "
+                "or start new processes"
+            )
+    return file
+
+
 def _of_file(file: Path, before: Mapping[str, Any]) -> dict[str, Any]:
-    status, stamp = file.stat(), _stamp(file)
+    status, stamp = file.stat(), local_stamp(file)
     stamp, sha256 = (stamp, before["sha256"]) if before.get("stamp") == stamp else _hashed(file)
     modified = datetime.fromtimestamp(status.st_mtime, UTC).isoformat()
     return {"bytes": status.st_size, "modified": modified, "sha256": sha256, "stamp": stamp}
 
 
-def _stamp(file: str | Path) -> str:
+def local_stamp(file: str | Path) -> str:
     """Return inode, size and times of a file: any change of the file changes them."""
     status = os.stat(file)
     return f"{status.st_ino:x}-{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ctime_ns:x}"
-
-
-class _Place(NamedTuple):
-    """State of a file, link or folder on a path: inode, times in nanoseconds, and its `moves`."""
-
-    inode: int
-    modified: int
-    changed: int
-    is_folder: bool
-    moves: tuple[int, int] | None
-
-    def is_touched(self, later: "_Place") -> bool:
-        """Return whether a file or link changed, or a folder was exchanged.
-
-        A folder that gets a new file has both times of that moment, one that is renamed only the change time.
-        """
-        is_moved = None not in (self.moves, later.moves) and self.moves != later.moves
-        has_other_time = self.changed != later.changed and not (later.is_folder and later.modified == later.changed)
-        return self.inode != later.inode or is_moved or has_other_time
-
-
-class _Moment(NamedTuple):
-    """Stamp of a file, None if it has none, and the places on its path and those of its links."""
-
-    stamp: str | None
-    places: list[_Place]
-
-    def is_touched(self, later: "_Moment") -> bool:
-        """Return whether the file, or a link or folder on its path, was changed or exchanged since."""
-        return self.stamp != later.stamp or _is_other_way(self.places, later.places)
-
-
-def _moment(path: str) -> _Moment:
-    file = local_file(path)
-    return _Moment(None, []) if file is None else _Moment(_stamp(file), [*_way_to(file.absolute())])
-
-
-def _way_to(path: Path) -> Iterator[_Place]:
-    for place in (path, *path.parents):
-        counted, status = moves(place), place.lstat()  # in this order: what comes between them changes the inode
-        is_folder, is_link = stat.S_ISDIR(status.st_mode), stat.S_ISLNK(status.st_mode)
-        if is_folder or is_link:
-            yield _Place(status.st_ino, status.st_mtime_ns, status.st_ctime_ns, is_folder, counted)
-        if is_link:
-            yield from _way_to(place.parent / place.readlink())
-
-
-def _is_other_way(before: Sequence[_Place], later: Sequence[_Place]) -> bool:
-    return len(before) != len(later) or any(map(_Place.is_touched, before, later))
 
 
 def _hashed(file: str | Path) -> tuple[str, str]:
     """Return stamp and SHA-256 of a file; try again if it changes meanwhile."""
     for _ in range(_TRIES - 1):
         with suppress(ChangedInputError):
-            stamp = _stamp(file)
+            stamp = local_stamp(file)
             return stamp, _sha256(file, stamp)
-    stamp = _stamp(file)
+    stamp = local_stamp(file)
     return stamp, _sha256(file, stamp)
 
 
@@ -175,7 +143,7 @@ def _sha256(file: str | Path, stamp: str) -> str:
     """Return the SHA-256 of a file; cached by stamp, as workers need it for every tile."""
     with open(file, "rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    if _stamp(file) != stamp:
+    if local_stamp(file) != stamp:
         raise ChangedInputError(f"{file} is being written: rerun the command when it is complete")
     return digest
 
@@ -187,6 +155,11 @@ def checksum_of(file: Path) -> dict[str, int]:
         while block := stream.read(1 << 20):
             size, crc32 = size + len(block), zlib.crc32(block, crc32)
     return {"bytes": size, "crc32": crc32}
+
+
+def known_checksum(known: Mapping[str, Any]) -> dict[str, int]:
+    """Return the `checksum_of` a file from a report; raises LookupError or TypeError for what is none."""
+    return {key: index(known[key]) for key in ("bytes", "crc32")}
 
 
 def checksum_of_text(text: str) -> dict[str, int]:
@@ -221,9 +194,9 @@ def _of_url(url: str) -> dict[str, Any]:
 def is_changed(path: str, known: Mapping[str, Any]) -> bool:
     """Return whether a file differs from its `identity` of before; False if a server does not answer."""
     if "sha256" in known:
-        file = local_file(path)
+        file = _current_file(path)
         try:
-            return file is None or (_stamp(file) != known.get("stamp") and _hashed(file)[1] != known["sha256"])
+            return file is None or (local_stamp(file) != known.get("stamp") and _hashed(file)[1] != known["sha256"])
         except FileNotFoundError:
             return True
     now = identity(path)
@@ -246,34 +219,6 @@ def check_unchanged(files: Mapping[str, Mapping[str, Any]]) -> None:
                 f"{name} was replaced or changed during the run: restore it and rerun the same command: it resumes; or "
                 "start again with --overwrite"
             )
-
-
-def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _Read]) -> _Read:
-    """Read from the inputs of a run and return the result.
-
-    It reads again if an input was touched meanwhile, or a file came beside it: another one may have been read.
-
-    Raises
-    ------
-    ChangedInputError
-        See `check_unchanged`.
-    RunError
-        An input is touched all the time.
-    """
-    for _ in range(_TRIES):
-        came, before = came_beside(files), {name: _moment(name) for name in files}
-        try:
-            content = read()
-        finally:  # a changed input explains a read error
-            check_unchanged(files)
-        now = {name: _moment(name) for name in files}
-        touched = [name for name in files if before[name].is_touched(now[name])]
-        touched += [name for name, count in came_beside(files).items() if came.get(name) != count]
-        if not touched:
-            return content
-    raise RunError(
-        f"{touched[0]} keeps changing while it is read: stop the program that writes it and rerun the same command"
-    )
 
 
 @contextmanager
@@ -307,35 +252,6 @@ def _differing(files: Mapping[str, Mapping[str, Any]], is_over: Event) -> str | 
             _sha256.cache_clear()
             return name
     return None
-
-
-def watched(files: Iterable[str | Path | None], *, is_local: bool = False) -> Callable[[], None]:
-    """Return a function that raises if a file was made, replaced or changed since; None is ignored.
-
-    Call it between reading several times from files and publishing what was made of them. Of rasters, see
-    `watched_rasters`. A server that does not answer does not change a file; with ``is_local``, none is asked.
-    """
-    names = {str(file) for file in files if file is not None}
-    before = {file: (_moment(file), None if is_local else stamp_of(file)) for file in names}
-
-    def check() -> None:
-        for file, (moment, stamp) in before.items():
-            now = None if is_local else stamp_of(file)
-            if moment.is_touched(_moment(file)) or (None not in (stamp, now) and stamp != now):
-                raise ChangedInputError(f"{file} was replaced or changed while it was read: rerun the command")
-
-    return check
-
-
-def watched_folder(folder: Path) -> Callable[[], None]:
-    """Return a function that raises if a folder was another one for a moment since, while files were written there."""
-    before = [*_way_to(folder.absolute())]
-
-    def check() -> None:
-        if _is_other_way(before, [*_way_to(folder.absolute())]):
-            raise ChangedInputError(f"{folder} was another folder while files were written: rerun the command")
-
-    return check
 
 
 def check_not_replaced(

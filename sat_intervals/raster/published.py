@@ -1,12 +1,11 @@
 """Compare ``points.tif`` with the size and checksum that were published with it."""
 
 import json
-from operator import index
 from pathlib import Path
 
 from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
-from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.identity import checksum_of, known_checksum
 from sat_intervals.raster.layers import read_alone
 from sat_intervals.raster.publishing import POINTS_REPORT
 
@@ -38,8 +37,7 @@ def published_points(out: Path) -> dict[str, int] | None:
             report = json.loads(stream.read().decode())
         if report.keys() != {"files"}:  # it was edited
             raise LookupError(file)
-        known = report["files"][POINTS_FILE]
-        return {key: index(known[key]) for key in ("bytes", "crc32")}
+        return known_checksum(report["files"][POINTS_FILE])
     except FileNotFoundError:
         return None
     except SatIntervalsError:

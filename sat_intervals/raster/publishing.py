@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster.watching import watched
 from sat_intervals.store.manifest import unsealed
 from sat_intervals.store.open_folder import flush_names
 
@@ -225,9 +225,13 @@ def _give_back(aside: Path, place: Path) -> None:
     try:
         _rename_free(aside, place)
     except FileExistsError:
-        kept = aside.with_name(f"{place.name}.{uuid.uuid4().hex}")
-        os.rename(aside, kept)
-        _LOG.warning("a file of another program was %s for a moment: it is kept as %s", place.resolve(), kept.resolve())
+        _keep(aside, aside.with_name(f"{place.name}.{uuid.uuid4().hex}"), place)
+
+
+def _keep(aside: Path, kept: Path, place: Path) -> None:
+    """Give what had the place of an output for a moment a name of its own."""
+    os.rename(aside, kept)
+    _LOG.warning("a file of another program was %s for a moment: it is kept as %s", place.resolve(), kept.resolve())
 
 
 def _is_file(own: os.stat_result, file: Path) -> bool:
@@ -298,6 +302,8 @@ def replace_same(new: Path, place: Path, stamp: str) -> None:
         there = stamps(new.parent, [new.name]).get(new.name)
         if there not in (stamp, own, None):
             _exchange(new, place)
+            if stamps(new.parent, [new.name]).get(new.name) not in (own, None):  # again another one
+                _keep(new, place.with_name(f"{place.name}.{uuid.uuid4().hex}"), place)
     if there not in (stamp, None):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
 

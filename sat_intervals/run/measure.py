@@ -30,7 +30,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, Layer, open_image, watched_images
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster.watching import watched
 from sat_intervals.run.inputs import appeared_file
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images

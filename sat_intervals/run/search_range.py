@@ -25,7 +25,7 @@ from sat_intervals.match.search_range import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, read_window, watched_images
-from sat_intervals.raster.identity import read_unchanged
+from sat_intervals.raster.watching import read_unchanged
 from sat_intervals.run.quality import COLLAR, is_plain
 from sat_intervals.run.workers import Connection, Task, Workers, reason
 from sat_intervals.tiling import Grid, Window

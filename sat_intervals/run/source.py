@@ -12,7 +12,7 @@ from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, patch_areas
 from sat_intervals.progress import timed
 from sat_intervals.raster import read_views
-from sat_intervals.raster.identity import read_unchanged
+from sat_intervals.raster.watching import read_unchanged
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.run.job import Job
 from sat_intervals.run.workers import is_remote

@@ -25,7 +25,7 @@ from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
-from sat_intervals.raster.identity import read_unchanged
+from sat_intervals.raster.watching import read_unchanged
 from sat_intervals.run.job import Job
 from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines

@@ -138,6 +138,34 @@ def test_cached__machine_code_of_another_signature_is_not_executed(tmp_path):
 
 
 @pytest.mark.process
+def test_checked_cache__damaged_kernels_of_the_sensor_models_are_compiled_again(tmp_path):
+    pytest.importorskip("shareloc")
+
+    def used():
+        script = "import sat_intervals.heights.sensors\nfrom shareloc.geomodels import rpc\n"
+        script += "stats = rpc.polynomial_equation.stats\nprint(sum(stats.cache_hits.values()), stats.cache_path)"
+        return use_a_kernel(script, NUMBA_CACHE_DIR=str(tmp_path))
+
+    (_, place), files = used(), sorted(tmp_path.rglob("rpc.*.nb?"))
+    assert Path(place).parent == tmp_path / "sat-intervals" / FINGERPRINT
+    assert len(files) > 4
+    for file in files:
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+    assert used() == ["0", place]
+    assert used() == ["1", place]
+
+
+@pytest.mark.process
+def test_cached__goes_on_without_room_for_machine_code(tmp_path):
+    script = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\nprint(*use())"
+    used = use_a_kernel(script, NUMBA_CACHE_DIR=str(tmp_path))
+    assert used[:2] == ["0", "1"]
+    assert not [*tmp_path.rglob("*.tmp*")]
+
+
+@pytest.mark.process
 def test_cached__functions_of_others_stay_out_of_its_folder(tmp_path):
     (tmp_path / "stranger.py").write_text(
         "from numba import njit\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"

@@ -70,3 +70,14 @@ def test_watched_rasters__allows_what_other_programs_write_again_and_again(image
     write("left.tif.aux.xml", f"<PAMDataset>{STATISTICS.format(0)}{POSITION}</PAMDataset>")
     with pytest.raises(ChangedInputError, match=r"a file beside .*left\.tif appeared while it was read"):
         check()
+
+
+@pytest.mark.parametrize("name", ["DIM_A_B.XML", "RPC_A_B.XML", "img_a_b_r1c2.rpb"])
+def test_watched_rasters__raises_if_a_sensor_model_of_a_product_comes_and_goes(image, name):
+    tile = image.rename(image.with_name("IMG_A_B_R1C2.TIF"))
+    check = watched_rasters([tile])
+    come_and_go(image.parent, "DIM_A_C.XML", "IMG_A_B_R1C1.RPB")
+    check()
+    come_and_go(image.parent, name)
+    with pytest.raises(ChangedInputError, match=f"{name} came, and went"):
+        check()

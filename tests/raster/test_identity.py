@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import tarfile
 import time
 import zipfile
 from http.server import ThreadingHTTPServer
@@ -21,7 +22,9 @@ from helpers import COMMAND, OUTPUTS, hashes
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
-from sat_intervals.raster.identity import identity, is_changed, read_unchanged
+from sat_intervals.raster import identity as identities
+from sat_intervals.raster.identity import check_unchanged, identity, is_changed
+from sat_intervals.raster.watching import read_unchanged
 from sat_intervals.tiling import Window
 
 SIDE = 1024
@@ -173,6 +176,29 @@ def test_identity__of_a_url_in_a_query_is_refused():
 @pytest.mark.parametrize("path", ["http://127.0.0.1:1/image.tif", "/vsimem/image.tif", "nowhere://image.tif"])
 def test_identity__of_what_nobody_tells_more_of_is_its_name(path):
     assert identity(path) == {"path": path}
+
+
+def test_identity__of_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(ChangedInputError, match=r"left\.tif cannot be read: it is missing, or a link to nothing"):
+        identity(str(tmp_path / "left.tif"))
+
+
+def test_check_unchanged__refuses_an_archive_of_which_gdal_may_have_an_old_index(tmp_path, monkeypatch):
+    """Of an older one of the same size, GDAL reads files at their old places."""
+    archive = tmp_path / "images.tar"
+    for name in ("one", "other"):
+        (tmp_path / name).write_text(name)
+        with tarfile.open(tmp_path / f"{name}.tar", "w") as file:
+            file.add(tmp_path / name, "left.tif")
+    path = f"/vsitar/{archive}/left.tif"
+    (tmp_path / "one.tar").rename(archive)
+    check_unchanged({path: identity(path)})
+    (tmp_path / "other.tar").rename(archive)
+    known = {path: {"sha256": hashlib.sha256(archive.read_bytes()).hexdigest()}}
+    with pytest.raises(ChangedInputError, match=r"images\.tar was replaced since this process read it first"):
+        check_unchanged(known)
+    monkeypatch.setattr(identities, "_ARCHIVES", {})  # as in a new process
+    check_unchanged(known)
 
 
 OPEN_AND_DESCRIBE = """import sys

@@ -9,7 +9,7 @@ from helpers import exchanged
 
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.raster import moves
-from sat_intervals.raster.identity import watched
+from sat_intervals.raster.watching import watched
 
 
 @pytest.fixture

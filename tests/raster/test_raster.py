@@ -1038,6 +1038,26 @@ def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monk
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
 
 
+def test_whole_file__keeps_two_files_that_appear_one_after_the_other(tmp_path, monkeypatch, caplog):
+    path = tmp_path / "new.yaml"
+    path.write_text("before")
+    for name in ("one", "two"):
+        (tmp_path / name).write_text(name)
+    exchange, others = publishing._exchange, iter([tmp_path / "one", tmp_path / "two"])
+
+    def late(new, place):
+        exchange(next(others), place)
+        exchange(new, place)
+
+    monkeypatch.setattr(publishing, "_exchange", late)
+    with pytest.raises(OutputError, match=r"new\.yaml was written by another process"), whole_file(path) as new:
+        new.write_text("new")
+    assert {"one", "two"} <= {file.read_text() for file in tmp_path.iterdir()}
+    assert path.read_text() == "one"
+    (kept,) = tmp_path.glob("new.yaml.*")
+    assert f"{path} for a moment: it is kept as {kept}" in caplog.text
+
+
 def test_whole_file__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
     path, foreign = tmp_path / "a[1].txt", tmp_path / ".a[1].txt-mine"
     foreign.write_text("mine")

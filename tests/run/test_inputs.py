@@ -28,8 +28,10 @@ from sat_intervals.raster import (
     read_layers,
     read_window,
     watched_rasters,
+    watching,
     write_layer,
 )
+from sat_intervals.raster import identity as identities
 from sat_intervals.raster.identity import identity
 from sat_intervals.results import open_results
 from sat_intervals.run import search_range, source
@@ -181,12 +183,31 @@ def test_match_pair__knows_an_image_in_an_archive(small_pair, kind):
     (folder / "out" / "run.json").unlink()
     (folder / "out" / "tiles" / "records" / "1_1.json").unlink()
     pack("other.tif")
+    with pytest.raises(
+        ChangedInputError, match=r"a\.zip was replaced since this process read it first.*: extract it or"
+    ):
+        match_pair(left, folder / "right.tif", folder / "out", settings)
+    identities._ARCHIVES.clear()  # as in a new process
     with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: inputs\.left\.bytes was "):
         match_pair(left, folder / "right.tif", folder / "out", settings)
     (folder / "in" / "tiles").mkdir(parents=True)
     inside = shutil.copy(folder / "a.zip", folder / "in" / "tiles")
     with pytest.raises(SatIntervalsError, match="is an input inside"):
         match_pair(f"/vsizip/{inside}/left.tif", folder / "right.tif", folder / "in", settings)
+
+
+@pytest.mark.parametrize("name", ["left.tif.aux.xml", "left_RPC.TXT"])
+def test_match_pair__refuses_a_link_to_nothing_beside_the_source_of_a_virtual_raster(small_pair, name):
+    """Its target could come while tiles are matched."""
+    folder, settings = small_pair
+    copy(folder / "left.tif", folder / "virtual.vrt", driver="VRT")
+    (folder / name).symlink_to(folder / "later")
+    with pytest.raises(
+        ChangedInputError, match=rf"{name} cannot be read: it is missing, or a link to nothing: restore"
+    ):
+        match_pair(folder / "virtual.vrt", folder / "right.tif", folder / "out", settings)
+    (folder / name).unlink()
+    match_pair(folder / "virtual.vrt", folder / "right.tif", folder / "out", settings)
 
 
 def test_other_files__are_those_of_the_sources_of_a_virtual_raster_too(small_pair):
@@ -449,7 +470,8 @@ def test_match_pair__ends_where_a_memory_map_changes_an_input(small_pair, monkey
         match_block(job, block)
         image[-1] += 1
 
-    monkeypatch.setattr("sat_intervals.raster.identity._stamp", lambda file: "as before")  # until the page is written
+    for module in (identities, watching):  # until the page is written
+        monkeypatch.setattr(module, "local_stamp", lambda file: "as before")
     monkeypatch.setattr("sat_intervals.run.pair.match_block", change)
     with pytest.raises(RunError, match="was changed during the run without a change of its modification time"):
         match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
