@@ -236,7 +236,8 @@ def test_plan__of_an_image_that_cannot_be_read_speaks_of_no_run(tmp_path, how):
         )
     result = invoke("plan", str(bad), str(image), "--disparity", "-2", "2")
     (line,) = result.stderr.splitlines()
-    assert f"a sample of the pair cannot be matched: {bad} cannot be read at rows 0 to 63" in line
+    reason = f"{bad} cannot be read at rows 0 to 63" if how == "cut" else "nowhere.tif cannot be read: it is missing"
+    assert f"a sample of the pair cannot be matched: {reason}" in line
     assert "--overwrite" not in line
     assert result.exit_code == 1
 
