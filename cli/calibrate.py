@@ -1,6 +1,6 @@
 """``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -112,17 +112,17 @@ def calibrate(
     from sat_intervals.run.calibrate import calibration_from, check_subjects
     from sat_intervals.run.measure import measure_subjects
 
-    check_arguments = watched_arguments(pairs, settings.file)
-    subjects = _subjects(pairs, truth, _Judging(settings, **judging))
+    checks = [watched_arguments(pairs, settings.file)]
+    subjects = _subjects(pairs, truth, _Judging(settings, checks, **judging))
     check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file, *named_by(settings.file)], [output])
     folder = checked_folder(output, _SETTINGS if tune else _CALIBRATION)
     check_subjects(subjects)
     with Console(quiet or as_json) as console:
         if tune:
-            _tune(subjects, output, folder, name, check_arguments, console, as_json)
+            _tune(subjects, output, folder, name, partial(_check, checks), console, as_json)
             return
         parts, key = measure_subjects(subjects, folder, console.progress)
-    check_arguments()
+    _check(checks)
     calibration, expected = calibration_from(parts, subjects, name or output.stem, key)
     write_calibration(output, calibration)
     if as_json:
@@ -132,11 +132,17 @@ def calibrate(
         click.echo(str(output))
 
 
+def _check(checks: Iterable[Callable[[], None]]) -> None:
+    for check in checks:
+        check()
+
+
 @dataclass(frozen=True)
 class _Judging:
-    """Options that decide how pairs are matched and compared with their truth."""
+    """Options that decide how pairs are matched and compared with their truth; ``checks`` of files that are read."""
 
     settings: SettingsArguments
+    checks: list[Callable[[], None]]
     tolerance: float
     remove_bias: bool
     by_group: bool
@@ -197,6 +203,7 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
     from sat_intervals.config import Cluster, load_config
     from sat_intervals.config.pairs import group_beside
     from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.raster.watching import watched
     from sat_intervals.results import open_results
     from sat_intervals.run.measure import Subject
 
@@ -209,7 +216,10 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
     else:
         here = run.config.model_copy(update={"cluster": Cluster()})  # the run's may be jobs of a batch system
         config = load_config(here, settings.sections)
-    group = group_beside(run.left.path) if judging.by_group else str(out)
+    group = str(out)
+    if judging.by_group:
+        judging.checks.append(watched([Path(run.left.path).with_name("meta.json")]))
+        group = group_beside(run.left.path)
     return Subject(
         str(out), group, run.left, run.right, run.truth, config, run.region, judging.tolerance, judging.remove_bias
     )

@@ -74,15 +74,15 @@ def names_beside(name: str) -> frozenset[str]:
     return frozenset([*_names(path, (*_OF_STEM, *_world_files(path), *_OF_SOME)), *of_product]) - {path.name}
 
 
-def came_beside(files: Iterable[str]) -> dict[str, int]:
+def came_beside(files: Iterable[str], *, with_overviews: bool = False) -> dict[str, int]:
     """Return how often files came that GDAL may read with rasters, by path, see `arrivals`.
 
-    Overviews do not count, nor an ``.aux.xml`` that has statistics only: programs that show a raster write it anew.
+    An ``.aux.xml`` that has statistics only does not count: programs that show a raster write it anew.
     """
     counts = {}
     for file in filter(os.path.isfile, files):
         folder, name = os.path.split(os.path.abspath(file))
-        names = {other for other in names_beside(name) if not other.endswith(".ovr")}
+        names = {other for other in names_beside(name) if with_overviews or not other.endswith(".ovr")}
         for other, count in arrivals(Path(os.path.realpath(folder)), names).items():
             if is_read(place := os.path.join(folder, other)):
                 counts[place] = count

@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -113,10 +114,11 @@ def watched_rasters(
     Nor may one come and go, where the system counts `arrivals`.
     """
     names = {str(file) for file in files if file is not None}
-    came = came_beside(names)
+    came = came_beside(names, with_overviews=True)
     before = {name: files_of(name) for name in names}
     sources = {file for name in names for file in before[name]}
-    came = came_beside(sources) | came
+    came_to = partial(came_beside, sources, with_overviews=any(survey(name).uses_overviews for name in names))
+    came = came_to() | came
     check_files = watched(sources)
 
     def check() -> None:
@@ -124,7 +126,7 @@ def watched_rasters(
         for name in names:
             if files_of(name) != before[name]:
                 raise ChangedInputError(f"a file beside {name} appeared while it was read: rerun the command")
-        for file, count in came_beside(sources).items():
+        for file, count in came_to().items():
             if count > came.get(file, 0) + os.path.lexists(file):  # what is still there was compared
                 raise ChangedInputError(
                     f"{file} came, and went or was replaced, while files were read: rerun the command"

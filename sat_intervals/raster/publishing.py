@@ -210,8 +210,11 @@ def _put_aside(new: Path, place: Path, stamp: str | None) -> bool:
 
 
 def _remove(place: Path, folder: Path, may_go: Callable[[Path], bool]) -> bool:
-    """Delete a file if it may go, and return whether it did: it is looked at where nothing can take its place."""
-    aside = folder / f"strips-{uuid.uuid4().hex}-{place.name}"
+    """Delete a file if it may go, and return whether it did: it is looked at where nothing can take its place.
+
+    There it has a name that nobody deletes, in case of a kill.
+    """
+    aside = _name_of_its_own(folder, place)
     os.rename(place, aside)
     if not may_go(aside):
         _give_back(aside, place)
@@ -225,11 +228,17 @@ def _give_back(aside: Path, place: Path) -> None:
     try:
         _rename_free(aside, place)
     except FileExistsError:
-        _keep(aside, aside.with_name(f"{place.name}.{uuid.uuid4().hex}"), place)
+        _keep(aside, aside.parent, place)
 
 
-def _keep(aside: Path, kept: Path, place: Path) -> None:
-    """Give what had the place of an output for a moment a name of its own."""
+def _name_of_its_own(folder: Path, place: Path) -> Path:
+    """Return a new name for a file that was in the place of an output: no temporary one, which would be deleted."""
+    return folder / f"{place.name}.{uuid.uuid4().hex}"
+
+
+def _keep(aside: Path, folder: Path, place: Path) -> None:
+    """Give what had the place of an output for a moment a name of its own in a folder."""
+    kept = _name_of_its_own(folder, place)
     os.rename(aside, kept)
     _LOG.warning("a file of another program was %s for a moment: it is kept as %s", place.resolve(), kept.resolve())
 
@@ -295,15 +304,19 @@ def replace_same(new: Path, place: Path, stamp: str) -> None:
         Another file came there meanwhile, and stays.
     """
     own = stamps(new.parent, [new.name])[new.name]
+    aside = _name_of_its_own(new.parent, place)  # a kill leaves there what nobody has looked at
+    os.rename(new, aside)
     try:
         if stamps(place.parent, [place.name]).get(place.name) == stamp:
-            _exchange(new, place)
+            _exchange(aside, place)
     finally:  # of a signal, too
-        there = stamps(new.parent, [new.name]).get(new.name)
+        there = stamps(aside.parent, [aside.name]).get(aside.name)
         if there not in (stamp, own, None):
-            _exchange(new, place)
-            if stamps(new.parent, [new.name]).get(new.name) not in (own, None):  # again another one
-                _keep(new, place.with_name(f"{place.name}.{uuid.uuid4().hex}"), place)
+            _exchange(aside, place)
+            if stamps(aside.parent, [aside.name]).get(aside.name) not in (own, None):  # again another one
+                _keep(aside, place.parent, place)
+        with suppress(FileNotFoundError):
+            os.rename(aside, new)
     if there not in (stamp, None):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
 

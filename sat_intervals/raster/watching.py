@@ -78,14 +78,15 @@ def read_unchanged(files: Mapping[str, Mapping[str, Any]], read: Callable[[], _R
         An input is touched all the time.
     """
     for _ in range(_TRIES):
-        came, before = came_beside(files), {name: _moment(name) for name in files}
+        came, before = came_beside(files, with_overviews=True), {name: _moment(name) for name in files}
         try:
             content = read()
         finally:  # a changed input explains a read error
             check_unchanged(files)
         now = {name: _moment(name) for name in files}
         touched = [name for name in files if before[name].is_touched(now[name])]
-        touched += [name for name, count in came_beside(files).items() if came.get(name) != count]
+        arrived = came_beside(files, with_overviews=True)
+        touched += [name for name, count in arrived.items() if came.get(name) != count]
         if not touched:
             return content
     raise RunError(

@@ -8,6 +8,8 @@ from rasterio.shutil import copy
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.raster import watched_rasters, write_layer
 from sat_intervals.raster.beside import check_place
+from sat_intervals.raster.identity import identity
+from sat_intervals.raster.watching import read_unchanged
 
 STATISTICS = "<PAMRasterBand band='1'><Metadata><MDI key='STATISTICS_MEAN'>{}</MDI></Metadata></PAMRasterBand>"
 POSITION = "<GeoTransform>1, 1, 0, 0, 0, -1</GeoTransform>"
@@ -50,6 +52,25 @@ def test_watched_rasters__raises_if_a_file_beside_one_comes_and_goes(image, tmp_
     come_and_go(folder, name)
     with pytest.raises(ChangedInputError, match=f"{name} came, and went or was replaced, while files were read"):
         check()
+
+
+def test_watched_rasters__raises_if_overviews_come_and_go_where_they_are_read(image):
+    check, check_small = watched_rasters([image]), watched_rasters([f"vrt://{image}?outsize=4,4"])
+    come_and_go(image.parent, "left.tif.ovr")
+    check()
+    with pytest.raises(ChangedInputError, match=r"left\.tif\.ovr came, and went"):
+        check_small()
+
+
+def test_read_unchanged__reads_again_if_overviews_came_and_went(image):
+    coming = iter([True, False])
+
+    def read():
+        if is_coming := next(coming):
+            come_and_go(image.parent, "left.tif.ovr")
+        return is_coming
+
+    assert not read_unchanged({str(image): identity(str(image))}, read)
 
 
 @pytest.mark.parametrize("way", ["made", "renamed"])

@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
-from helpers import OUTPUTS, exchanged
+from helpers import OUTPUTS, contents, exchanged
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rasterio.control import GroundControlPoint
@@ -1036,6 +1036,30 @@ def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monk
         with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile: move it away"):
             write()
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
+
+
+def test_whole_file__deletes_nothing_that_a_process_had_exchanged_when_it_was_killed(tmp_path, monkeypatch):
+    path, killed = tmp_path / "out" / "new.yaml", tmp_path / "killed"
+    path.parent.mkdir()
+    path.write_text("before")
+    (tmp_path / "mine").write_text("mine")
+    exchange = publishing._exchange
+
+    def late(new, place):
+        if not killed.exists():
+            os.replace(tmp_path / "mine", place)
+            exchange(new, place)
+            shutil.copytree(path.parent, killed)
+        else:
+            exchange(new, place)
+
+    monkeypatch.setattr(publishing, "_exchange", late)
+    with pytest.raises(OutputError), whole_file(path) as new:
+        new.write_text("new")
+    monkeypatch.undo()
+    with whole_file(killed / "new.yaml") as new:
+        new.write_text("new")
+    assert b"mine" in contents(killed).values()
 
 
 def test_whole_file__keeps_two_files_that_appear_one_after_the_other(tmp_path, monkeypatch, caplog):

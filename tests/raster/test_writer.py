@@ -544,10 +544,15 @@ def test_output_writer__removes_no_file_that_takes_the_place_of_one_that_it_remo
         shutil.copy(out / "intervals.tif", hidden_files / "replaced" / "intervals.tif")
     remove, rename_new = publishing._remove, publishing.rename_new
 
-    def late(place, *arguments):
+    def late(place, folder, may_go):
         place.rename(tmp_path / "moved")
         mine.rename(place)
-        return remove(place, *arguments)
+
+        def and_copied(file):
+            shutil.copytree(out, tmp_path / "killed")
+            return may_go(file)
+
+        return remove(place, folder, and_copied)
 
     def failing(source, target):
         if moment == "takes back" and source.name == "validity.tif" and source.parent.name != "replaced":
@@ -559,6 +564,10 @@ def test_output_writer__removes_no_file_that_takes_the_place_of_one_that_it_remo
     with pytest.raises(OutputError), writer(out) as output:
         written(output, np.full((4, 4, 5), 3, np.float32), np.zeros((4, 5), np.uint16))
     assert (out / "intervals.tif").read_text() == "mine"
+    monkeypatch.undo()
+    with writer(tmp_path / "killed") as output:
+        written(output, np.full((4, 4, 5), 3, np.float32), np.zeros((4, 5), np.uint16))
+    assert b"mine" in named(tmp_path / "killed").values()
 
 
 def test_remove_scratch__keeps_what_a_process_put_aside_that_was_killed_before_its_end(tmp_path):

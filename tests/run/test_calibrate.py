@@ -14,12 +14,12 @@ from helpers import PLACE, invoke, write_pair
 from rasterio.shutil import copy
 
 from sat_intervals import SatIntervalsError, match_pair, open_image
-from sat_intervals.cli.calibrate import _Judging, _subjects
+from sat_intervals.cli.calibrate import _check, _Judging, _subjects
 from sat_intervals.cli.matching import SettingsArguments
-from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
+from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config, pairs
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError
+from sat_intervals.errors import ChangedInputError, RunError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.match import measurement
 from sat_intervals.raster import OutputError, write_layer
@@ -164,7 +164,7 @@ def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
 
 
 def test_measure_subjects__deletes_the_tiles_of_a_killed_calibration(scene, tmp_path):
-    subjects = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    subjects = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), [], 0.0, False, False))
     left = tmp_path / ".calibrate-left"
 
     def keep(stage, done, total):
@@ -181,7 +181,7 @@ def test_measure_subjects__deletes_the_tiles_of_a_killed_calibration(scene, tmp_
 def test_measure_subjects__ends_where_a_truth_is_replaced_meanwhile(scene, tmp_path):
     for name in ("left.tif", "right.tif", "truth.tif", "meta.json"):
         (tmp_path / name).write_bytes((scene / name).read_bytes())
-    subjects = _subjects((tmp_path,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    subjects = _subjects((tmp_path,), (), _Judging(SettingsArguments(None, {}), [], 0.0, False, False))
 
     def replace(stage, done, total):
         if stage == "tiles":
@@ -196,7 +196,7 @@ def test_measure_subjects__ends_where_a_mask_appears_beside_the_source_of_an_ima
         (tmp_path / name).write_bytes((scene / name).read_bytes())
     copy(tmp_path / "left.tif", tmp_path / "left.vrt", driver="VRT")
     (tmp_path / "pairs.csv").write_text("left,right,truth,minimum,maximum\nleft.vrt,right.tif,truth.tif,-10,10\n")
-    subjects = _subjects((tmp_path / "pairs.csv",), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    subjects = _subjects((tmp_path / "pairs.csv",), (), _Judging(SettingsArguments(None, {}), [], 0.0, False, False))
 
     def appear(stage, done, total):
         if stage == "tiles":
@@ -277,7 +277,7 @@ def test_calibrate__a_run_is_matched_again_on_this_machine(scene, tmp_path):
     settings = settings_with(scene) | {"cluster": {"workers": 2, "store": str(tmp_path / "store")}}
     match_pair(scene / "left.tif", scene / "right.tif", tmp_path / "out", settings)
     for given in ({}, {"cluster": {"workers": 1}}):
-        (subject,) = _subjects((tmp_path / "out",), (), _Judging(SettingsArguments(None, given), 0.0, False, False))
+        (subject,) = _subjects((tmp_path / "out",), (), _Judging(SettingsArguments(None, given), [], 0.0, False, False))
         assert subject.config.cluster == Cluster(**given.get("cluster", {}))
 
 
@@ -287,6 +287,25 @@ def test_check_subjects__needs_another_group_to_judge_with(scene, tmp_path):
         copytree(scene, folder)
     line = one_line(invoke("calibrate", *folders, "--by-group", "--output", tmp_path / "new.yaml"))
     assert "all 2 pairs are of group" in line
+
+
+def test_calibrate__ends_where_the_group_of_runs_changes_between_them(scene, tmp_path, monkeypatch):
+    pair = copytree(scene, tmp_path / "pair")
+    runs, meta = [tmp_path / "one", tmp_path / "other"], json.loads((pair / "meta.json").read_text())
+    for run in runs:
+        match_pair(pair / "left.tif", pair / "right.tif", run, settings_with(pair))
+    read, groups = pairs.group_beside, iter(["a", "b"])
+
+    def of_another(image):
+        (pair / "meta.json").write_text(json.dumps(meta | {"group": next(groups)}))
+        return read(image)
+
+    monkeypatch.setattr(pairs, "group_beside", of_another)
+    checks = []
+    subjects = _subjects(tuple(runs), (), _Judging(SettingsArguments(None, {}), checks, 0.0, False, True))
+    assert [subject.group for subject in subjects] == ["a", "b"]
+    with pytest.raises(ChangedInputError, match=r"meta\.json was replaced or changed while it was read"):
+        _check(checks)
 
 
 @pytest.mark.parametrize("tolerance", [0, 0.5])
@@ -304,7 +323,7 @@ def test_check_subjects__refuses_a_scene_that_counts_twice(scene, tmp_path):
         match_pair(scene / "left.tif", scene / "right.tif", out, settings_with(scene, coverage=0.9))
     line = one_line(invoke("calibrate", tmp_path / "one", tmp_path / "other", "--output", tmp_path / "new.yaml"))
     assert f"{tmp_path}/one and {tmp_path}/other are the same scene: give each scene once" in line
-    (one,) = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+    (one,) = _subjects((scene,), (), _Judging(SettingsArguments(None, {}), [], 0.0, False, False))
     third = open_image(copytree(scene, tmp_path / "third") / "right.tif")
     check_subjects([one, dataclasses.replace(one, name="a triplet", group="another", right=third)])
 
