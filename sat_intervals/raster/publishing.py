@@ -233,7 +233,7 @@ def _give_back(aside: Path, place: Path) -> None:
 
 def _name_of_its_own(folder: Path, place: Path) -> Path:
     """Return a new name for a file that was in the place of an output: no temporary one, which would be deleted."""
-    return folder / f"{place.name}.{uuid.uuid4().hex}"
+    return folder / f"kept-{uuid.uuid4().hex}-{place.name}"  # names of outputs may have 32 hexadecimal digits, too
 
 
 def _keep(aside: Path, folder: Path, place: Path) -> None:

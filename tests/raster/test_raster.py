@@ -1038,8 +1038,9 @@ def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monk
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
 
 
-def test_whole_file__deletes_nothing_that_a_process_had_exchanged_when_it_was_killed(tmp_path, monkeypatch):
-    path, killed = tmp_path / "out" / "new.yaml", tmp_path / "killed"
+@pytest.mark.parametrize("name", ["new.yaml", f"{'0f' * 16}.yaml"])
+def test_whole_file__deletes_nothing_that_a_process_had_exchanged_when_it_was_killed(tmp_path, monkeypatch, name):
+    path, killed = tmp_path / "out" / name, tmp_path / "killed"
     path.parent.mkdir()
     path.write_text("before")
     (tmp_path / "mine").write_text("mine")
@@ -1057,7 +1058,7 @@ def test_whole_file__deletes_nothing_that_a_process_had_exchanged_when_it_was_ki
     with pytest.raises(OutputError), whole_file(path) as new:
         new.write_text("new")
     monkeypatch.undo()
-    with whole_file(killed / "new.yaml") as new:
+    with whole_file(killed / name) as new:
         new.write_text("new")
     assert b"mine" in contents(killed).values()
 
@@ -1078,7 +1079,7 @@ def test_whole_file__keeps_two_files_that_appear_one_after_the_other(tmp_path, m
         new.write_text("new")
     assert {"one", "two"} <= {file.read_text() for file in tmp_path.iterdir()}
     assert path.read_text() == "one"
-    (kept,) = tmp_path.glob("new.yaml.*")
+    (kept,) = tmp_path.glob("kept-*-new.yaml")
     assert f"{path} for a moment: it is kept as {kept}" in caplog.text
 
 

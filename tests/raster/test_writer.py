@@ -508,12 +508,12 @@ def test_output_writer__keeps_a_file_that_is_in_the_place_of_a_result_for_a_mome
     with pytest.raises(OutputError, match=r"intervals\.tif is not of this run"), writer(out) as output:
         written(output, *zeros)
     assert before.items() <= named(out).items()
-    (kept,) = (file for file in out.rglob("intervals.tif.*") if file.read_text() == "mine")
+    (kept,) = (file for file in out.rglob("kept-*-intervals.tif") if file.read_text() == "mine")
     assert f"{out}/intervals.tif for a moment: it is kept as {kept}" in caplog.text
     monkeypatch.undo()
     with writer(out) as output:
         written(output, *zeros)
-    assert "mine" in [file.read_text() for file in out.rglob("*.*") if file.is_file() and file.suffix != ".tif"]
+    assert kept.read_text() == "mine"
 
 
 def test_output_writer__gives_a_folder_back_that_takes_the_place_of_a_result(tmp_path, monkeypatch):
