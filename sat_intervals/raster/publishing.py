@@ -105,6 +105,10 @@ def stamps(folder: Path, names: Iterable[str]) -> dict[str, str]:
     return found
 
 
+def _stamp(file: Path) -> str | None:
+    return stamps(file.parent, [file.name]).get(file.name)
+
+
 @contextmanager
 def examined(folder: Path, names: Iterable[str]) -> Iterator[dict[str, str]]:
     """Yield the `stamps` of files that the block examines, to replace them later.
@@ -197,7 +201,7 @@ def _put_aside(new: Path, place: Path, stamp: str | None) -> bool:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
 
     def may_go(file: Path) -> bool:
-        return stamps(file.parent, [file.name]).get(file.name) == stamp or _is_same(file, new)
+        return _stamp(file) == stamp or _is_same(file, new)
 
     aside = new.parent / REPLACED / new.name
     if os.path.lexists(aside):  # a killed process has put aside the one to restore
@@ -303,17 +307,17 @@ def replace_same(new: Path, place: Path, stamp: str) -> None:
     FileExistsError
         Another file came there meanwhile, and stays.
     """
-    own = stamps(new.parent, [new.name])[new.name]
+    own = _stamp(new)
     aside = _name_of_its_own(new.parent, place)  # a kill leaves there what nobody has looked at
     os.rename(new, aside)
     try:
-        if stamps(place.parent, [place.name]).get(place.name) == stamp:
+        if _stamp(place) == stamp:
             _exchange(aside, place)
     finally:  # of a signal, too
-        there = stamps(aside.parent, [aside.name]).get(aside.name)
+        there = _stamp(aside)
         if there not in (stamp, own, None):
             _exchange(aside, place)
-            if stamps(aside.parent, [aside.name]).get(aside.name) not in (own, None):  # again another one
+            if _stamp(aside) not in (own, None):  # again another one
                 _keep(aside, place.parent, place)
         with suppress(FileNotFoundError):
             os.rename(aside, new)
