@@ -156,6 +156,12 @@ POINTS = (
 # The band of true disparities made from reference heights.
 TRUTH = (Band("disparity", "px", "of the reference height that the left sensor sees at the pixel's centre"),)
 
+# Bands of the local search ranges of a pair.
+RANGES = (
+    Band("minimum", "px", "first disparity that is searched for the pixel"),
+    Band("maximum", "px", "last disparity that is searched for the pixel"),
+)
+
 # Bands of a surface model.
 SURFACE = (
     Band("height", "m", "mean of the points that reach the cell, the nearer the heavier"),

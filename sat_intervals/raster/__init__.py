@@ -5,7 +5,7 @@ from sat_intervals.raster.beside import check_place
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.dependencies import other_files, pixel_files, read_files, survey, watched_rasters
-from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, run_files, surface_file, truth_file
+from sat_intervals.raster.files import POINT_FILES, RUN_FILES, File, ranges_file, run_files, surface_file, truth_file
 from sat_intervals.raster.footprint import footprint
 from sat_intervals.raster.frame import Frame, Vertical
 from sat_intervals.raster.georeferencing import ControlPoint, Georeferencing
@@ -28,7 +28,6 @@ from sat_intervals.raster.layers import (
     whole_file,
     write_layer,
     write_once,
-    write_rows,
 )
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
@@ -89,6 +88,7 @@ __all__ = [
     "part_bytes",
     "pixel_files",
     "put_back",
+    "ranges_file",
     "read_alone",
     "read_files",
     "read_heights",
@@ -116,5 +116,4 @@ __all__ = [
     "whole_file",
     "write_layer",
     "write_once",
-    "write_rows",
 ]

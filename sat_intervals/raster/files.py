@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from rasterio.io import DatasetWriter
 
-from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, SURFACE, TRUTH, Band
+from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SURFACE, TRUTH, Band
 
 
 @dataclass(frozen=True)
@@ -66,3 +66,8 @@ def surface_file(name: str) -> File:
 def truth_file(name: str) -> File:
     """Return the properties of a file of true disparities."""
     return File(name, "float32", float("nan"), TRUTH, is_sealed=True)
+
+
+def ranges_file(name: str) -> File:
+    """Return the properties of a file of local search ranges."""
+    return File(name, "int16", None, RANGES, is_sealed=True)

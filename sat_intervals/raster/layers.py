@@ -5,11 +5,10 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from rasterio import Env
@@ -159,46 +158,26 @@ def write_layer(
     tags: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Write ``(rows, columns)`` as a tiled, compressed GeoTIFF of one band; replaces an existing file."""
-    _write(path, [pixels[np.newaxis]], pixels.dtype, (1, *pixels.shape), georeferencing, tags, nodata)
-
-
-def write_rows(
-    path: str | os.PathLike[str],
-    rows: Iterable[np.ndarray],
-    shape: tuple[int, int, int],
-    georeferencing: Georeferencing,
-    tags: Mapping[str, str],
-    before: Mapping[str, str],
-) -> None:
-    """Write int16 rows, ``(bands, some, columns)`` from the top, as a tiled, compressed GeoTIFF with `MARK` and tags.
-
-    ``shape`` has the numbers of bands, rows and columns; ``before`` is that of `whole_file`.
-    """
-    _write(path, rows, np.dtype(np.int16), shape, georeferencing, {**MARK, **tags}, before=before)
+    _write(path, pixels, nodata, georeferencing, tags)
 
 
 def _write(
     path: str | os.PathLike[str],
-    rows: Iterable[np.ndarray],
-    dtype: np.dtype[Any],
-    shape: tuple[int, int, int],
+    pixels: np.ndarray,
+    nodata: float,
     georeferencing: Georeferencing,
     tags: Mapping[str, str],
-    nodata: float | None = None,
     before: Mapping[str, str] | None = None,
 ) -> None:
-    """Write rows from the top and read them back: GDAL closes a file without an error when the disk is full."""
-    bands, height, width = shape
-    kind = {"count": bands, "height": height, "width": width, "dtype": dtype.name, "nodata": nodata}
+    """Write a layer and read it back: GDAL closes a file without an error when the disk is full."""
+    height, width = pixels.shape
+    kind = {"count": 1, "height": height, "width": width, "dtype": pixels.dtype.name, "nodata": nodata}
     kind |= {"tiled": True, "compress": "deflate", **georeferencing.creation_options()}
-    first = difference = 0
+    difference = sum_of_bits(np.ascontiguousarray(pixels))
     with whole_file(path, before) as new:
         with Env(), gdal.create(str(new), **kind) as dataset:
             dataset.update_tags(**tags)
-            for part in rows:
-                dataset.write(part, window=RasterioWindow(0, first, width, part.shape[1]))
-                first += part.shape[1]
-                difference += sum_of_bits(np.ascontiguousarray(part, dtype))
+            dataset.write(pixels, 1)
         with gdal.reading(str(new)) as dataset:
             for window in strips(height, width, _STRIP):
                 difference -= sum_of_bits(dataset.read(window=RasterioWindow(0, window.row, width, window.height)))
@@ -235,7 +214,7 @@ def write_once(
             if before is None:
                 raise SatIntervalsError(f"{path} has other content: choose another folder or --overwrite")
             check_marked(path)
-    _write(path, [pixels[np.newaxis]], pixels.dtype, (1, *pixels.shape), georeferencing, MARK, nodata, before or {})
+    _write(path, pixels, nodata, georeferencing, MARK, before or {})
 
 
 def read_layers(path: str | os.PathLike[str], window: Window | None = None, band: int | None = None) -> np.ndarray:

@@ -9,25 +9,27 @@ from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
+from sat_intervals.products import RANGES
 from sat_intervals.raster import (
+    MARK,
     Image,
+    OutputWriter,
+    check_as_made,
     check_made_by,
     check_place,
-    examined,
     open_image,
     other_files,
+    ranges_file,
     read_shape,
     read_window,
+    replaceable,
     watched_rasters,
-    write_rows,
 )
 from sat_intervals.raster.identity import check_not_replaced
 from sat_intervals.tiling import Window
 
 # Side of the cells that a raster of ranges is reduced to, in pixels.
 _CELL = 64
-# Minimum and maximum.
-_BANDS = 2
 # Tag of the rasters that `write_ranges` may replace: the image.
 _OF = "RANGES_OF"
 # Rows written at a time.
@@ -69,12 +71,14 @@ def replaceable_ranges(path: Path, left: Image, right: Image) -> dict[str, str]:
     Raises
     ------
     SatIntervalsError
-        It is a file of the images, was not made by this tool, or GDAL would read another one with it.
+        It is a file of the images, was not made by this tool, was changed since, or GDAL would read another one with
+        it.
     """
     names = [name for image in (left, right) for name in (image.path, image.mask) if name]
     check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
-    with examined(path.parent, [path.name]) as there:
+    with replaceable(path.parent, [ranges_file(path.name)]) as there:
         check_made_by(path, "range", _OF)
+        check_as_made(path)
     check_place(path, has_transform=left.georeferencing.transform is not None)
     return there
 
@@ -83,12 +87,18 @@ def write_ranges(path: Path, ranges: LocalRanges, left: Image, before: Mapping[s
     """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image.
 
     ``before`` are the `replaceable_ranges`.
+
+    Raises
+    ------
+    SatIntervalsError
+        The file cannot be written, or another one came there.
     """
-    rows = (
-        np.stack(ranges.at(Window(row, 0, min(_STRIP, left.height - row), left.width)))
-        for row in range(0, left.height, _STRIP)
-    )
-    write_rows(path, rows, (_BANDS, left.height, left.width), left.georeferencing, {_OF: left.path}, before)
+    shape, tags = (left.height, left.width), {_OF: left.path, **MARK}
+    with OutputWriter(path.parent, [ranges_file(path.name)], *shape, left.georeferencing, tags) as writer:
+        for row in range(0, left.height, _STRIP):
+            window = Window(row, 0, min(_STRIP, left.height - row), left.width)
+            writer.write(row, np.stack(ranges.at(window)))
+        writer.publish(replaceable=before)
 
 
 def read_ranges(path: str, left: Image) -> LocalRanges:
@@ -104,7 +114,7 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
     """
     check_unchanged = watched_rasters([path])
     bands, height, width = read_shape(path)
-    if (bands, height, width) != (_BANDS, left.height, left.width):
+    if (bands, height, width) != (len(RANGES), left.height, left.width):
         raise SatIntervalsError(
             f"{path} has {bands} bands of {height} x {width} pixels, {left.path} {left.height} x {left.width}: give "
             "minimum and maximum for each pixel of the left image"

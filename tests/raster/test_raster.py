@@ -52,7 +52,6 @@ from sat_intervals.raster import (
     surface_file,
     whole_file,
     write_layer,
-    write_rows,
 )
 from sat_intervals.raster.identity import local_file
 from sat_intervals.raster.windows import kept_view, restored_view
@@ -955,14 +954,6 @@ def test_write_layer__leaves_no_damaged_file_on_a_full_disk(disk, size):
     disk(600 << 10)
     write_layer(place / "noise.tif", noise, 0, Georeferencing())
     assert (read_layers(place / "noise.tif")[0] == noise).all()
-
-
-def test_write_rows__leaves_no_damaged_file_on_a_full_disk(disk):
-    place = disk(8 << 10)
-    (place / "other").write_bytes(bytes(8 << 10))
-    with pytest.raises(OutputError, match=r"ranges.tif cannot be written"):
-        write_rows(place / "ranges.tif", [np.ones((2, 9, 9), np.int16)], (2, 9, 9), Georeferencing(), {}, {})
-    assert left_behind(place) == ["other"]
 
 
 def test_whole_file__names_the_file_that_cannot_be_written(tmp_path):

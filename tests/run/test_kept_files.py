@@ -677,14 +677,17 @@ def test_page__keeps_a_file_that_appears_while_it_is_drawn(tmp_path):
     assert contents(tmp_path) == {str(path): b"mine"}
 
 
-def test_write_rows__keeps_a_file_that_appears_while_it_is_written(tmp_path):
-    def rows():
-        yield np.zeros((2, 9, 9), np.int16)
-        (tmp_path / "ranges.tif").write_text("mine")
+def test_write_once__keeps_a_file_that_appears_while_it_is_written(tmp_path, monkeypatch):
+    write = layers.sum_of_bits
 
-    with pytest.raises(SatIntervalsError, match=r"ranges\.tif exists and was not made by"):
-        layers.write_rows(tmp_path / "ranges.tif", rows(), (2, 9, 9), PLACE, {}, {})
-    assert contents(tmp_path) == {str(tmp_path / "ranges.tif"): b"mine"}
+    def appears_before(bands):
+        (tmp_path / "left.tif").write_text("mine")
+        return write(bands)
+
+    monkeypatch.setattr(layers, "sum_of_bits", appears_before)
+    with pytest.raises(SatIntervalsError, match=r"left\.tif exists and was not made by"):
+        layers.write_once(tmp_path / "left.tif", np.zeros((9, 9), np.float32), np.nan, PLACE, None)
+    assert contents(tmp_path) == {str(tmp_path / "left.tif"): b"mine"}
 
 
 def test_match_batch__that_fails_to_overwrite_keeps_the_runs(small_pair, monkeypatch):

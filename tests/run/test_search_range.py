@@ -7,8 +7,9 @@ import json
 import numpy as np
 import pytest
 import rasterio
-from helpers import PLACE, bands, invoke, write_pair
+from helpers import PLACE, bands, flip_bit, invoke, write_pair
 from matplotlib.image import imread
+from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
@@ -132,7 +133,7 @@ def test_read_ranges__ends_where_the_raster_is_replaced_meanwhile(folder, tmp_pa
 
 def test_range__keeps_a_raster_of_another_pair_that_appears_meanwhile(folder, tmp_path, monkeypatch):
     images, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "ranges.tif"
-    assert invoke("range", *images, "--output", tmp_path / "other.tif").exit_code == 0
+    assert invoke("range", *images[::-1], "--output", tmp_path / "other.tif").exit_code == 0
     there, find = (tmp_path / "other.tif").read_bytes(), search_range.find_here
 
     def appears_before(*arguments):
@@ -141,8 +142,24 @@ def test_range__keeps_a_raster_of_another_pair_that_appears_meanwhile(folder, tm
 
     monkeypatch.setattr(search_range, "find_here", appears_before)
     result = invoke("range", *images, "--output", file)
-    assert "ranges.tif was written by another process meanwhile: move it away" in result.stderr
+    assert "ranges.tif is not of this run, or was changed since it started: move it away" in result.stderr
     assert (result.exit_code, file.read_bytes()) == (2, there)
+
+
+def test_range__writes_a_raster_whose_damage_is_noticed(folder, tmp_path):
+    pair, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "ranges.tif"
+    assert invoke("range", *pair, "--output", file).exit_code == 0
+    assert cog_validate(file, strict=True) == (True, [], [])
+    with rasterio.open(file) as dataset:
+        assert dataset.descriptions == ("minimum", "maximum")
+    assert invoke("range", *pair, "--output", file).exit_code == 0  # replaces its own
+    flip_bit(file)
+    damaged = file.read_bytes()
+    written = invoke("range", *pair, "--output", file)
+    assert f"{file} was changed since sat-intervals made it" in written.stderr
+    read = invoke("match", *pair, tmp_path / "out", "--range-grid", file)
+    assert f"{file} is damaged or was changed: its CRC-32 is" in read.stderr
+    assert (written.exit_code, read.exit_code, file.read_bytes()) == (2, 2, damaged)
 
 
 def test_range__writes_no_raster_beside_a_mask_that_appears_meanwhile(folder, tmp_path, monkeypatch):
