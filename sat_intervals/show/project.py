@@ -139,7 +139,10 @@ def _add_defaults(run: Run, layers: list[Layer], written: Written) -> None:
 def _is_free(file: Path, written: Written) -> bool:
     """Return whether a file may be written; note if it is kept."""
     if is_kept := file in written.kept:
-        written.notes.append(f"{file} was not made by sat-intervals and is kept")
+        note = f"{file} was not made by sat-intervals and is kept"
+        if file.suffix == ".vrt":
+            note += ": its layer is left out; to have it, move the file away and rerun sat-intervals project"
+        written.notes.append(note)
     return not is_kept
 
 

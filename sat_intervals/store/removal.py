@@ -102,7 +102,7 @@ def check_not_foreign(folder: Folder) -> None:
         return
     if there := sorted(names & folder.sizes().keys()):  # otherwise another run has just removed its tiles
         raise StoreError(
-            f"{folder} has files that no run made, such as {', '.join(there[:3])}: move them away or choose "
+            f"{folder} has files without a sign of their run, such as {', '.join(there[:3])}: move them away or choose "
             "another folder"
         )
 

@@ -255,7 +255,7 @@ def test_match__refuses_tiles_of_which_it_cannot_tell_the_run(folder, tmp_path):
     (tmp_path / "out" / "tiles").mkdir(parents=True)
     (tmp_path / "out" / "tiles" / "manifest.json").write_text("{")
     result = invoke(*matching(folder, tmp_path / "out"))
-    assert_refused(result, "tiles has files that no run made, such as manifest.json: move them away")
+    assert_refused(result, "tiles has files without a sign of their run, such as manifest.json: move them away")
 
 
 def test_match__refuses_tiles_that_the_machine_cannot_hold(folder, tmp_path):

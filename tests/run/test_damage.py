@@ -678,7 +678,7 @@ def test_tidy__of_tiles_that_cannot_be_reached_says_so(scene, tmp_path, monkeypa
 def test_match__never_writes_over_files_of_the_user(scene, tmp_path, name, options):
     mine = with_files(tmp_path / "out" / "tiles", [name])
     said = match(scene, tmp_path / "out", *options, status=2)
-    assert f"{tmp_path}/out/tiles has files that no run made, such as {name}: move them away" in said
+    assert f"{tmp_path}/out/tiles has files without a sign of their run, such as {name}: move them away" in said
     assert_kept(mine)
 
 
@@ -765,7 +765,7 @@ def test_match__keeps_empty_files_and_pipes_in_a_folder_without_signs_of_a_run(s
     make(mine)
     before = mine.lstat()
     said = match(scene, tmp_path / "out", status=2)
-    assert f"tiles has files that no run made, such as {name}: move them away" in said
+    assert f"tiles has files without a sign of their run, such as {name}: move them away" in said
     assert os.path.samestat(mine.lstat(), before)
 
 

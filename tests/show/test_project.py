@@ -140,6 +140,19 @@ def test_write_project__keeps_styles_and_projects_of_others(run):
     assert not (out / "width.qml").exists()  # nothing is written before
 
 
+@pytest.mark.parametrize("name", ["width.vrt", "dsm_half_width.vrt"])
+def test_write_project__says_that_the_layer_of_a_kept_file_is_left_out(run, name):
+    out, _, _ = run
+    invoke("project", out)
+    (out / name).write_bytes(b"")
+    done = invoke("project", out)
+    assert (done.exit_code, (out / name).read_bytes()) == (0, b"")
+    assert done.stderr == (
+        f"{out / name} was not made by sat-intervals and is kept: its layer is left out; to have it, move the file "
+        "away and rerun sat-intervals project\n"
+    )
+
+
 def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
     out, _, _ = run
     write_surface(out, np.ones((60, 80)), runs="2020-01-01T00:00:00+00:00")
