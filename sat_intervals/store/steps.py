@@ -1,18 +1,19 @@
 """What steps of a run hand to later ones: path states, pixels and costs; one file each, with its own checksums."""
 
 import struct
-import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 
+import google_crc32c
 import numpy as np
 
 from sat_intervals.store.folder import Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, sealed, unsealed
 from sat_intervals.store.removal import BORDERS, COSTS, PIXELS, is_of_tile
 
-# A file is the length of its header, the header, a sealed text, and the bytes of all arrays.
+# A file is the length of its header, the header, a sealed text, and the bytes of all arrays. Every tile reads those of
+# its neighbours: processors have an instruction for CRC-32C, which takes a third of the time of CRC-32.
 _LENGTH = struct.Struct("<I")
 
 
@@ -34,7 +35,7 @@ class Steps:
     def write(self, kind: str, name: str, *arrays: np.ndarray) -> None:
         """Write arrays as a whole; ``kind`` is their folder, such as BORDERS."""
         whole = [np.ascontiguousarray(array) for array in arrays]
-        about = [[array.dtype.str, list(array.shape), zlib.crc32(array.data)] for array in whole]
+        about = [[array.dtype.str, list(array.shape), google_crc32c.value(array)] for array in whole]
         header, file = sealed({"arrays": about}, f"{self.run}/{kind}/{name}").encode(), f"{kind}/{name}"
         self.folder.write_bytes(file, b"".join([_LENGTH.pack(len(header)), header, *(array.data for array in whole)]))
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
@@ -103,7 +104,8 @@ def _parsed(content: bytes, of: str, wanted: Iterable[int] | None) -> list[np.nd
         return None
     found, view = [], memoryview(content)
     for start, stop, dtype, shape, checksum in places if wanted is None else [places[i] for i in wanted]:
-        if zlib.crc32(view[start:stop]) != checksum:
+        array = np.frombuffer(view[start:stop], dtype).reshape(shape)
+        if google_crc32c.value(array) != checksum:
             return None
-        found.append(np.frombuffer(view[start:stop], dtype).reshape(shape).copy())  # kernels take writable arrays
+        found.append(array.copy())  # kernels take writable arrays
     return found
