@@ -35,7 +35,7 @@ class Steps:
     def write(self, kind: str, name: str, *arrays: np.ndarray) -> None:
         """Write arrays as a whole; ``kind`` is their folder, such as BORDERS."""
         whole = [np.ascontiguousarray(array) for array in arrays]
-        about = [[array.dtype.str, list(array.shape), google_crc32c.value(array)] for array in whole]
+        about = [[array.dtype.str, list(array.shape), _checksum(array)] for array in whole]
         header, file = sealed({"arrays": about}, f"{self.run}/{kind}/{name}").encode(), f"{kind}/{name}"
         self.folder.write_bytes(file, b"".join([_LENGTH.pack(len(header)), header, *(array.data for array in whole)]))
         if self.folder.read(MANIFEST) is None:  # another run removed the tiles meanwhile
@@ -105,7 +105,12 @@ def _parsed(content: bytes, of: str, wanted: Iterable[int] | None) -> list[np.nd
     found, view = [], memoryview(content)
     for start, stop, dtype, shape, checksum in places if wanted is None else [places[i] for i in wanted]:
         array = np.frombuffer(view[start:stop], dtype).reshape(shape)
-        if google_crc32c.value(array) != checksum:
+        if _checksum(array) != checksum:
             return None
         found.append(array.copy())  # kernels take writable arrays
     return found
+
+
+def _checksum(array: np.ndarray) -> int:
+    """Return the CRC-32C of the bytes of an array, which are not copied."""
+    return int(google_crc32c.value(array.reshape(-1).view(np.uint8)))
