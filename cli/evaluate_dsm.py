@@ -13,12 +13,11 @@ import click
 from sat_intervals.cli.options import FILE, Command, SurfaceAndReference, reference_options, say_json, with_options
 
 Line = tuple[float, float, float, float]
-_SOFTWARE = "sat-intervals"
 # Files of --pictures: figures and pictures.
 _TEXTS = "dsm-accuracy.json", "dsm-accuracy.md"
 _PICTURES = "dsm-reliability.png", "dsm-errors.png", "dsm-profile.png"
-# Beginnings of files of figures: those without one are not replaced.
-_MARKS = f'{{\n "software": "{_SOFTWARE}"', f"<!-- {_SOFTWARE} -->\n"
+# Beginnings of files of figures: those without one are not replaced, nor those that were changed since.
+_MARKS = '{\n "software": "sat-intervals', "<!-- sat-intervals"
 
 
 @dataclass(frozen=True)
@@ -103,6 +102,7 @@ def surface_options(command: Command) -> Command:
 def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: dict[str, Any]) -> list[Path]:
     """Write figures and pictures of a surface model to a folder; return their paths."""
     from sat_intervals.cli.tables import surface_markdown
+    from sat_intervals.config.sealing import ROOM, sealed
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
     from sat_intervals.evaluate.dsm import read_profile
     from sat_intervals.raster import examined, whole_file
@@ -114,7 +114,11 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     names = given.dsm.name, given.reference.name
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
-    content = json.dumps({"software": _SOFTWARE} | report, indent=1), surface_markdown(str(given.dsm), report)
+    mark = f"sat-intervals, {ROOM}"
+    content = (
+        json.dumps({"software": mark} | report, indent=1),
+        f"<!-- {mark} -->\n{surface_markdown(str(given.dsm), report)}",
+    )
     with examined(folder, [*_TEXTS, *_PICTURES]) as there:
         _check_texts(folder)
         check_made_here(paths)
@@ -124,9 +128,9 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     draw_error_map(compared, report["all"]["nmad"], errors)
     draw_height_profile(profile, heights, names)
     check_folder = watched_folder(folder)
-    for path, text in zip(texts, (content[0], f"{_MARKS[1]}{content[1]}"), strict=True):
+    for path, text in zip(texts, content, strict=True):
         with whole_file(path, there) as new:
-            new.write_text(text, encoding="utf-8")
+            new.write_bytes(sealed(text.encode()))
             _check_texts(folder)  # again: a file may have appeared meanwhile
     write_made_here({path: drawn.getvalue() for path, drawn in pictures.items()}, there)
     check_folder()
@@ -146,10 +150,16 @@ def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
 
 
 def _check_texts(folder: Path) -> None:
-    """Raise if a text file exists there without a mark."""
+    """Raise if a text file exists there without a mark, or was changed since."""
+    from sat_intervals.config.sealing import is_as_made
     from sat_intervals.errors import SatIntervalsError, check_regular
 
     for path in (folder / name for name in _TEXTS):
         check_regular(path, "move it away")
-        if path.exists() and not path.read_bytes().startswith(tuple(mark.encode() for mark in _MARKS)):
-            raise SatIntervalsError(f"{path} exists and was not made by sat-intervals: move it away")
+        if not path.exists():
+            continue
+        content = path.read_bytes()
+        if not content.startswith(tuple(mark.encode() for mark in _MARKS)) or not is_as_made(content):
+            raise SatIntervalsError(
+                f"{path} exists and was not made by sat-intervals, or was changed since: move it away"
+            )

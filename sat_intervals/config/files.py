@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml
 
+from sat_intervals.config.sealing import is_as_made
 from sat_intervals.config.sections import ConfigError
 from sat_intervals.errors import SatIntervalsError, open_regular
 
@@ -88,10 +89,15 @@ def read_mapping(file: Path, holds: str) -> Mapping[str, Any]:
     OSError
         The file cannot be read.
     SatIntervalsError
-        It is too large, not YAML, or holds something else.
+        It is too large, not YAML, holds something else, or its bytes differ from the CRC-32 in it.
     """
     try:
-        values = load_yaml(read_small(file))
+        content = read_small(file)
+        if is_as_made(content) is False:
+            raise ConfigError(
+                f"{file} is damaged or was edited: restore it, or delete its line with CRC-32 if you edited it"
+            )
+        values = load_yaml(content)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(f"{file}: {line}{error.problem}") from error

@@ -18,6 +18,7 @@ from sat_intervals.raster import POINT_FILES, OutputWriter, examined, read_tags
 from sat_intervals.raster.identity import checksum_of
 from sat_intervals.raster.published import POINTS_FILE, published_points
 from sat_intervals.raster.publishing import POINTS_REPORT
+from sat_intervals.raster.seal import is_as_made
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -110,7 +111,8 @@ def _check_own(out: Path) -> None:
     published = published_points(out)  # raises for a points.json of others
     if os.path.lexists(path):
         try:
-            is_own = "LEFT_MODEL" in read_tags(path) and published in (None, checksum_of(path))
+            as_made = published == checksum_of(path) if published else is_as_made(path)
+            is_own = "LEFT_MODEL" in read_tags(path) and as_made
         except SatIntervalsError:
             is_own = False
         if not is_own:

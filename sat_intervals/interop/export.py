@@ -13,7 +13,7 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import LEFT_WINDOW, Band, Bands
-from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_made_by, examined
+from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_as_made, check_made_by, examined
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window, strips
 
@@ -27,7 +27,8 @@ Raster = tuple[File, Callable[[Bands], np.ndarray]]
 
 
 def _file(name: str, *bands: str, dtype: str = "float32", nodata: float | None = None, driver: str = "COG") -> File:
-    return File(name, dtype, nodata, tuple(Band(band, "", band) for band in bands), driver=driver)
+    described = tuple(Band(band, "", band) for band in bands)
+    return File(name, dtype, nodata, described, driver=driver, is_sealed=driver == "COG")
 
 
 def _two(horizontal: np.ndarray, *more: np.ndarray) -> np.ndarray:
@@ -119,6 +120,8 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
         with examined(folder, [file.name for file in files]) as there:
             for file in files:
                 check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
+                if file.is_sealed:
+                    check_as_made(folder / file.name)
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sat_intervals.config.sealing import ROOM, is_as_made, sealed
 from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
 from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
 from sat_intervals.raster import (
@@ -74,7 +75,7 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
     with run.unchanged("points.tif", "dsm.tif", "overview.png"):
         item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
     with run.unchanged(), whole_file(file, there) as new:
-        new.write_text(json.dumps(item, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        new.write_bytes(sealed((json.dumps(item, indent=1, allow_nan=False) + "\n").encode()))
         _check_own(file)  # again: a file may have appeared meanwhile
     return file
 
@@ -90,14 +91,18 @@ def _time(text: str) -> str:
 
 
 def _check_own(file: Path) -> None:
-    """Raise if the file exists and is not an item of this tool. Links pass: they are replaced, never followed."""
+    """Raise if the file exists and is not an item of this tool, or was changed since.
+
+    Links pass: they are replaced, never followed.
+    """
     if not os.path.lexists(file) or file.is_symlink():
         return
     check_regular(file, "move it away")
     with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
-        if "sat-intervals" in json.loads(file.read_text(encoding="utf-8"))["properties"]["processing:software"]:
+        content = file.read_bytes()
+        if "sat-intervals" in json.loads(content)["properties"]["processing:software"] and is_as_made(content):
             return
-    raise SatIntervalsError(f"{file} exists and was not made by sat-intervals: move it away")
+    raise SatIntervalsError(f"{file} exists and was not made by sat-intervals, or was changed since: move it away")
 
 
 def _item(run: Run, taken: str, identifier: str) -> dict[str, Any]:
@@ -109,6 +114,7 @@ def _item(run: Run, taken: str, identifier: str) -> dict[str, Any]:
         corners = footprint(of_surface, shape)
     item: dict[str, Any] = {
         "type": "Feature",
+        "sat-intervals": ROOM,
         "stac_version": "1.1.0",
         "stac_extensions": _EXTENSIONS,
         "id": identifier,

@@ -49,7 +49,7 @@ _VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity
 INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS)
 VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
 RUN_FILES = (INTERVALS, VALIDITY)
-POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT"),)
+POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT", is_sealed=True),)
 
 
 def run_files(compression: str) -> tuple[File, File]:

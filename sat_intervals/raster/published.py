@@ -8,12 +8,15 @@ from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of, known_checksum
 from sat_intervals.raster.layers import read_alone
 from sat_intervals.raster.publishing import POINTS_REPORT
+from sat_intervals.raster.seal import check_seal
 
 POINTS_FILE = POINT_FILES[0].name
 
 
 def check_points(out: Path) -> None:
-    """Raise if the bytes of ``points.tif`` differ from those that were published; earlier versions wrote no checksum.
+    """Raise if the bytes of ``points.tif`` differ from those that were published, or from the CRC-32 in it.
+
+    Without ``points.json``, there is only the latter. Earlier versions wrote neither.
 
     Raises
     ------
@@ -22,7 +25,9 @@ def check_points(out: Path) -> None:
     """
     read_alone(out / POINTS_FILE)
     published = published_points(out)
-    if published and published != checksum_of(out / POINTS_FILE):
+    if published is None:
+        check_seal(out / POINTS_FILE, [])
+    elif published != checksum_of(out / POINTS_FILE):
         raise SatIntervalsError(
             f"{out / POINTS_FILE} is not what triangulate published; it is damaged or was changed: move it away and "
             "triangulate again"

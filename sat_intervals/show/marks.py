@@ -1,25 +1,27 @@
-"""Keep files in the place of a picture, page, style or project that this tool did not make."""
+"""Keep files in the place of a picture, page, style or project that this tool did not make, or that were edited."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from sat_intervals.config.sealing import ROOM, is_as_made, sealed
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import examined, whole_file
 
-XML_MARK = "made by sat-intervals"
-"""Text of the comment in styles and projects; QGIS removes it when it writes the file again."""
+XML_MARK = f"made by sat-intervals, {ROOM}"
+"""Text of the comment in styles; QGIS removes it when it writes the file again."""
 
 # Text near the beginning of the tool's pictures, pages, styles and projects.
 _MARKS = (
     b"tEXtSoftware\0sat-intervals",
-    b'<meta name="generator" content="sat-intervals">',
-    f"<!--{XML_MARK}-->".encode(),
+    b'<meta name="generator" content="sat-intervals',
+    b"<!--made by sat-intervals",
 )
 _BEGINNING = 1024  # bytes
+_ARCHIVE = b"PK"
 
 
 def check_made_here(paths: Iterable[Path]) -> None:
-    """Raise if one of the files exists without the mark of this tool. Links are replaced, never followed: they pass.
+    """Raise if one of the files exists and is not `is_replaceable`. Links are replaced, never followed: they pass.
 
     Raises
     ------
@@ -29,13 +31,15 @@ def check_made_here(paths: Iterable[Path]) -> None:
     for path in paths:
         if not is_replaceable(path):
             raise SatIntervalsError(
-                f"{path} exists and was not made by sat-intervals, or by a version that left no mark in it: move "
-                "it away"
+                f"{path} exists and was not made by sat-intervals, was changed since, or is of a version without "
+                "checksums: move it away"
             )
 
 
 def is_replaceable(path: Path) -> bool:
-    """Return whether a file is missing, a link, or has the mark of this tool.
+    """Return whether a file is missing, a link, or has the mark of this tool and its bytes agree with the CRC-32 in it.
+
+    Projects are archives, which have a checksum of their own; QGIS writes them again without the mark.
 
     Raises
     ------
@@ -46,10 +50,13 @@ def is_replaceable(path: Path) -> bool:
         return True
     try:
         with path.open("rb") as stream:
-            beginning = stream.read(_BEGINNING)
+            content = stream.read(_BEGINNING)
+            if not any(mark in content for mark in _MARKS):  # the file may be of any size
+                return False
+            content += stream.read()
     except OSError as error:
         raise SatIntervalsError(f"{path} exists and cannot be read: {error.strerror}: move it away") from error
-    return any(mark in beginning for mark in _MARKS)
+    return content.startswith(_ARCHIVE) or bool(is_as_made(content))
 
 
 def replaceable_here(folder: Path, names: Iterable[str]) -> dict[str, str]:
@@ -67,7 +74,7 @@ def replaceable_here(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def write_made_here(files: Mapping[Path, bytes], there: Mapping[str, str]) -> None:
-    """Write files of one folder; those that have no stamp in ``there``, or that this tool did not make, are kept.
+    """Write files of one folder, `sealed`; those that have no stamp in ``there``, or that are not ours, are kept.
 
     If there is such a file before the first is written, none is. ``there`` is that of `whole_file`.
 
@@ -79,5 +86,5 @@ def write_made_here(files: Mapping[Path, bytes], there: Mapping[str, str]) -> No
     check_made_here(files)
     for path, content in files.items():
         with whole_file(path, there) as new:
-            new.write_bytes(content)
+            new.write_bytes(content if content.startswith(_ARCHIVE) else sealed(content))
             check_made_here([path])  # again: a file may have appeared meanwhile

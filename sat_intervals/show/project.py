@@ -11,6 +11,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from sat_intervals.config.sealing import ROOM
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, POINTS, SURFACE
 from sat_intervals.raster import (
@@ -117,8 +118,8 @@ def write_project(out: str | Path) -> Written:
 
 
 def _archive(project: bytes) -> bytes:
-    """Return an archive of a project; it is stored, so that the mark is in the first bytes."""
-    content = BytesIO()
+    """Return an archive of a project; it is stored, so that the mark is in the first bytes. It has its own CRC-32."""
+    content, project = BytesIO(), project.replace(f", {ROOM}".encode(), b"", 1)
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(zipfile.ZipInfo("project.qgs"), project)
     return content.getvalue()
@@ -139,7 +140,7 @@ def _add_defaults(run: Run, layers: list[Layer], written: Written) -> None:
 def _is_free(file: Path, written: Written) -> bool:
     """Return whether a file may be written; note if it is kept."""
     if is_kept := file in written.kept:
-        note = f"{file} was not made by sat-intervals and is kept"
+        note = f"{file} was not made by sat-intervals, or was changed since, and is kept"
         if file.suffix == ".vrt":
             note += ": its layer is left out; to have it, move the file away and rerun sat-intervals project"
         written.notes.append(note)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.config import load_height_calibration
+from sat_intervals.config import ConfigError, load_height_calibration
 from sat_intervals.evaluate import calibration
 from sat_intervals.evaluate.calibration import calibrate_surface
 
@@ -270,8 +271,54 @@ def test_calibrate_dsm_command__keeps_a_file_that_appears_meanwhile(tmp_path, mo
     monkeypatch.setattr(calibration, "calibrate_surface", slow)
     done = invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
     assert done.exit_code == 2
-    assert f"{output} exists and was not made by sat-intervals calibrate, or holds something else" in done.stderr
+    assert (
+        f"{output} exists and was not made by sat-intervals calibrate, holds something else, or was changed"
+        in done.stderr
+    )
     assert output.read_text() == "mine"
+
+
+def test_calibrate_dsm_command__keeps_a_calibration_that_was_edited(tmp_path, monkeypatch):
+    model, reference = scene(tmp_path)
+    output = tmp_path / "heights.yaml"
+    words = ["calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output]
+    for _ in range(2):  # its own file is replaced
+        assert invoke(*words).exit_code == 0
+    said = "was not made by sat-intervals calibrate, holds something else, or was changed since: move it away"
+    made = output.read_text()
+    seal = next(line for line in made.splitlines(keepends=True) if "CRC-32" in line)
+    for mine in (made + "# mine\n", made.replace(seal, "")):
+        output.write_text(mine)
+        done = invoke(*words)
+        assert (done.exit_code, output.read_text()) == (2, mine)
+        assert said in done.stderr
+
+    def edited_meanwhile(*files, **options):
+        output.write_text(made + "# mine\n")
+        return calibrate_surface(*files, **options)
+
+    output.write_text(made)
+    monkeypatch.setattr(calibration, "calibrate_surface", edited_meanwhile)
+    done = invoke(*words)
+    assert (done.exit_code, output.read_text()) == (2, made + "# mine\n")
+    assert said in done.stderr
+
+
+def test_load_height_calibration__refuses_what_was_cut_or_changed(tmp_path):
+    model, reference = scene(tmp_path)
+    output = tmp_path / "heights.yaml"
+    assert invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
+    made, content = output.read_bytes(), load_height_calibration(output)
+    seal = re.search(rb"CRC-32 [0-9a-f]{8}", made)
+    rng = np.random.default_rng(1)
+    for place in rng.integers(seal.end(), len(made), 40):
+        for damaged in (made[:place], made[:place] + bytes([made[place] ^ 1]) + made[place + 1 :]):
+            output.write_bytes(damaged)
+            with pytest.raises(ConfigError, match="is damaged or was edited: restore it, or delete its line with"):
+                load_height_calibration(output)
+    edited = made.decode().replace(f"# {seal[0].decode()} of this file: delete this line if you edit others.\n", "")
+    output.write_text(edited + "# mine\n")
+    assert load_height_calibration(output) == content
 
 
 def test_calibrate_dsm_command__keeps_a_file_that_appears_after_its_last_check(tmp_path, monkeypatch):

@@ -252,6 +252,10 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
         assert message in result.stderr
     for file in written[:2]:
         made = file.read_text()
+        file.write_text(made + "mine\n")
+        result = invoke(*words, "--pictures", tmp_path)
+        assert (result.exit_code, file.read_text()) == (2, made + "mine\n")
+        assert f"{file.name} exists and was not made by sat-intervals, or was changed since" in result.stderr
         file.write_text("# Notes on sat-intervals")
         result = invoke(*words, "--pictures", tmp_path)
         assert result.exit_code == 2

@@ -332,8 +332,17 @@ def test_triangulate__protects_the_points_by_a_checksum(level_run, tmp_path):
         (out / "points.tif").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
         with pytest.raises(SatIntervalsError, match=r"points.tif is not what triangulate published; .*triangulate aga"):
             make_surface([out], surface, resolution=1.0)
-    (out / "points.json").unlink()  # of an earlier version
+    report = (out / "points.json").read_text()
+    (out / "points.json").unlink()
+    for place in range(len(whole) // 2, len(whole), len(whole) // 20):
+        (out / "points.tif").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(SatIntervalsError, match=r"points.tif is damaged or was changed: its CRC-32 is"):
+            make_surface([out], surface, resolution=1.0)
+        with pytest.raises(SatIntervalsError, match=r"points.tif exists .*, or was changed since: move it away"):
+            triangulate(out, *files)
     (out / "points.tif").write_bytes(whole)
+    make_surface([out], surface, resolution=1.0)
+    (out / "points.json").write_text(report)
     make_surface([out], surface, resolution=1.0)
     triangulate(out, *files)
     make_surface([out], surface, resolution=1.0)

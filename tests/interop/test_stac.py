@@ -122,8 +122,16 @@ def test_stac__replaces_its_own_item_only(made, tmp_path):
     (out / "stac.json").write_text('{"properties": {}}')
     done = invoke("stac", out)
     assert done.exit_code == 2
-    assert done.stderr == f"sat-intervals: {out / 'stac.json'} exists and was not made by sat-intervals: move it away\n"
+    said = "exists and was not made by sat-intervals, or was changed since: move it away"
+    assert done.stderr == f"sat-intervals: {out / 'stac.json'} {said}\n"
     assert (out / "stac.json").read_text() == '{"properties": {}}'
+    (out / "stac.json").unlink()
+    assert invoke("stac", out).exit_code == 0
+    item = json.loads((out / "stac.json").read_text())
+    item["properties"]["title"] = "mine"
+    (out / "stac.json").write_text(mine := json.dumps(item, indent=1))
+    assert said in invoke("stac", out).stderr
+    assert (out / "stac.json").read_text() == mine
     (out / "stac.json").unlink()
     os.mkfifo(out / "stac.json")
     assert f"{out / 'stac.json'} is a named pipe" in invoke("stac", out).stderr

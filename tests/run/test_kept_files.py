@@ -722,9 +722,10 @@ def test_report_and_plot__replace_only_files_that_they_made(finished, name):
     assert contents(finished) == before
     for own in ("overview.png", "profile.png", "report.html"):
         if str(finished / own) in made:
-            (finished / own).write_bytes(made[str(finished / own)] + b"older")
+            (finished / own).write_bytes(made[str(finished / own)])
+            os.utime(finished / own, (0, 0))
     assert invoke(*command).exit_code == 0
-    assert not (finished / name).read_bytes().endswith(b"older")
+    assert (finished / name).stat().st_mtime
     assert (finished / "curve.png").read_text() == "of nobody's concern"
 
 
@@ -792,7 +793,7 @@ def test_plot__writes_no_picture_if_one_of_the_user_appears_while_it_draws(finis
 
 def test_plot__keeps_a_picture_that_another_process_wrote_while_it_drew(finished, monkeypatch):
     assert invoke("plot", finished, "--row", "0", "--dpi", "50").exit_code == 0
-    other = (finished / "overview.png").read_bytes() + b"of another process"
+    other = (finished / "profile.png").read_bytes()
     drawn = Figure.savefig
 
     def savefig(figure, stream, **options):
@@ -1004,6 +1005,33 @@ def test_export__replaces_only_its_own_files(finished, tmp_path, form, name):
         with pytest.raises(SatIntervalsError, match=rf"{name} exists and was not made by sat-intervals{by}, .*move it"):
             export(finished, form, target)
         assert contents(target) == before
+
+
+@pytest.mark.parametrize("name", ["disparity.tif", "mask.tif"])
+def test_export__keeps_a_file_that_was_changed_in_its_place(finished, tmp_path, name):
+    export(finished, "otb", tmp_path)
+    with rasterio.open(tmp_path / name, "r+", IGNORE_COG_LAYOUT_BREAK=True) as file:  # keeps the tags
+        file.write(np.zeros((1, 2, 2), file.dtypes[0])[0], 1, window=((0, 2), (0, 2)))
+        assert file.tags()["EXPORT"] == "otb"
+    before = contents(tmp_path)
+    refused(["export", finished, tmp_path, "--to", "otb"], f"{name} was changed since sat-intervals made it")
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "edit"),
+    [
+        (["plot"], "overview.png", b"edited"),
+        (["report"], "report.html", b"<p>mine</p>"),
+        (["stac"], "stac.json", b"\n"),
+    ],
+)
+def test_commands__keep_pictures_and_pages_that_were_edited(finished, command, name, edit):
+    for _ in range(2):  # their own files are replaced
+        assert invoke(*command, finished).exit_code == 0
+    (finished / name).write_bytes(mine := (finished / name).read_bytes() + edit)
+    refused([*command, finished], f"{name} exists and was not made by sat-intervals", "changed since")
+    assert (finished / name).read_bytes() == mine
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])

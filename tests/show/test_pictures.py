@@ -21,6 +21,7 @@ from PIL import Image
 
 from sat_intervals import match_pair
 from sat_intervals.cli.console import Console
+from sat_intervals.config.sealing import ROOM
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import (
@@ -80,7 +81,7 @@ def share_of(picture, colour):
 @pytest.fixture
 def unrendered(monkeypatch):
     """Figures are made and not rendered, which takes most of their time: for tests that look at what is drawn."""
-    monkeypatch.setattr(Figure, "savefig", lambda figure, stream, **options: None)
+    monkeypatch.setattr(Figure, "savefig", lambda figure, stream, **options: stream.write(ROOM.encode()))
 
 
 def test_plot__makes_every_picture_and_names_it(run):
@@ -319,7 +320,7 @@ def test_plot__without_intervals_claims_none(tmp_path, words, unrendered):
     [((40, 60), np.nan, "Confidence"), ((1, 5), 1.0, "Agreement of runs")],
 )
 def test_plot__draws_the_surface_of_a_run(tmp_path, monkeypatch, words, shape, agreement, last):
-    monkeypatch.setattr(maps, "draw_overview", lambda results, stream, dpi: stream.write(b"drawn"))
+    monkeypatch.setattr(maps, "draw_overview", lambda results, stream, dpi: stream.write(ROOM.encode()))
     out = write_run(tmp_path, *random_bands(20, 20)[:2])
     height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])) / 10
     height[:, 3] = np.nan

@@ -127,7 +127,8 @@ def test_write_project__keeps_styles_and_projects_of_others(run):
     (out / "intervals.qml").write_text("<qgis/>")
     done = invoke("project", out)
     assert done.exit_code == 0
-    assert done.stderr == f"{out / 'intervals.qml'} was not made by sat-intervals and is kept\n"
+    said = f"{out / 'intervals.qml'} was not made by sat-intervals, or was changed since, and is kept\n"
+    assert done.stderr == said
     assert (out / "intervals.qml").read_text() == "<qgis/>"
     assert invoke("project", out).exit_code == 0  # its own files are replaced
     before = (out / "width.qml").read_bytes()
@@ -141,16 +142,29 @@ def test_write_project__keeps_styles_and_projects_of_others(run):
 
 
 @pytest.mark.parametrize("name", ["width.vrt", "dsm_half_width.vrt"])
-def test_write_project__says_that_the_layer_of_a_kept_file_is_left_out(run, name):
+@pytest.mark.parametrize("is_edited", [False, True])
+def test_write_project__says_that_the_layer_of_a_kept_file_is_left_out(run, name, is_edited):
     out, _, _ = run
     invoke("project", out)
-    (out / name).write_bytes(b"")
+    mine = (out / name).read_bytes().replace(b"</VRTDataset>", b"<!-- mine --></VRTDataset>") if is_edited else b""
+    (out / name).write_bytes(mine)
     done = invoke("project", out)
-    assert (done.exit_code, (out / name).read_bytes()) == (0, b"")
+    assert (done.exit_code, (out / name).read_bytes()) == (0, mine)
     assert done.stderr == (
-        f"{out / name} was not made by sat-intervals and is kept: its layer is left out; to have it, move the file "
-        "away and rerun sat-intervals project\n"
+        f"{out / name} was not made by sat-intervals, or was changed since, and is kept: its layer is left out; to "
+        "have it, move the file away and rerun sat-intervals project\n"
     )
+
+
+def test_write_project__keeps_styles_that_were_edited(run):
+    out, _, _ = run
+    invoke("project", out)
+    style = out / "intervals.qml"
+    mine = style.read_bytes().replace(b'"Reds"', b'"Blues"') + b"<!-- mine -->\n"
+    style.write_bytes(mine)
+    done = invoke("project", out)
+    assert (done.exit_code, style.read_bytes()) == (0, mine)
+    assert f"{style} was not made by sat-intervals, or was changed since, and is kept" in done.stderr
 
 
 def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):

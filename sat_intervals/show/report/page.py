@@ -9,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from sat_intervals.config.sealing import sealed
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster import watched_images, whole_file
 from sat_intervals.results import Results
@@ -38,7 +39,7 @@ def write_report(results: Results) -> Path:
     check_images()
     with results.unchanged(), whole_file(path, there) as new:
         with results.unchanged():  # another run may have come to the folder
-            new.write_text(page, encoding="utf-8")
+            new.write_bytes(sealed(page.encode()))
         check_made_here([path])  # again: a file may have appeared meanwhile
     return path
 
