@@ -1,6 +1,10 @@
 """Keep files in the place of a picture, page, style or project that this tool did not make, or that were edited."""
 
+import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 
 from sat_intervals.config.sealing import ROOM, is_as_made, sealed
@@ -39,7 +43,7 @@ def check_made_here(paths: Iterable[Path]) -> None:
 def is_replaceable(path: Path) -> bool:
     """Return whether a file is missing, a link, or has the mark of this tool and its bytes agree with the CRC-32 in it.
 
-    Projects are archives, which have a checksum of their own; QGIS writes them again without the mark.
+    An archive has them in its only file.
 
     Raises
     ------
@@ -56,7 +60,16 @@ def is_replaceable(path: Path) -> bool:
             content += stream.read()
     except OSError as error:
         raise SatIntervalsError(f"{path} exists and cannot be read: {error.strerror}: move it away") from error
-    return content.startswith(_ARCHIVE) or bool(is_as_made(content))
+    return bool(is_as_made(_only_file(content) if content.startswith(_ARCHIVE) else content))
+
+
+def _only_file(archive: bytes) -> bytes:
+    """Return the content of the file in an archive; nothing if it is damaged or has several."""
+    errors = zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error, EOFError, ValueError
+    with suppress(*errors), zipfile.ZipFile(BytesIO(archive)) as opened:
+        (name,) = opened.namelist()
+        return opened.read(name)
+    return b""
 
 
 def replaceable_here(folder: Path, names: Iterable[str]) -> dict[str, str]:
@@ -74,7 +87,7 @@ def replaceable_here(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def write_made_here(files: Mapping[Path, bytes], there: Mapping[str, str]) -> None:
-    """Write files of one folder, `sealed`; those that have no stamp in ``there``, or that are not ours, are kept.
+    """Write files of one folder, `sealed` but for archives; those that are not ours, or not in ``there``, are kept.
 
     If there is such a file before the first is written, none is. ``there`` is that of `whole_file`.
 

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from sat_intervals.config.sealing import ROOM
+from sat_intervals.config.sealing import sealed
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, POINTS, SURFACE
 from sat_intervals.raster import (
@@ -118,10 +118,10 @@ def write_project(out: str | Path) -> Written:
 
 
 def _archive(project: bytes) -> bytes:
-    """Return an archive of a project; it is stored, so that the mark is in the first bytes. It has its own CRC-32."""
-    content, project = BytesIO(), project.replace(f", {ROOM}".encode(), b"", 1)
+    """Return an archive of a project, which is `sealed`; it is stored, so that the mark is in the first bytes."""
+    content = BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr(zipfile.ZipInfo("project.qgs"), project)
+        archive.writestr(zipfile.ZipInfo("project.qgs"), sealed(project))
     return content.getvalue()
 
 

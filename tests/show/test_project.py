@@ -156,6 +156,25 @@ def test_write_project__says_that_the_layer_of_a_kept_file_is_left_out(run, name
     )
 
 
+def test_write_project__keeps_a_project_that_was_edited(run):
+    out, _, _ = run
+    for _ in range(2):  # its own file is replaced
+        assert invoke("project", out).exit_code == 0
+    made = (out / "project.qgz").read_bytes()
+    with zipfile.ZipFile(out / "project.qgz") as archive:
+        project = archive.read("project.qgs")
+    for files in ({"project.qgs": project + b"<!-- mine -->"}, {"project.qgs": project, "mine.txt": b"mine"}):
+        with zipfile.ZipFile(out / "project.qgz", "w") as archive:
+            for name, content in files.items():
+                archive.writestr(name, content)
+        before = (out / "project.qgz").read_bytes()
+        done = invoke("project", out)
+        assert (done.exit_code, (out / "project.qgz").read_bytes()) == (2, before)
+        assert "project.qgz exists and was not made by sat-intervals, was changed since" in done.stderr
+    (out / "project.qgz").write_bytes(made[:-9])
+    assert invoke("project", out).exit_code == 2
+
+
 def test_write_project__keeps_styles_that_were_edited(run):
     out, _, _ = run
     invoke("project", out)
