@@ -16,8 +16,6 @@ Line = tuple[float, float, float, float]
 # Files of --pictures: figures and pictures.
 _TEXTS = "dsm-accuracy.json", "dsm-accuracy.md"
 _PICTURES = "dsm-reliability.png", "dsm-errors.png", "dsm-profile.png"
-# Beginnings of files of figures: those without one are not replaced, nor those that were changed since.
-_MARKS = '{\n "software": "sat-intervals', "<!-- sat-intervals"
 
 
 @dataclass(frozen=True)
@@ -102,64 +100,39 @@ def surface_options(command: Command) -> Command:
 def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: dict[str, Any]) -> list[Path]:
     """Write figures and pictures of a surface model to a folder; return their paths."""
     from sat_intervals.cli.tables import surface_markdown
-    from sat_intervals.config.sealing import ROOM, sealed
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
     from sat_intervals.evaluate.dsm import read_profile
-    from sat_intervals.raster import examined, whole_file
     from sat_intervals.raster.watching import watched_folder
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
-    from sat_intervals.show.marks import check_made_here, write_made_here
+    from sat_intervals.show.marks import TEXT_MARK, replaceable_here, write_made_here
 
-    texts, paths = [folder / name for name in _TEXTS], [folder / name for name in _PICTURES]
+    paths = [folder / name for name in (*_TEXTS, *_PICTURES)]
     names = given.dsm.name, given.reference.name
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
-    mark = f"sat-intervals, {ROOM}"
-    content = (
-        json.dumps({"software": mark} | report, indent=1),
-        f"<!-- {mark} -->\n{surface_markdown(str(given.dsm), report)}",
+    texts = (
+        json.dumps({"software": TEXT_MARK} | report, indent=1),
+        f"<!-- {TEXT_MARK} -->\n{surface_markdown(str(given.dsm), report)}",
     )
-    with examined(folder, [*_TEXTS, *_PICTURES]) as there:
-        _check_texts(folder)
-        check_made_here(paths)
-    pictures = {path: BytesIO() for path in paths}
-    reliability, errors, heights = pictures.values()
+    there = replaceable_here(folder, [path.name for path in paths])
+    reliability, errors, heights = pictures = BytesIO(), BytesIO(), BytesIO()
     draw_reliability(report, reliability, names[0])
     draw_error_map(compared, report["all"]["nmad"], errors)
     draw_height_profile(profile, heights, names)
     check_folder = watched_folder(folder)
-    for path, text in zip(texts, content, strict=True):
-        with whole_file(path, there) as new:
-            new.write_bytes(sealed(text.encode()))
-            _check_texts(folder)  # again: a file may have appeared meanwhile
-    write_made_here({path: drawn.getvalue() for path, drawn in pictures.items()}, there)
+    contents = [*(text.encode() for text in texts), *(picture.getvalue() for picture in pictures)]
+    write_made_here(dict(zip(paths, contents, strict=True)), there)
     check_folder()
-    return [*texts, *paths]
+    return paths
 
 
 def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
-    """Raise if there is no such folder, or if files there would be replaced that are inputs or without a mark."""
+    """Raise if there is no such folder, or if files there would be replaced that are inputs or of others."""
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.show.marks import check_made_here
 
     if not folder.is_dir():
         raise click.UsageError(f"--pictures {folder} is not a folder: give an existing one.")
-    check_not_replaced(inputs, [folder / name for name in (*_TEXTS, *_PICTURES)])
-    check_made_here(folder / name for name in _PICTURES)
-    _check_texts(folder)
-
-
-def _check_texts(folder: Path) -> None:
-    """Raise if a text file exists there without a mark, or was changed since."""
-    from sat_intervals.config.sealing import is_as_made
-    from sat_intervals.errors import SatIntervalsError, check_regular
-
-    for path in (folder / name for name in _TEXTS):
-        check_regular(path, "move it away")
-        if not path.exists():
-            continue
-        content = path.read_bytes()
-        if not content.startswith(tuple(mark.encode() for mark in _MARKS)) or not is_as_made(content):
-            raise SatIntervalsError(
-                f"{path} exists and was not made by sat-intervals, or was changed since: move it away"
-            )
+    paths = [folder / name for name in (*_TEXTS, *_PICTURES)]
+    check_not_replaced(inputs, paths)
+    check_made_here(paths)

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config.sealing import ROOM
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.show.marks import replaceable_here, write_made_here
+from sat_intervals.show.marks import TEXT_MARK, replaceable_here, write_made_here
 
 try:
     from matplotlib import rc_context
@@ -49,7 +48,7 @@ def page(target: Target, size: tuple[float, float], dpi: int, title: str, run: s
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
-        figure.savefig(drawn, dpi=dpi, format="png", metadata={"Software": f"sat-intervals, {ROOM}", "Comment": run})
+        figure.savefig(drawn, dpi=dpi, format="png", metadata={"Software": TEXT_MARK, "Comment": run})
     if isinstance(target, Path):
         write_made_here({target: drawn.getvalue()}, there)
 

@@ -1,4 +1,4 @@
-"""Keep files in the place of a picture, page, style or project that this tool did not make, or that were edited."""
+"""Keep files in the place of a picture, page, style, project or text that is not ours, or that was edited."""
 
 import zipfile
 import zlib
@@ -14,11 +14,16 @@ from sat_intervals.raster import examined, whole_file
 XML_MARK = f"made by sat-intervals, {ROOM}"
 """Text of the comment in styles; QGIS removes it when it writes the file again."""
 
-# Text near the beginning of the tool's pictures, pages, styles and projects.
+TEXT_MARK = f"sat-intervals, {ROOM}"
+"""Text of the comment in Markdown, of ``software`` in JSON, and of ``Software`` in pictures."""
+
+# Text near the beginning of the tool's pictures, pages, styles and projects, and of figures in JSON and Markdown.
 _MARKS = (
     b"tEXtSoftware\0sat-intervals",
     b'<meta name="generator" content="sat-intervals',
     b"<!--made by sat-intervals",
+    b'{\n "software": "sat-intervals',
+    b"<!-- sat-intervals",
 )
 _BEGINNING = 1024  # bytes
 _ARCHIVE = b"PK"

@@ -255,7 +255,7 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
         file.write_text(made + "mine\n")
         result = invoke(*words, "--pictures", tmp_path)
         assert (result.exit_code, file.read_text()) == (2, made + "mine\n")
-        assert f"{file.name} exists and was not made by sat-intervals, or was changed since" in result.stderr
+        assert f"{file.name} exists and was not made by sat-intervals, was changed since" in result.stderr
         file.write_text("# Notes on sat-intervals")
         result = invoke(*words, "--pictures", tmp_path)
         assert result.exit_code == 2
@@ -279,7 +279,7 @@ def test_evaluate_command__keeps_a_file_that_appears_after_its_check(tmp_path, m
     truth = relief(row, column)
     model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
     reference = write_raster(tmp_path / "reference.tif", [truth])
-    monkeypatch.setattr("sat_intervals.raster.whole_file", late_file(tmp_path / name))
+    monkeypatch.setattr("sat_intervals.show.marks.whole_file", late_file(tmp_path / name))
     done = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register", "--pictures", tmp_path)
     assert (done.exit_code, (tmp_path / name).read_text()) == (2, "mine")
     assert f"{name} exists and was not made by sat-intervals" in done.stderr
