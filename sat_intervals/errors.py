@@ -50,7 +50,8 @@ def check_regular(path: str | os.PathLike[str], way_out: str = "give a regular f
 
 
 def check_file(path: str | os.PathLike[str], way_out: str) -> None:
-    """Raise if a path is no file: it is missing, or a folder."""
+    """Raise if a path is no file: it is missing, a folder, or see `check_regular`."""
+    check_regular(path, way_out)
     if not os.path.isfile(path):
         reason = "is a folder" if os.path.isdir(path) else "no such file"
         raise SatIntervalsError(f"{os.fspath(path)}: {reason}: {way_out}")

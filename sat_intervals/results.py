@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveInt, ValidationError
 
 from sat_intervals.config import Config, Regularization, load_config
-from sat_intervals.errors import RunError, SatIntervalsError, open_regular
+from sat_intervals.errors import RunError, SatIntervalsError, check_file, open_regular
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS, Bands
 from sat_intervals.raster import (
@@ -327,6 +327,7 @@ def _checked_place(file: Path, bands: int, region: Window, published: dict[str, 
     """
     if not file.exists():
         raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or rerun match")
+    check_file(file, "move it away and match again with --overwrite")
     if published and published != checksum_of(file):
         raise SatIntervalsError(
             f"{file} is not what the run published; it is damaged or was changed: move it away and match again with "

@@ -190,7 +190,7 @@ def _is_of_run(picture: Path, finished: str) -> bool:
     """Return whether a picture notes that it is of a run; a user's, or one of an earlier run, does not."""
     if not picture.is_file():
         return False
-    with picture.open("rb") as stream:
+    with open_regular(picture) as stream:
         return b"Comment\0" + finished.encode() in stream.read(_BEGINNING)
 
 

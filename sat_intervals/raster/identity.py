@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any
 from urllib.request import Request, urlopen
 
-from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError, check_regular, open_regular
 from sat_intervals.store.folder import object_tag
 
 # GDAL's prefixes of object stores, and those of fsspec.
@@ -141,7 +141,7 @@ def _hashed(file: str | Path) -> tuple[str, str]:
 @lru_cache(maxsize=1024)
 def _sha256(file: str | Path, stamp: str) -> str:
     """Return the SHA-256 of a file; cached by stamp, as workers need it for every tile."""
-    with open(file, "rb") as stream:
+    with open_regular(file) as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     if local_stamp(file) != stamp:
         raise ChangedInputError(f"{file} is being written: rerun the command when it is complete")
@@ -151,7 +151,7 @@ def _sha256(file: str | Path, stamp: str) -> str:
 def checksum_of(file: Path) -> dict[str, int]:
     """Return size in bytes and CRC-32 of a local file."""
     size = crc32 = 0
-    with file.open("rb") as stream:
+    with open_regular(file) as stream:
         while block := stream.read(1 << 20):
             size, crc32 = size + len(block), zlib.crc32(block, crc32)
     return {"bytes": size, "crc32": crc32}
@@ -243,7 +243,7 @@ def _differing(files: Mapping[str, Mapping[str, Any]], is_over: Event) -> str | 
             continue
         digest = hashlib.sha256()
         try:
-            with open(file, "rb") as stream:
+            with open_regular(file) as stream:
                 while not is_over.is_set() and (block := stream.read(1 << 20)):
                     digest.update(block)
         except OSError as error:

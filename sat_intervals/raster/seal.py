@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.beside import check_beside
 
 _SIZE = re.compile(rb"GDAL_STRUCTURAL_METADATA_SIZE=(\d{6}) bytes\n")
@@ -62,7 +62,7 @@ def check_seal(path: str | Path, files: Iterable[str]) -> None:
 
 def _checksums(path: str | Path) -> tuple[int, int] | None:
     """Return the CRC-32 in a file, and that of its bytes; None without one in it."""
-    with open(path, "rb") as stream:
+    with open_regular(path) as stream:
         beginning = stream.read(_BEGINNING)
         if not (seal := _SEAL.search(beginning)):
             return None

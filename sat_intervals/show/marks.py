@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 
 from sat_intervals.config.sealing import ROOM, is_as_made, sealed
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster import examined, whole_file
 
 XML_MARK = f"made by sat-intervals, {ROOM}"
@@ -58,7 +58,7 @@ def is_replaceable(path: Path) -> bool:
     if not path.is_file() or path.is_symlink():
         return True
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             content = stream.read(_BEGINNING)
             if not any(mark in content for mark in _MARKS):  # the file may be of any size
                 return False
