@@ -1,8 +1,6 @@
 """A run.json that was edited by hand, and files that appear beside a run: one line that names them."""
 
 import json
-import os
-import signal
 
 import pytest
 from finished import random_bands, write_run
@@ -81,20 +79,6 @@ def test_commands__end_where_a_file_with_another_place_appears_beside_the_run(tm
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert "validity.tif.aux.xml changes what is read from" in done.stderr
     assert not [*out.glob("*.qgz"), *out.glob("stac*"), *tmp_path.glob("to/*.tif")]
-
-
-@pytest.mark.parametrize("name", ["intervals.tif", "validity.tif"])
-@pytest.mark.parametrize(("make", "kind"), [(os.mkfifo, " is a named pipe"), (os.mkdir, ": is a folder")])
-def test_open_run__never_waits_for_a_pipe_in_the_place_of_a_raster(tmp_path, name, make, kind):
-    out = write_run(tmp_path, *random_bands(40, 50))
-    (out / name).unlink()
-    make(out / name)
-    signal.alarm(60)  # ends this process if it waits
-    for command in ("status", "stac", "report"):
-        done = invoke(command, out)
-        assert done.exit_code == 2
-        assert f"{name}{kind}: move it away and match again with --overwrite\n" in done.stderr
-    signal.alarm(0)
 
 
 def test_open_run__does_not_call_the_rasters_of_another_run_damaged(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import shutil
+import signal
 from contextlib import suppress
 from functools import reduce
 from operator import getitem
@@ -747,6 +748,20 @@ def test_open_run__refuses_a_report_with_another_number(scene, tmp_path, place):
     section[last] -= 1
     file.write_text(json.dumps(report))
     open_run(tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["intervals.tif", "validity.tif"])
+@pytest.mark.parametrize(("make", "kind"), [(os.mkfifo, " is a named pipe"), (os.mkdir, ": is a folder")])
+def test_open_run__never_waits_for_a_pipe_in_the_place_of_a_raster(scene, tmp_path, name, make, kind):
+    out = shutil.copytree(scene / "kept", tmp_path / "out")
+    (out / name).unlink()
+    make(out / name)
+    signal.alarm(60)  # ends this process if it waits
+    for command in ("status", "stac", "report"):
+        done = invoke(command, out)
+        assert done.exit_code == 2
+        assert f"{name}{kind}: move it away and match again with --overwrite\n" in done.stderr
+    signal.alarm(0)
 
 
 def test_open_run__of_a_report_without_sizes_opens(scene, tmp_path):
