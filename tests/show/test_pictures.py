@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
+import sat_intervals
 from sat_intervals import match_pair
 from sat_intervals.cli.console import Console
 from sat_intervals.config.sealing import ROOM
@@ -125,6 +126,7 @@ def test_plot__says_in_one_line_what_is_wrong(tmp_path, arguments, message):
 
 def test_plot__without_matplotlib_says_what_to_install(tmp_path, monkeypatch):
     out = write_run(tmp_path, *random_bands(40, 50)[:2])
+    monkeypatch.setattr(sat_intervals, "show", sat_intervals.show)  # restored, as its modules are
     for name in [name for name in sys.modules if name.startswith("sat_intervals.show")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
