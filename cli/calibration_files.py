@@ -35,12 +35,11 @@ def write(output: Path, head: str, content: dict[str, Any]) -> None:
     import yaml
 
     from sat_intervals.config.sealing import ROOM, sealed
-    from sat_intervals.raster import examined, whole_file
+    from sat_intervals.raster import examined, write_file
 
     kind, explanation = head.split("\n", 1)
     seal = f"# {ROOM} of this file: delete this line if you edit others."
     text = f"{kind}\n{seal}\n{explanation}{yaml.safe_dump(content, sort_keys=False, width=120)}"
     with examined(output.parent, [output.name]) as there:
         checked_folder(output, head)  # again, after hours
-    with whole_file(output, there) as new:
-        new.write_bytes(sealed(text.encode()))
+    write_file(output, sealed(text.encode()), there)

@@ -27,7 +27,7 @@ from sat_intervals.kernels.cost import between, census
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import INVALID
-from sat_intervals.raster import OutputWriter, hidden, north_up, publishing, whole_file, write_layer
+from sat_intervals.raster import OutputWriter, hidden, north_up, publishing, write_file, write_layer
 from sat_intervals.tiling import Window
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
@@ -111,12 +111,12 @@ def flip_bit(path):
 
 
 def late_file(file: Path) -> Callable[..., Any]:
-    """Return a `whole_file` before which a user puts ``file`` at the place of a file that is about to be written."""
+    """Return a `write_file` before which a user puts ``file`` at the place of a file that is about to be written."""
 
     def late(path: Path, *arguments: Any) -> Any:
         if path == file:
             file.write_text("mine")
-        return whole_file(path, *arguments)
+        return write_file(path, *arguments)
 
     return late
 

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from sat_intervals.raster import (
     read_place,
     read_shape,
     read_tags,
-    whole_file,
+    write_file,
 )
 from sat_intervals.raster.published import check_points
 from sat_intervals.results import Run, open_run
@@ -74,9 +75,9 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
         _check_own(file)
     with run.unchanged("points.tif", "dsm.tif", "overview.png"):
         item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
-    with run.unchanged(), whole_file(file, there) as new:
-        new.write_bytes(sealed((json.dumps(item, indent=1, allow_nan=False) + "\n").encode()))
-        _check_own(file)  # again: a file may have appeared meanwhile
+    content = sealed((json.dumps(item, indent=1, allow_nan=False) + "\n").encode())
+    with run.unchanged():
+        write_file(file, content, there, partial(_check_own, file))  # again: a file may have appeared meanwhile
     return file
 
 

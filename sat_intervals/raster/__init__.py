@@ -25,7 +25,7 @@ from sat_intervals.raster.layers import (
     read_layers,
     read_shape,
     read_tags,
-    whole_file,
+    write_file,
     write_layer,
     write_once,
 )
@@ -113,7 +113,7 @@ __all__ = [
     "utm_of",
     "watched_images",
     "watched_rasters",
-    "whole_file",
+    "write_file",
     "write_layer",
     "write_once",
 ]

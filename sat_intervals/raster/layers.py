@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -39,6 +39,7 @@ from sat_intervals.tiling import Window, strips
 _STRIP = 1 << 22
 SUM_WRAPS = 1 << 64
 """Sums of bits are modulo 2^64."""
+_DIFFERS = "the content read back differs from that written"
 # Name of a file kept aside: the report's stamp and the file's name.
 _ASIDE = ".sat-intervals.{}.{}"
 
@@ -84,6 +85,31 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
             check_opened(path.parent, parent, path.parent)
             _put(new, parent / path.name, before)
         check_opened(path.parent, parent, path.parent)
+
+
+def write_file(
+    path: Path, content: bytes, before: Mapping[str, str] | None = None, check: Callable[[], None] = lambda: None
+) -> str:
+    """Write a small file as `whole_file` does and read it back; ``check`` is called before it gets its name.
+
+    Returns
+    -------
+    Its stamp, see `stamps`.
+
+    Raises
+    ------
+    OutputError
+        See `whole_file`; or the content read back differs.
+    """
+    with whole_file(path, before) as new:
+        new.write_bytes(content)
+        check_own(new)
+        with new.open("rb") as file:
+            os.fsync(file.fileno())  # takes long: the content may change meanwhile
+        check()
+        if new.read_bytes() != content:
+            raise OSError(errno.EIO, _DIFFERS)
+        return stamps(new.parent, [new.name])[new.name]
 
 
 @contextmanager
@@ -182,7 +208,7 @@ def _write(
             for window in strips(height, width, _STRIP):
                 difference -= sum_of_bits(dataset.read(window=RasterioWindow(0, window.row, width, window.height)))
         if difference % SUM_WRAPS:
-            raise OSError(errno.EIO, "the content read back differs from that written")
+            raise OSError(errno.EIO, _DIFFERS)
         if MARK.items() <= tags.items():  # again: files may have appeared meanwhile
             check_marked(Path(path))
             check_place(Path(path), has_transform=georeferencing.transform is not None)

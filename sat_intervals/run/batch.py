@@ -23,9 +23,8 @@ from sat_intervals.raster import (
     examined,
     open_image,
     other_files,
-    stamps,
     watched_rasters,
-    whole_file,
+    write_file,
 )
 from sat_intervals.raster.identity import check_not_replaced, identifiers
 from sat_intervals.run.assemble import remove_tiles
@@ -152,12 +151,10 @@ class _Report:
         self.states.update(states)
         text = json.dumps(self.states, indent=1) + "\n"
         try:
-            with whole_file(self._file, self._there) as new:
-                new.write_text(text)
-                there = {REPORT: stamps(new.parent, [new.name])[new.name]}
+            stamp = write_file(self._file, text.encode(), self._there)
         except OutputError as error:
             raise RunError(f"{error}, and rerun the batch: it resumes") from error
-        self._there = there
+        self._there = {REPORT: stamp}
 
 
 def _check_not_replaced(

@@ -22,17 +22,19 @@ def check_output(out: Path, overwrite: bool, *, has_transform: bool = True) -> N
     """Create the folder of a run, or raise if it cannot be used; see `check_place`."""
     if os.path.lexists(out) and not out.is_dir():
         raise SatIntervalsError(f"{out} is not a folder: choose another")
+    home = out / "tiles"
     try:
+        if home.is_symlink():
+            raise SatIntervalsError(f"{home} is a symbolic link: move it away, and give its folder with --store")
+        if home.exists() and not home.is_dir():
+            raise SatIntervalsError(f"{home} is not a folder: move it away")
         there = [name for name in OUTPUTS if (out / name).exists()]
         # run.json is renamed last: tiles without it are from a run that was killed before
-        home = out / "tiles"
         is_unfinished = is_replacing(home) or finished_run(home) is not None
         is_under_way = is_unfinished or ("run.json" not in there and has_begun(home))
         if there and not overwrite and not is_under_way:
             check_replaceable(out)
             raise holds_run(out, there)
-        if home.is_symlink():
-            raise SatIntervalsError(f"{home} is a symbolic link: give the folder of the tiles with --store")
         for file in RUN_FILES:
             check_place(out / file.name, has_transform=has_transform)
         out.mkdir(parents=True, exist_ok=True)

@@ -4,12 +4,13 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 
 from sat_intervals.config.sealing import ROOM, is_as_made, sealed
 from sat_intervals.errors import SatIntervalsError, open_regular
-from sat_intervals.raster import examined, whole_file
+from sat_intervals.raster import examined, write_file
 
 XML_MARK = f"made by sat-intervals, {ROOM}"
 """Text of the comment in styles; QGIS removes it when it writes the file again."""
@@ -94,7 +95,7 @@ def replaceable_here(folder: Path, names: Iterable[str]) -> dict[str, str]:
 def write_made_here(files: Mapping[Path, bytes], there: Mapping[str, str]) -> None:
     """Write files of one folder, `sealed` but for archives; those that are not ours, or not in ``there``, are kept.
 
-    If there is such a file before the first is written, none is. ``there`` is that of `whole_file`.
+    If there is such a file before the first is written, none is. ``there`` is that of `write_file`.
 
     Raises
     ------
@@ -103,6 +104,5 @@ def write_made_here(files: Mapping[Path, bytes], there: Mapping[str, str]) -> No
     """
     check_made_here(files)
     for path, content in files.items():
-        with whole_file(path, there) as new:
-            new.write_bytes(content if content.startswith(_ARCHIVE) else sealed(content))
-            check_made_here([path])  # again: a file may have appeared meanwhile
+        content = content if content.startswith(_ARCHIVE) else sealed(content)
+        write_file(path, content, there, partial(check_made_here, [path]))  # again: a file may have appeared meanwhile

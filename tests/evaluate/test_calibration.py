@@ -325,6 +325,6 @@ def test_load_height_calibration__refuses_what_was_cut_or_changed(tmp_path):
 def test_calibrate_dsm_command__keeps_a_file_that_appears_after_its_last_check(tmp_path, monkeypatch):
     model, reference = scene(tmp_path)
     output = tmp_path / "heights.yaml"
-    monkeypatch.setattr("sat_intervals.raster.whole_file", late_file(output))
+    monkeypatch.setattr("sat_intervals.raster.write_file", late_file(output))
     done = invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
     assert (done.exit_code, output.read_text()) == (2, "mine")

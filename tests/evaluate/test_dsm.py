@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
-from sat_intervals import SatIntervalsError, raster
+from sat_intervals import SatIntervalsError
 from sat_intervals.errors import RunError
 from sat_intervals.evaluate import dsm
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.match.histogram import Histogram
-from sat_intervals.show import marks
+from sat_intervals.raster import layers
 
 
 def test_evaluate_surface__worked_example(tmp_path):
@@ -279,7 +279,7 @@ def test_evaluate_command__keeps_a_file_that_appears_after_its_check(tmp_path, m
     truth = relief(row, column)
     model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
     reference = write_raster(tmp_path / "reference.tif", [truth])
-    monkeypatch.setattr("sat_intervals.show.marks.whole_file", late_file(tmp_path / name))
+    monkeypatch.setattr("sat_intervals.show.marks.write_file", late_file(tmp_path / name))
     done = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register", "--pictures", tmp_path)
     assert (done.exit_code, (tmp_path / name).read_text()) == (2, "mine")
     assert f"{name} exists and was not made by sat-intervals" in done.stderr
@@ -350,9 +350,8 @@ def test_evaluate_command__pictures_are_not_mixed_with_those_of_another_folder(t
             if is_one:
                 exchanged(tmp_path / "own", tmp_path / "other")
 
-    whole_file = raster.whole_file
-    monkeypatch.setattr(raster, "whole_file", there_for_one)
-    monkeypatch.setattr(marks, "whole_file", there_for_one)
+    whole_file = layers.whole_file
+    monkeypatch.setattr(layers, "whole_file", there_for_one)
     done = invoke(*words, "--pictures", tmp_path / "own")
     assert (done.exit_code in (1, 2), done.stderr.count("\n")) == (True, 1), done.output
     assert mine.items() <= contents(tmp_path / "other").items()

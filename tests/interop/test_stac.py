@@ -185,7 +185,7 @@ def test_write_item__ends_where_a_surface_is_replaced_meanwhile(made, tmp_path, 
     assert re.search(r"dsm.tif was replaced or changed while it was read: rerun the command", done.stderr)
 
 
-@pytest.mark.parametrize("moment", ["whole_file", "_check_own"])
+@pytest.mark.parametrize("moment", ["write_file", "_check_own"])
 def test_stac__ends_where_another_run_takes_the_folders_name_while_it_writes(tmp_path, monkeypatch, moment):
     for name in "ab":
         (tmp_path / name).mkdir()

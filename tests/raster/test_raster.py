@@ -50,10 +50,11 @@ from sat_intervals.raster import (
     read_window,
     stamps,
     surface_file,
-    whole_file,
+    write_file,
     write_layer,
 )
 from sat_intervals.raster.identity import local_file
+from sat_intervals.raster.layers import whole_file
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.tiling import View, Window
 
@@ -963,6 +964,22 @@ def test_whole_file__names_the_file_that_cannot_be_written(tmp_path):
             new.write_text("a")
 
 
+def test_write_file__gives_no_name_to_a_file_that_was_damaged_since_it_was_written(tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def zeroed(descriptor):
+        fsync(descriptor)
+        Path(os.readlink(f"/proc/self/fd/{descriptor}")).write_bytes(bytes(7))
+
+    monkeypatch.setattr(os, "fsync", zeroed)
+    with pytest.raises(OutputError, match=r"page\.html cannot be written: the content read back differs"):
+        write_file(tmp_path / "page.html", b"content")
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    assert write_file(tmp_path / "page.html", b"content") == stamps(tmp_path, ["page.html"])["page.html"]
+    assert (tmp_path / "page.html").read_bytes() == b"content"
+
+
 @pytest.mark.parametrize("was_there", [False, True])
 def test_whole_file__keeps_a_file_that_appears_meanwhile(tmp_path, was_there):
     path = tmp_path / "new.yaml"
@@ -1077,7 +1094,7 @@ def test_whole_file__keeps_two_files_that_appear_one_after_the_other(tmp_path, m
 def test_whole_file__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
     path, foreign = tmp_path / "a[1].txt", tmp_path / ".a[1].txt-mine"
     foreign.write_text("mine")
-    code = "import os, sys\nfrom sat_intervals.raster import whole_file\n"
+    code = "import os, sys\nfrom sat_intervals.raster.layers import whole_file\n"
     code += "with whole_file(sys.argv[1]) as new:\n    new.write_text('half')\n    os._exit(9)"
     assert subprocess.run([sys.executable, "-c", code, path]).returncode == 9
     assert len(list(tmp_path.iterdir())) == 2

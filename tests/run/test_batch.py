@@ -82,14 +82,14 @@ def test_match_batch__keeps_the_counts_of_a_pair_whose_last_step_fails(images, t
 
 
 def test_match_batch__that_cannot_write_its_report_can_be_run_again(images, tmp_path, monkeypatch):
-    write_text, full = Path.write_text, [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))]
+    write_bytes, full = Path.write_bytes, [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))]
 
-    def fails_once(path, *arguments, **options):
+    def fails_once(path, content):
         if ".batch.json-" in str(path.resolve()) and full:
             raise full.pop()
-        return write_text(path, *arguments, **options)
+        return write_bytes(path, content)
 
-    monkeypatch.setattr(Path, "write_text", fails_once)
+    monkeypatch.setattr(Path, "write_bytes", fails_once)
     pairs = read_batch(rows(images))[:1]
     with pytest.raises(RunError, match=r"batch.json cannot be written: No space left .*, and rerun the batch: it resu"):
         match_batch(pairs, tmp_path)

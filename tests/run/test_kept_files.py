@@ -451,7 +451,7 @@ def test_match_pair__is_complete_where_its_tiles_cannot_be_removed(small_pair, m
     assert (folder / "away" / "manifest.json").exists()
 
 
-def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(small_pair):
+def test_match__refuses_tiles_that_are_a_link_or_file_and_takes_an_out_that_is_a_link(small_pair):
     folder, settings = small_pair
     (folder / "precious" / "records").mkdir(parents=True)
     (folder / "precious" / "records" / "0_0.json").write_text("mine")
@@ -463,6 +463,11 @@ def test_match__refuses_tiles_that_are_a_link_and_takes_an_out_that_is_one(small
     with pytest.raises(SatIntervalsError, match="tiles is a symbolic link"):
         match_pair(*images, folder / "out", settings, overwrite=True)
     assert contents(folder) == before
+    (folder / "real" / "tiles").unlink()
+    (folder / "real" / "tiles").write_text("mine")
+    with pytest.raises(SatIntervalsError, match="tiles is not a folder: move it away"):
+        match_pair(*images, folder / "out", settings, overwrite=True)
+    assert (folder / "real" / "tiles").read_text() == "mine"
     (folder / "real" / "tiles").unlink()
     match_pair(*images, folder / "out", settings)
     assert (folder / "real" / "run.json").exists()
@@ -765,9 +770,8 @@ def test_report_and_plot__replace_a_whole_file_and_no_link(finished, tmp_path, m
     assert precious.read_text() == "mine"
     assert not (finished / name).is_symlink()
     before = contents(finished)
-    text, picture = Path.write_text, Path.write_bytes
-    monkeypatch.setattr(Path, "write_text", lambda path, page, **options: text(path, page[:100], **options) and fail())
-    monkeypatch.setattr(Path, "write_bytes", lambda path, content: picture(path, content[:100]) and fail())
+    write_bytes = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", lambda path, content: write_bytes(path, content[:100]) and fail())
     with pytest.raises(SatIntervalsError, match=rf"{name} cannot be written: Input/output error"):
         write()
     monkeypatch.undo()

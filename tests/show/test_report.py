@@ -20,7 +20,7 @@ from selenium.webdriver.support.wait import WebDriverWait
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
-from sat_intervals.raster import read_layers, whole_file
+from sat_intervals.raster import read_layers, write_file
 from sat_intervals.results import open_results
 from sat_intervals.show.legend import classify
 from sat_intervals.show.report import contents, write_report
@@ -99,9 +99,9 @@ def test_write_report__ends_where_another_run_comes_before_the_page_is_written(t
     def late(path, *arguments):
         shutil.copy(path.parent / "run.json", path.parent / "new")
         (path.parent / "new").replace(path.parent / "run.json")
-        return whole_file(path, *arguments)
+        return write_file(path, *arguments)
 
-    monkeypatch.setattr(report_page, "whole_file", late)
+    monkeypatch.setattr(report_page, "write_file", late)
     with pytest.raises(SatIntervalsError, match="was replaced while it was read: rerun the command"):
         write_report(results)
     assert not (results.out / "report.html").exists()

@@ -11,7 +11,7 @@ from typing import Any
 
 from sat_intervals.config.sealing import sealed
 from sat_intervals.evaluate.disparity import evaluate_run
-from sat_intervals.raster import watched_images, whole_file
+from sat_intervals.raster import watched_images, write_file
 from sat_intervals.results import Results
 from sat_intervals.show.legend import PIXEL_CLASSES
 from sat_intervals.show.marks import check_made_here, replaceable_here
@@ -37,10 +37,13 @@ def write_report(results: Results) -> Path:
     with results.unchanged():  # over all that is read from the run
         page = _page(_contents(results))
     check_images()
-    with results.unchanged(), whole_file(path, there) as new:
+
+    def check() -> None:
         with results.unchanged():  # another run may have come to the folder
-            new.write_bytes(sealed(page.encode()))
-        check_made_here([path])  # again: a file may have appeared meanwhile
+            check_made_here([path])  # again: a file may have appeared meanwhile
+
+    with results.unchanged():
+        write_file(path, sealed(page.encode()), there, check)
     return path
 
 
