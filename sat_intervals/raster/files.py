@@ -12,7 +12,7 @@ from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SURFAC
 class File:
     """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression.
 
-    One that ``is_sealed`` has its CRC-32 in it, see `seal`; those of the others are in reports.
+    One that ``is_sealed`` has its CRC-32 in it, see `seal`; those of a run's files are also in its report.
     """
 
     name: str
@@ -46,8 +46,8 @@ _FLAG_TAGS = {
 }
 _VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity & {INVALID}) == 0")
 
-INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS)
-VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
+INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS, is_sealed=True)
+VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS, is_sealed=True)
 RUN_FILES = (INTERVALS, VALIDITY)
 POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT", is_sealed=True),)
 

@@ -71,7 +71,7 @@ def whole_file(path: str | os.PathLike[str], before: Mapping[str, str] | None = 
     with _named(path), pinned(path.parent.resolve()) as parent:  # nothing is done in a folder that takes its place
         before = stamps(parent, [path.name]) if before is None else before
         if path.is_dir() and not path.is_symlink():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+            raise OutputError(f"{path} is a folder: move it away")
         scratch = LocalFolder(parent).scratch(path.name, "[0-9a-f]{32}.*")
         with scratch as folder, pinned(folder) as own:
             new = own / f"{uuid.uuid4().hex}{path.suffix}"  # nobody can put a link there before

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
-from sat_intervals.raster import RUN_FILES, examined, is_marked, restore, stamps
+from sat_intervals.raster import RUN_FILES, examined, restore, stamps
 from sat_intervals.raster.beside import check_place
 from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.seal import is_as_made
 from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.store.marks import finished_run, is_replacing
 from sat_intervals.store.removal import has_begun
@@ -64,21 +65,22 @@ def check_replaceable(out: Path) -> None:
         A file with the name of a run's file was not made by a run, or was changed since.
     """
     published = _published(out / "run.json")
-    if published and is_replacing(out / "tiles"):  # a killed run has perhaps replaced some of the files
-        published = {}
+    is_mixed = is_replacing(out / "tiles")  # a killed run has perhaps replaced some of the files
     for file in (out / name for name in OUTPUTS):
         check_regular(file, "move it away or choose another folder")
-        if file.exists() and not _is_of_run(file, published):
+        if file.exists() and not _is_of_run(file, published, is_mixed=is_mixed):
             raise SatIntervalsError(
                 f"{file} exists and was not made by sat-intervals, or was changed since: move it away or choose "
                 "another folder"
             )
 
 
-def _is_of_run(file: Path, published: dict[str, Any] | None) -> bool:
+def _is_of_run(file: Path, published: dict[str, Any] | None, *, is_mixed: bool) -> bool:
     if file.name == "run.json":
         return published is not None
-    return is_marked(file) and (not published or checksum_of(file) == published.get(file.name))
+    if published and checksum_of(file) == published.get(file.name):
+        return True
+    return (is_mixed or not published) and is_as_made(file)
 
 
 def _published(file: Path) -> dict[str, Any] | None:

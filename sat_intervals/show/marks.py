@@ -31,7 +31,7 @@ _ARCHIVE = b"PK"
 
 
 def check_made_here(paths: Iterable[Path]) -> None:
-    """Raise if one of the files exists and is not `is_replaceable`. Links are replaced, never followed: they pass.
+    """Raise if one of the files is a folder, or not `is_replaceable`. Links are replaced, never followed: they pass.
 
     Raises
     ------
@@ -39,6 +39,8 @@ def check_made_here(paths: Iterable[Path]) -> None:
         Names the first such file.
     """
     for path in paths:
+        if path.is_dir() and not path.is_symlink():
+            raise SatIntervalsError(f"{path} is a folder: move it away")
         if not is_replaceable(path):
             raise SatIntervalsError(
                 f"{path} exists and was not made by sat-intervals, was changed since, or is of a version without "

@@ -264,6 +264,10 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
         os.mkfifo(file)
         assert f"{file.name} is a named pipe" in invoke(*words, "--pictures", tmp_path).stderr
         file.unlink()
+        file.mkdir()
+        result = invoke(*words, "--pictures", tmp_path)
+        assert (result.stderr, result.stdout) == (f"sat-intervals: {file} is a folder: move it away\n", "")
+        file.rmdir()
         file.write_text(made)
     written[-1].unlink()
     os.mkfifo(written[-1])

@@ -959,8 +959,9 @@ def test_write_layer__leaves_no_damaged_file_on_a_full_disk(disk, size):
 
 def test_whole_file__names_the_file_that_cannot_be_written(tmp_path):
     """Not the temporary one."""
-    for path in (tmp_path / "missing" / "a.txt", tmp_path):
-        with pytest.raises(OutputError, match=rf"{path} cannot be written: .*: make room or"), whole_file(path) as new:
+    missing = tmp_path / "missing" / "a.txt"
+    for path, says in ((missing, "cannot be written: .*: make room or"), (tmp_path, "is a folder: move it away")):
+        with pytest.raises(OutputError, match=rf"{path} {says}"), whole_file(path) as new:
             new.write_text("a")
 
 

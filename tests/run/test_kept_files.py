@@ -65,11 +65,16 @@ from sat_intervals.show.report import write_report
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
+@pytest.mark.parametrize("has_report", [True, False])
 @pytest.mark.parametrize("name", ["intervals.tif", "run.json"])
-def test_match__overwrites_no_result_that_was_changed_since(small_pair, name):
+def test_match__overwrites_no_result_that_was_changed_since(small_pair, name, has_report):
     folder, settings = small_pair
     out = folder / "out"
     match_pair(folder / "left.tif", folder / "right.tif", out, settings)
+    if not has_report:
+        (out / "run.json").unlink()
+        match_pair(folder / "left.tif", folder / "right.tif", out, settings, overwrite=True)  # others are replaced
+        (out / "run.json").rename(folder / "kept.json") if name != "run.json" else None
     if name == "run.json":
         (out / name).write_text((out / name).read_text().replace('"valid"', '"valid "', 1))
     else:
