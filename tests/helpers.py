@@ -127,7 +127,7 @@ def refused(arguments, *parts):
     assert result.exit_code == 2, result.output
     assert result.stderr.count("\n") == 1
     for part in parts:
-        assert part in result.stderr
+        assert part in result.stderr, result.stderr
 
 
 def contents(folder):

@@ -28,7 +28,7 @@ Raster = tuple[File, Callable[[Bands], np.ndarray]]
 
 def _file(name: str, *bands: str, dtype: str = "float32", nodata: float | None = None, driver: str = "COG") -> File:
     described = tuple(Band(band, "", band) for band in bands)
-    return File(name, dtype, nodata, described, driver=driver, is_sealed=driver == "COG")
+    return File(name, dtype, nodata, described, driver=driver)
 
 
 def _two(horizontal: np.ndarray, *more: np.ndarray) -> np.ndarray:
@@ -120,8 +120,7 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
         with examined(folder, [file.name for file in files]) as there:
             for file in files:
                 check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
-                if file.is_sealed:
-                    check_as_made(folder / file.name)
+                check_as_made(folder / file.name)
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))

@@ -80,10 +80,8 @@ def assemble(
     shape: tuple[int, int],
     levels: Sequence[Sequence[Part]],
     copy_parts: CopyParts,
-    *,
-    is_sealed: bool = False,
 ) -> dict[str, int]:
-    """Write a file from the rows of blocks of each level, see `factors`; return its size and CRC-32.
+    """Write a file from the rows of blocks of each level, see `factors`; return its size and CRC-32, which is in it.
 
     Parameters
     ----------
@@ -97,17 +95,14 @@ def assemble(
         Rows of blocks of each level, from the top.
     copy_parts
         Writes them into the file.
-    is_sealed
-        Whether the file gets its CRC-32, see `seal`.
     """
     sizes = [[size for part in level for size in part.sizes] for level in levels]
-    head = header(made, shape, sizes, is_sealed=is_sealed)
+    head = header(made, shape, sizes)
     parts = [part for level in reversed(levels) for part in level]
     body = length = 0
     for part in parts:
         body, length = combined(body, part.checksum, part.length), length + part.length
-    if is_sealed:
-        head = sealed(head, combined(zlib.crc32(head), body, length))
+    head = sealed(head, combined(zlib.crc32(head), body, length))
     *offsets, size = accumulate((part.length for part in parts), initial=len(head))
     with open(path, "xb") as stream:
         stream.write(head)
@@ -120,7 +115,7 @@ def assemble(
     return {"bytes": size, "crc32": combined(zlib.crc32(head), body, length)}
 
 
-def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]], *, is_sealed: bool = False) -> bytes:
+def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) -> bytes:
     """Return all that comes before the first block of a file.
 
     Parameters
@@ -131,11 +126,9 @@ def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]], 
         Rows and columns.
     sizes
         Bytes of the blocks of each level, row by row.
-    is_sealed
-        Whether there is room for the CRC-32 of the file.
     """
     ghost, (whole, overview) = _parsed(made)
-    ghost = with_room(ghost) if is_sealed else ghost
+    ghost = with_room(ghost)
     directories = []
     for factor, of_level in zip(factors(*shape), sizes, strict=True):
         height, width = (-(-side // factor) for side in shape)

@@ -12,7 +12,7 @@ from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SURFAC
 class File:
     """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression.
 
-    One that ``is_sealed`` has its CRC-32 in it, see `seal`; those of a run's files are also in its report.
+    All have their CRC-32 in them, see `seal`; those of a run's files are also in its report.
     """
 
     name: str
@@ -23,7 +23,6 @@ class File:
     predictor: str = "NO"
     driver: str = "COG"
     compression: str = "deflate"
-    is_sealed: bool = False
 
     @property
     def kind(self) -> str:
@@ -46,10 +45,10 @@ _FLAG_TAGS = {
 }
 _VALIDITY = Band("validity", "", f"sum of bits; a pixel is valid where (validity & {INVALID}) == 0")
 
-INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS, is_sealed=True)
-VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS, is_sealed=True)
+INTERVALS = File("intervals.tif", "float32", float("nan"), BANDS)
+VALIDITY = File("validity.tif", "uint16", None, (_VALIDITY,), _FLAG_TAGS)
 RUN_FILES = (INTERVALS, VALIDITY)
-POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT", is_sealed=True),)
+POINT_FILES = (File("points.tif", "float64", float("nan"), POINTS, predictor="FLOATING_POINT"),)
 
 
 def run_files(compression: str) -> tuple[File, File]:
@@ -60,14 +59,14 @@ def run_files(compression: str) -> tuple[File, File]:
 
 def surface_file(name: str) -> File:
     """Return the properties of a surface model's file."""
-    return File(name, "float32", float("nan"), SURFACE, is_sealed=True)
+    return File(name, "float32", float("nan"), SURFACE)
 
 
 def truth_file(name: str) -> File:
     """Return the properties of a file of true disparities."""
-    return File(name, "float32", float("nan"), TRUTH, is_sealed=True)
+    return File(name, "float32", float("nan"), TRUTH)
 
 
 def ranges_file(name: str) -> File:
     """Return the properties of a file of local search ranges."""
-    return File(name, "int16", None, RANGES, is_sealed=True)
+    return File(name, "int16", None, RANGES)

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
+from sat_intervals.config import sealing
 from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.beside import check_beside
 
@@ -34,7 +35,10 @@ def sealed(head: bytes, checksum: int) -> bytes:
 
 
 def is_as_made(path: Path) -> bool:
-    """Return whether a local file has a CRC-32 in it, and its bytes agree."""
+    """Return whether a local GeoTIFF or picture has a CRC-32 in it, and its bytes agree."""
+    if path.suffix == ".png":
+        with open_regular(path) as stream:
+            return bool(sealing.is_as_made(stream.read()))
     written, there = _checksums(path) or (0, None)
     return written == there
 

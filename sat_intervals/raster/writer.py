@@ -16,6 +16,7 @@ from rasterio.io import DatasetWriter
 from rasterio.shutil import copy
 from rasterio.windows import Window as RasterioWindow
 
+from sat_intervals.config.sealing import ROOM, sealed
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import gdal
 from sat_intervals.raster.beside import check_place
@@ -148,7 +149,7 @@ class OutputWriter:
                 kind = {"count": len(file.bands), "dtype": file.dtype, "nodata": file.nodata}
                 path = self._new(file.name)
                 self._pictures[file.name] = gdal.create(str(path), height=height, width=width, **kind), 0
-                self._pictures[file.name][0].update_tags(**self._tags)
+                self._pictures[file.name][0].update_tags(**self._tags, COMMENT=ROOM)
                 file.describe(self._pictures[file.name][0])
             strips, before = self._pictures[file.name]
             strips.write(bands, window=RasterioWindow(0, row, self._shape[1], bands.shape[1]))
@@ -161,7 +162,7 @@ class OutputWriter:
         with self._failing(self._folder / name):
             made = template(file, self._georeferencing, self._tags)
             path = self._hidden.files / self._new(name).name
-            self._made[name] = assemble(path, made, self._shape, levels, copy_parts, is_sealed=file.is_sealed)
+            self._made[name] = assemble(path, made, self._shape, levels, copy_parts)
             os.replace(self._hidden.opened_files / path.name, self._hidden.opened_files / name)
 
     def _new(self, name: str) -> Path:
@@ -184,6 +185,7 @@ class OutputWriter:
                 strips.close()
                 place = self._new(name)
                 copy(strips.name, str(place), driver="PNG", **_PNG)
+                place.write_bytes(sealed(place.read_bytes()))
                 flush(place)
                 with gdal.reading(str(place)) as dataset:
                     if (sum_of_bits(dataset.read()) - expected) % SUM_WRAPS:

@@ -1016,6 +1016,20 @@ def test_export__replaces_only_its_own_files(finished, tmp_path, form, name):
         assert contents(target) == before
 
 
+def test_export__keeps_a_mask_of_s2p_that_was_changed_by_a_program_that_copies_its_tags(finished, tmp_path):
+    mask = tmp_path / "rectified_mask.png"
+    export(finished, "s2p", tmp_path)
+    with rasterio.open(mask) as file:
+        pixels, kind, tags = file.read(), {"driver": "PNG", "count": 1, "dtype": "uint8"}, file.tags()
+    kind |= {"height": pixels.shape[1], "width": pixels.shape[2], "WRITE_METADATA_AS_TEXT": "YES"}
+    with rasterio.open(mask, "w", **kind) as file:
+        file.update_tags(**tags)
+        file.write(1 - pixels)
+    before = contents(tmp_path)
+    refused(["export", finished, tmp_path, "--to", "s2p"], f"{mask} was changed since sat-intervals made it")
+    assert contents(tmp_path) == before
+
+
 @pytest.mark.parametrize("name", ["disparity.tif", "mask.tif"])
 def test_export__keeps_a_file_that_was_changed_in_its_place(finished, tmp_path, name):
     export(finished, "otb", tmp_path)
