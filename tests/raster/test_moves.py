@@ -145,13 +145,16 @@ folder = Path(sys.argv[1])
 _, before = moves(folder)
 descriptors = len(os.listdir("/proc/self/fd"))
 process = os.fork()
-if not process:
+if process:
+    # Asked in between, it would count both renamings.
+    _, status = os.waitpid(process, 0)
+    assert status == 0
+else:
     folder.rename(folder.with_name("aside")).rename(folder)
-moves(folder)
+_, after = moves(folder)
 assert len(os.listdir("/proc/self/fd")) == descriptors
 if process:
-    os.waitpid(process, 0)
-    print(moves(folder)[1] - before)
+    print(after - before)
 """
 
 
