@@ -14,8 +14,8 @@ import click
 
 from sat_intervals.cli.signals import Ended
 
-# Output files of commands, which must not be log files.
-_OF_RUNS = ("intervals.tif", "validity.tif", "run.json", "points.tif", "points.json", "dsm.tif", "batch.json")
+# Results end so: a log with such a name would be in the way of one.
+_OF_RESULTS = {".csv", ".html", ".json", ".las", ".laz", ".md", ".png", ".qgz", ".tif", ".vrt", ".yaml", ".yml"}
 
 _LOG = logging.getLogger(__name__)
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
@@ -118,7 +118,9 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
     names = [name for value in given for name in (value if isinstance(value, tuple) else (value,))]
     paths = [Path(name) for name in names if isinstance(name, (str, Path))]
     if log_file.is_file() or not log_file.exists():  # a pipe or terminal is none of these, and is not replaced
-        check_not_replaced([*paths, *(path / file for path in paths for file in _OF_RUNS)], [log_file])
+        check_not_replaced(paths, [log_file])
+        if (ending := log_file.suffix.lower()) in _OF_RESULTS:
+            raise SatIntervalsError(f"{log_file} ends with {ending}, as results do: choose another --log-file")
     try:
         file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1, opener=_at_once)  # noqa: SIM115
     except OSError as error:

@@ -230,10 +230,20 @@ def finished(tmp_path):
     return write_run(tmp_path, *random_bands(40, 50))
 
 
-@pytest.mark.parametrize("name", ["run.json", "intervals.tif"])
-def test_log_file__is_no_file_of_the_run(finished, name):
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("report", "run.json"),
+        ("report", "intervals.tif"),
+        ("report", "report.html"),
+        ("plot", "overview.png"),
+        ("project", "project.qgz"),
+        ("stac", "STAC.JSON"),
+    ],
+)
+def test_log_file__is_not_named_like_a_result(finished, command, name):
     before = contents(finished)
-    refused(["report", finished, "--log-file", finished / name], f"{name} is an input")
+    refused([command, finished, "--log-file", finished / name], f"{name} ends with {Path(name).suffix.lower()}")
     assert contents(finished) == before
 
 
