@@ -11,13 +11,13 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.grids import read_grid
-from sat_intervals.kernels.compiled import checked_cache
+from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.lattice import interpolate
 from sat_intervals.raster import GROUND, Georeferencing, watched_rasters
 from sat_intervals.tiling import Window
 
 try:
-    with checked_cache():
+    with kernels_of_others():
         from shareloc.geofunctions.rectification_grid import RectificationGrid
         from shareloc.geofunctions.triangulation import epipolar_triangulation
         from shareloc.geomodels import GeoModel

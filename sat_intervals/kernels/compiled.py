@@ -13,6 +13,7 @@ from functools import cache
 from io import BytesIO
 from pathlib import Path
 
+import numba
 from numba import config, njit
 from numba.core import caching
 from numba.core.caching import IndexDataCacheFile
@@ -78,8 +79,8 @@ def _is_intact(file: str) -> bool:
 
 
 @contextmanager
-def checked_cache() -> Iterator[None]:
-    """Let functions that are decorated in the block, also by other packages, keep their machine code in checked files.
+def _checked_cache() -> Iterator[None]:
+    """Let functions that are decorated in the block keep their machine code in checked files.
 
     numba reads the folder, and the class of the files, from its globals while it decorates. They are restored, because
     they apply to all packages. Nothing is changed without a writable folder.
@@ -97,12 +98,30 @@ def checked_cache() -> Iterator[None]:
             config.CACHE_DIR, caching.IndexDataCacheFile = before, IndexDataCacheFile
 
 
+@contextmanager
+def kernels_of_others() -> Iterator[None]:
+    """Let a package that is imported in the block keep machine code in checked files, and compute without ``fastmath``.
+
+    With ``fastmath``, results depend on the processor, and on whether this process has compiled the code or read it.
+    """
+
+    def exact(*signature, fastmath=False, **options):
+        return njit(*signature, **options)
+
+    with _checked_cache():
+        numba.njit = exact
+        try:
+            yield
+        finally:
+            numba.njit = njit
+
+
 def cached(kernel):
     """Compile a kernel that releases the GIL, and cache its machine code on disk.
 
     Without a writable folder, every process compiles the kernels again.
     """
-    with checked_cache():
+    with _checked_cache():
         return njit(nogil=True, cache=_folder() is not None)(kernel)
 
 

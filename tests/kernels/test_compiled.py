@@ -138,7 +138,7 @@ def test_cached__machine_code_of_another_signature_is_not_executed(tmp_path):
 
 
 @pytest.mark.process
-def test_checked_cache__damaged_kernels_of_the_sensor_models_are_compiled_again(tmp_path):
+def test_kernels_of_others__damaged_ones_of_the_sensor_models_are_compiled_again(tmp_path):
     pytest.importorskip("shareloc")
 
     def used():
@@ -155,6 +155,18 @@ def test_checked_cache__damaged_kernels_of_the_sensor_models_are_compiled_again(
         file.write_bytes(content)
     assert used() == ["0", place]
     assert used() == ["1", place]
+
+
+@pytest.mark.process
+def test_kernels_of_others__give_the_same_bytes_when_compiled_and_when_read(tmp_path):
+    pytest.importorskip("shareloc")
+    script = "import sat_intervals.heights.sensors\nimport numpy as np\nfrom shareloc.geomodels import rpc\n"
+    script += "places, factors = np.random.default_rng(0).uniform(-1, 1, (3, 1000)), np.linspace(-1, 1, 80)\n"
+    script += "columns, rows = rpc.compute_rational_function_polynomial(*places, *factors.reshape(4, 20), 1, 0, 1, 0)\n"
+    script += "print(rpc.polynomial_equation.stats.cache_hits.total(), (columns + rows).tobytes().hex())"
+    (compiled, before), (read, after) = (use_a_kernel(script, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
+    assert (compiled, read) == ("0", "1")
+    assert after == before
 
 
 @pytest.mark.process
