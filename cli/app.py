@@ -156,7 +156,11 @@ def _explained(error: Exception) -> tuple[int, str]:
     if isinstance(error, OSError) and error.errno == errno.ENOMEM:
         return FAILED, f"{_NO_MEMORY} ({error})"
     if isinstance(error, OSError) and error.strerror:
-        return FAILED, f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        # Commands check their paths before: it was there, or its folder.
+        moved = isinstance(error, (FileNotFoundError, NotADirectoryError))
+        way_out = ": was it, or a folder above it, moved away meanwhile? Put it back, or run the command again"
+        reason = error.strerror + way_out * moved
+        return FAILED, f"{error.filename}: {reason}" if error.filename else reason
     if isinstance(error, MemoryError):
         return FAILED, f"{_NO_MEMORY} ({error})"
     line = " ".join(str(error).split())

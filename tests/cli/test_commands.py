@@ -337,6 +337,8 @@ def test_match__shows_a_traceback_only_when_asked(folder, tmp_path):
     [
         (OSError(28, "No space left on device", "/there/file"), 1, "/there/file: No space left on device"),
         (OSError(28, "No space left on device"), 1, "sat-intervals: No space left on device"),
+        (OSError(2, "No such file or directory", "/file"), 1, "/file: No such file or directory: was it, or a folder"),
+        (OSError(20, "Not a directory", "/file"), 1, "Put it back, or run the command again"),
         (MemoryError("9 GB"), 1, "not enough memory: choose a smaller --tile-size or fewer --workers (9 GB)"),
         (RuntimeError("can't start new thread"), 1, "no more threads can be started: not enough memory: choose"),
         (RuntimeError("cannot cache function 'f': no locator"), 1, "no locator: set NUMBA_CACHE_DIR to a folder that"),
