@@ -106,11 +106,13 @@ def _check(
 ) -> None:
     """Raise if a profile or a pixel is outside the results, or these cannot be compared with other runs."""
     from sat_intervals.errors import SatIntervalsError
+    from sat_intervals.show.coverage import check_one_pair
 
     if beside and not _is_judged(results):
         raise SatIntervalsError(
             f"--beside compares coverages, but {results.out} has no truth or no intervals: give --truth"
         )
+    check_one_pair([results.out, *beside])
     if columns is not None and row is None:
         raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
     if row is not None:

@@ -6,11 +6,23 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
+from sat_intervals.results import open_run
 from sat_intervals.show.canvas import DPI, INK, Target, page, plain_logarithm
 from sat_intervals.show.legend import BLUE, ORANGE
 
 _CLASSES = (("all", "valid pixels", "black"), ("high", "high confidence", BLUE), ("low", "low confidence", ORANGE))
+
+
+def check_one_pair(runs: Sequence[Path]) -> None:
+    """Raise if runs have read other images than the first one, or are no runs; copies of images are the same."""
+    images = []
+    for run in runs:
+        inputs = open_run(run).report["inputs"]
+        images.append([inputs[side].get(key) for side in ("left", "right") for key in ("bytes", "sha256", "etag")])
+        if images[-1] != images[0]:
+            raise SatIntervalsError(f"{run} is a run of other images than {runs[0]}: give runs of one pair")
 
 
 def draw_coverage(runs: Sequence[Path], target: Target, dpi: int = DPI, **judging: Any) -> None:

@@ -59,6 +59,14 @@ def test_evaluate_report_plot__show_the_coverage_asked_for(run, pair, tmp_path):
     assert str(run / "coverage.png") in drawn.output.split()
 
 
+def test_plot__beside_takes_runs_of_the_same_pair(run, pair, tmp_path):
+    other = tmp_path / "other"
+    assert invoke("match", pair / "right.tif", pair / "left.tif", other, "--disparity", -4, 4).exit_code == 0
+    drawn = invoke("plot", run, "--beside", other)
+    assert drawn.exit_code == 2
+    assert f"{other} is a run of other images than {run}: give runs of one pair" in drawn.stderr
+
+
 def test_plan_and_batch__take_a_coverage(pair, tmp_path):
     options = ["--config", pair / "settings.yaml", "--coverage", 0.9, "--calibration", pair / "own.yaml"]
     planned = invoke("plan", pair / "left.tif", pair / "right.tif", *options)

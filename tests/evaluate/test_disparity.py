@@ -296,6 +296,21 @@ def test_evaluate_run__says_what_is_missing(run, pair, tmp_path):
         evaluate_run(tmp_path / "off")
 
 
+def test_evaluate_run__takes_no_truth_beside_another_image(run, pair, tmp_path):
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for name in ("left.tif", "right.tif", "truth.tif"):
+        shutil.copy(pair / name, moved)
+    match_pair(moved / "left.tif", moved / "right.tif", tmp_path / "out", settings_of(pair))
+    expected = evaluate_run(tmp_path / "out")
+    shutil.copy(pair / "left.tif", moved)  # at another time
+    assert evaluate_run(tmp_path / "out") == expected
+    shutil.copy(pair / "right.tif", moved / "left.tif")
+    with pytest.raises(SatIntervalsError, match=r"truth.tif is beside .*left.tif, which has changed .* give --truth"):
+        evaluate_run(tmp_path / "out")
+    assert evaluate_run(tmp_path / "out", moved / "truth.tif") == expected
+
+
 # ---- Tables and pairs --------------------------------------------------------------------------------------
 def report_of(accuracy):
     area = {"accuracy": accuracy, "relative_size": 0.1, "relative_overestimation": None}
