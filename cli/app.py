@@ -42,6 +42,16 @@ _ITEM = "\n  "
 # Exit status of a process ended by SIGPIPE.
 READER_GONE = 141
 _NO_MEMORY = "not enough memory: choose a smaller --tile-size or fewer --workers"
+# Of errors that nobody foresaw: commands check their paths before they use them.
+_GONE = ": was it, or a folder above it, moved away meanwhile? Put it back, or run the command again"
+_WAYS_OUT = {
+    errno.ENOENT: _GONE,
+    errno.ENOTDIR: _GONE,
+    errno.EISDIR: ": move it away",
+    errno.EACCES: ": check its rights",
+    errno.EPERM: ": check its rights",
+    errno.ENAMETOOLONG: ": choose a shorter name",
+}
 _NOWHERE = "the working directory was deleted: change to another folder"
 RESUMED = ("match", "demo", "batch", "surface")
 STEPS: dict[str, tuple[click.Command, ...]] = {
@@ -156,10 +166,7 @@ def _explained(error: Exception) -> tuple[int, str]:
     if isinstance(error, OSError) and error.errno == errno.ENOMEM:
         return FAILED, f"{_NO_MEMORY} ({error})"
     if isinstance(error, OSError) and error.strerror:
-        # Commands check their paths before: it was there, or its folder.
-        moved = isinstance(error, (FileNotFoundError, NotADirectoryError))
-        way_out = ": was it, or a folder above it, moved away meanwhile? Put it back, or run the command again"
-        reason = error.strerror + way_out * moved
+        reason = error.strerror + _WAYS_OUT.get(error.errno or 0, "")
         return FAILED, f"{error.filename}: {reason}" if error.filename else reason
     if isinstance(error, MemoryError):
         return FAILED, f"{_NO_MEMORY} ({error})"

@@ -1,5 +1,6 @@
 """Options shared by commands, and checks of file names."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
@@ -19,6 +20,9 @@ PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homoge
 PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
 
 Command = Callable[..., Any]
+
+# What rasterio takes for an address, even if there is a folder with this name.
+_ADDRESS = re.compile(r"(file|https?|ftp|s3|gs|az|oss|zip|tar|gzip)(\+\w+)*:", re.IGNORECASE)
 
 
 class _Name(click.ParamType):  # type: ignore[type-arg,unused-ignore]
@@ -45,7 +49,9 @@ class _File(_Name):
     """The path of a file or folder."""
 
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
-        return Path(super().convert(value, parameter, context))
+        if _ADDRESS.match(str(name := super().convert(value, parameter, context))):
+            self.fail(f"{name} is read as an address: give the path of a file or folder here", parameter, context)
+        return Path(name)
 
 
 NAME, FILE = _Name(), _File()

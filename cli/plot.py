@@ -123,9 +123,9 @@ def _check(
 
 def _is_current(surface: Path, finished: str) -> bool:
     """Return whether there is a surface model of the run; say so if it belongs to another one."""
-    from sat_intervals.raster import read_tags
+    from sat_intervals.raster.published import is_surface_of
 
-    if not surface.exists() or finished in read_tags(surface).get("RUNS", ""):
+    if not surface.exists() or is_surface_of(surface, finished):
         return surface.exists()
-    click.echo(f"{surface} belongs to an earlier run and is not drawn: rerun sat-intervals dsm", err=True)
+    click.echo(f"{surface} is of another run or of earlier points and is not drawn: rerun sat-intervals dsm", err=True)
     return False

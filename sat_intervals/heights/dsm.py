@@ -32,6 +32,7 @@ from sat_intervals.raster import (
     utm_of,
     watched_rasters,
 )
+from sat_intervals.raster.seal import seal_of
 from sat_intervals.results import Run
 from sat_intervals.tiling import Window
 
@@ -100,7 +101,7 @@ def make_surface(
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
-    tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
+    tags |= _tag_of_points(runs) | {"HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}"}
     projection = _projection(runs, crs, geoid)
     clouds = _clouds(runs, projection, choices, progress)
     cells = _cells(clouds, resolution, radius, grid)
@@ -124,6 +125,12 @@ def make_surface(
         "calibration": choices.calibration and choices.calibration.name,
         "without_intervals": [str(run.out) for run in runs if run.config.interval is None],
     }
+
+
+def _tag_of_points(runs: Sequence[Run]) -> dict[str, str]:
+    """Return the tag by which `is_surface_of` recognises the points; those of earlier versions have no CRC-32."""
+    seals = [seal_of(run.out / "points.tif") for run in runs]
+    return {"POINTS": " ".join(filter(None, seals))} if any(seals) else {}
 
 
 def _counts(cells: Cells, clouds: Sequence[PointCloud]) -> dict[str, int]:

@@ -24,10 +24,9 @@ from sat_intervals.raster import (
     read_layers,
     read_place,
     read_shape,
-    read_tags,
     write_file,
 )
-from sat_intervals.raster.published import check_points
+from sat_intervals.raster.published import check_points, is_points_of, is_surface_of
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
 
@@ -165,10 +164,10 @@ def _assets(run: Run, place: Georeferencing) -> Iterator[tuple[str, dict[str, An
     yield "validity", _raster(run.out / "validity.tif", "Validity flags", (_VALIDITY,), place)
     finished = run.report["finished"]
     points, surface, picture = (run.out / name for name in ("points.tif", "dsm.tif", "overview.png"))
-    if _is_taken(points, _has_tag(points, "RUN", finished), "triangulate"):
+    if _is_taken(points, points.exists() and is_points_of(points, finished), "triangulate"):
         check_points(run.out)
         yield "points", _raster(points, "Longitude, latitude and height of every pixel", POINTS, place)
-    if _is_taken(surface, _has_tag(surface, "RUNS", finished), "dsm"):
+    if _is_taken(surface, surface.exists() and is_surface_of(surface, finished), "dsm"):
         yield "dsm", _raster(surface, "Surface model with intervals", SURFACE, read_place(surface)[1])
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
     yield "report", report | _file(run.out / "run.json")
@@ -179,12 +178,8 @@ def _assets(run: Run, place: Georeferencing) -> Iterator[tuple[str, dict[str, An
 def _is_taken(file: Path, is_of_run: bool, command: str) -> bool:
     """Return whether a file becomes an asset, and say so if it is left out."""
     if file.exists() and not is_of_run:
-        _LOG.warning("%s is not of this run and is left out: rerun sat-intervals %s", file, command)
+        _LOG.warning("%s is not of this run as it is now and is left out: rerun sat-intervals %s", file, command)
     return is_of_run
-
-
-def _has_tag(path: Path, name: str, finished: str) -> bool:
-    return path.exists() and finished in read_tags(path).get(name, "").split()
 
 
 def _is_of_run(picture: Path, finished: str) -> bool:

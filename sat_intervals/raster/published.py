@@ -1,4 +1,4 @@
-"""Compare ``points.tif`` with the size and checksum that were published with it."""
+"""Compare ``points.tif`` with what was published with it, and surface models with the points beside them."""
 
 import json
 from pathlib import Path
@@ -6,9 +6,9 @@ from pathlib import Path
 from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of, known_checksum
-from sat_intervals.raster.layers import read_alone
+from sat_intervals.raster.layers import read_alone, read_tags
 from sat_intervals.raster.publishing import POINTS_REPORT
-from sat_intervals.raster.seal import check_seal
+from sat_intervals.raster.seal import check_seal, seal_of
 
 POINTS_FILE = POINT_FILES[0].name
 
@@ -53,3 +53,25 @@ def published_points(out: Path) -> dict[str, int] | None:
         raise SatIntervalsError(
             f"{file} is not the report of {POINTS_FILE}: move it away and triangulate again"
         ) from error
+
+
+def is_points_of(points: Path, run: str) -> bool:
+    """Return whether points are of a run, by the time when it finished; raises SatIntervalsError if unreadable."""
+    return _tags(points).get("RUN") == run
+
+
+def is_surface_of(surface: Path, run: str) -> bool:
+    """Return whether a surface model is of a run and of the points beside it, if any; raises as `is_points_of`.
+
+    Earlier versions did not note the points.
+    """
+    tags = _tags(surface)
+    points, made_from = seal_of(surface.with_name(POINTS_FILE)), tags.get("POINTS", "").split()
+    return run in tags.get("RUNS", "").split() and (not points or not made_from or points in made_from)
+
+
+def _tags(path: Path) -> dict[str, str]:
+    try:
+        return read_tags(path)
+    except SatIntervalsError as error:
+        raise SatIntervalsError(f"{path} cannot be read: it is damaged or something else: move it away") from error

@@ -64,6 +64,15 @@ def check_seal(path: str | Path, files: Iterable[str]) -> None:
     check_beside(path, files)
 
 
+def seal_of(path: Path) -> str | None:
+    """Return the CRC-32 in a local GeoTIFF, eight hexadecimal digits; None without a file or one in it."""
+    if not path.exists():
+        return None
+    with open_regular(path) as stream:
+        seal = _SEAL.search(stream.read(_BEGINNING))
+    return seal and seal[1].decode()
+
+
 def _checksums(path: str | Path) -> tuple[int, int] | None:
     """Return the CRC-32 in a file, and that of its bytes; None without one in it."""
     with open_regular(path) as stream:

@@ -30,6 +30,8 @@ def check_output(out: Path, overwrite: bool, *, has_transform: bool = True) -> N
         if home.exists() and not home.is_dir():
             raise SatIntervalsError(f"{home} is not a folder: move it away")
         there = [name for name in OUTPUTS if (out / name).exists()]
+        if folders := [name for name in there if (out / name).is_dir()]:
+            raise SatIntervalsError(f"{out / folders[0]} is a folder: move it away or choose another folder")
         # run.json is renamed last: tiles without it are from a run that was killed before
         is_unfinished = is_replacing(home) or finished_run(home) is not None
         is_under_way = is_unfinished or ("run.json" not in there and has_begun(home))

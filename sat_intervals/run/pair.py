@@ -254,7 +254,7 @@ def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iter
         progress("tiles", done, total)
         if not schedules[i]:
             if not matched[i].failures:
-                jobs[i].store.steps.drop_sources()
+                jobs[i].store.steps.drop_sources({tile.name for tile in jobs[i].store.grid})
             yield matched[i]
     assert not any(schedules)  # else steps would wait for each other
 

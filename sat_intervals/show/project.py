@@ -25,10 +25,9 @@ from sat_intervals.raster import (
     read_shape,
     read_small_image,
     read_small_layers,
-    read_tags,
     watched_images,
 )
-from sat_intervals.raster.published import check_points
+from sat_intervals.raster.published import check_points, is_points_of, is_surface_of
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.show import styles
 from sat_intervals.show.marks import check_made_here, is_replaceable, write_made_here
@@ -171,7 +170,7 @@ def _points(run: Run, written: Written) -> Iterator[Layer]:
     file = run.out / "points.tif"
     if not file.exists():
         return
-    if read_tags(file).get("RUN") != run.report["finished"] or read_shape(file)[1:] != run.shape:
+    if not is_points_of(file, run.report["finished"]) or read_shape(file)[1:] != run.shape:
         written.notes.append(f"{file} belongs to another run and is left out: rerun sat-intervals triangulate")
         return
     check_points(run.out)
@@ -189,8 +188,8 @@ def _surface(run: Run, written: Written) -> Iterator[Layer]:
     file, group = run.out / "dsm.tif", "Heights"
     if not file.exists():
         return
-    if not is_surface(file) or run.report["finished"] not in read_tags(file).get("RUNS", ""):
-        written.notes.append(f"{file} belongs to another run and is left out: rerun sat-intervals dsm")
+    if not is_surface_of(file, run.report["finished"]) or not is_surface(file):
+        written.notes.append(f"{file} is of another run or of earlier points and is left out: rerun sat-intervals dsm")
         return
     shape, place = read_place(file)
     bands = dict(zip((band.name for band in SURFACE), read_small_layers(file, _fitting(shape)), strict=True))
@@ -207,11 +206,16 @@ def _surface(run: Run, written: Written) -> Iterator[Layer]:
 
 
 def _images(run: Run, written: Written) -> Iterator[Layer]:
-    """Yield truth and images; those that cannot be opened, or were changed since the run, are left out."""
+    """Yield truth and images; those that cannot be opened, or were changed since the run, are left out.
+
+    So is the truth beside a left image that was changed.
+    """
     names = ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right")
     for name in names:
         try:
-            image = open_image(run.truth_beside, band=1) if name == "truth" else open_input(run.report["inputs"][name])
+            image = open_input(run.report["inputs"]["left" if name == "truth" else name])
+            if name == "truth":
+                image = open_image(run.truth_beside, band=1)
             check_unchanged = watched_images([image])
             shape = image.height, image.width
             pixels = read_small_image(image, Window(0, 0, *shape), _fitting(shape))

@@ -124,11 +124,6 @@ def _names(folder: Folder) -> set[str]:
     return {name for name in folder.sizes() if is_named(name)}
 
 
-def is_of_tile(name: str) -> bool:
-    """Return whether a name is that of a tile's file, finished or not."""
-    return _OF_TILE.fullmatch(final_name(name)) is not None
-
-
 def is_part(name: str) -> bool:
     """Return whether a name is that of a file of a part, finished or not."""
     return _PART.fullmatch(final_name(name)) is not None

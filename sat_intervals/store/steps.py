@@ -1,7 +1,7 @@
 """What steps of a run hand to later ones: path states, pixels and costs; one file each, with its own checksums."""
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import cache
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.store.folder import Folder
 from sat_intervals.store.manifest import MANIFEST, StoreError, sealed, unsealed
-from sat_intervals.store.removal import BORDERS, COSTS, PIXELS, is_of_tile
+from sat_intervals.store.removal import BORDERS, COSTS, PIXELS, final_name
 
 # A file is the length of its header, the header, a sealed text, and the bytes of all arrays. Every tile reads those of
 # its neighbours: processors have an instruction for CRC-32C, which takes a third of the time of CRC-32.
@@ -60,10 +60,11 @@ class Steps:
 
         return is_intact
 
-    def drop_sources(self) -> None:
-        """Delete pixels and precomputed costs, which nothing needs once all tiles are matched."""
-        names = (f"{kind}/{name}" for kind in (PIXELS, COSTS) for name in self.folder.inside(kind).sizes())
-        self.folder.delete_all([name for name in names if is_of_tile(name)])  # damaged tiles need the folders again
+    def drop_sources(self, tiles: Collection[str]) -> None:
+        """Delete pixels and precomputed costs of tiles, which nothing needs once all are matched."""
+        names = ((kind, name) for kind in (PIXELS, COSTS) for name in self.folder.inside(kind).sizes())
+        # Not the folders: damaged tiles need them again.
+        self.folder.delete_all([f"{kind}/{name}" for kind, name in names if final_name(name) in tiles])
 
     def missing_bytes(self, needed: int) -> int:
         """Return the bytes that a run has yet to write of those that it needs for its steps."""

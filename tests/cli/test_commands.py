@@ -225,6 +225,21 @@ def test_match__notices_swapped_arguments(folder, tmp_path):
     assert_refused(result, "out cannot be read: No such file or directory")
 
 
+@pytest.mark.parametrize("more", [[], ["--overwrite"]])
+def test_match__names_a_folder_in_the_place_of_a_result(folder, tmp_path, more):
+    (tmp_path / "out" / "validity.tif").mkdir(parents=True)
+    result = invoke(*matching(folder, tmp_path / "out", *more))
+    assert_refused(result, "out/validity.tif is a folder: move it away or choose another folder")
+    assert [*(tmp_path / "out").iterdir()] == [tmp_path / "out" / "validity.tif"]
+
+
+@pytest.mark.parametrize("name", ["file:out", "S3:", "zip+https://out"])
+def test_match__refuses_an_output_whose_name_is_an_address(folder, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(invoke(*matching(folder, name)), f"{name} is read as an address: give the path of a file or folder")
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.parametrize(
     ("place", "says"),
     [
@@ -339,6 +354,9 @@ def test_match__shows_a_traceback_only_when_asked(folder, tmp_path):
         (OSError(28, "No space left on device"), 1, "sat-intervals: No space left on device"),
         (OSError(2, "No such file or directory", "/file"), 1, "/file: No such file or directory: was it, or a folder"),
         (OSError(20, "Not a directory", "/file"), 1, "Put it back, or run the command again"),
+        (OSError(21, "Is a directory", "/file"), 1, "/file: Is a directory: move it away"),
+        (OSError(13, "Permission denied", "/file"), 1, "/file: Permission denied: check its rights"),
+        (OSError(36, "File name too long", "/file"), 1, "/file: File name too long: choose a shorter name"),
         (MemoryError("9 GB"), 1, "not enough memory: choose a smaller --tile-size or fewer --workers (9 GB)"),
         (RuntimeError("can't start new thread"), 1, "no more threads can be started: not enough memory: choose"),
         (RuntimeError("cannot cache function 'f': no locator"), 1, "no locator: set NUMBA_CACHE_DIR to a folder that"),

@@ -30,7 +30,16 @@ from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
 from sat_intervals.kernels.splat import AGREEING, COUNT, MEDIAN, NEAREST, cell_bounds, empty_cells, reaching, splat
 from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
-from sat_intervals.raster import POINT_FILES, Projection, north_up, write_layer
+from sat_intervals.raster import (
+    POINT_FILES,
+    Georeferencing,
+    OutputWriter,
+    Projection,
+    north_up,
+    read_layers,
+    read_tags,
+    write_layer,
+)
 from sat_intervals.raster.projection import transformed
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
@@ -69,6 +78,43 @@ def surface_of(outs, tmp_path, **options):
     report = make_surface(outs, tmp_path / "dsm.tif", **{"resolution": 1.0, "crs": "EPSG:32631"} | options)
     with rasterio.open(tmp_path / "dsm.tif") as dataset:
         return dataset.read(), dataset.transform, report
+
+
+@pytest.mark.parametrize("command", ["stac", "project", "plot"])
+def test_surface__of_earlier_points_is_left_out(tmp_path, command):
+    y, x = np.mgrid[:20, :20]
+    out = write_points(tmp_path / "run", x, y, np.full(x.shape, 100.0))
+    points, tags = read_layers(out / "points.tif", Window(0, 0, *x.shape)), read_tags(out / "points.tif")
+
+    def triangulate(height):
+        (out / "points.tif").unlink()
+        points[2:5] += height
+        with OutputWriter(out, POINT_FILES, *x.shape, Georeferencing(), tags) as writer:
+            writer.write(0, points)
+            writer.publish()
+
+    triangulate(1.0)
+    make_surface([out], out / "dsm.tif", resolution=1.0, crs="EPSG:32631")
+    assert "dsm.tif is" not in invoke(command, out).stderr
+    triangulate(0.0)  # the same points
+    assert "dsm.tif is" not in invoke(command, out).stderr
+    triangulate(2.0)
+    done = invoke(command, out)
+    assert done.exit_code == 0
+    assert "dsm.tif is " in done.stderr
+    assert done.stderr.endswith(": rerun sat-intervals dsm\n")
+    make_surface([out], out / "dsm.tif", resolution=1.0, crs="EPSG:32631")
+    assert "dsm.tif is" not in invoke(command, out).stderr
+
+
+@pytest.mark.parametrize("command", ["stac", "project", "plot"])
+def test_surface__that_cannot_be_read_is_named(tmp_path, command):
+    y, x = np.mgrid[:20, :20]
+    out = write_points(tmp_path / "run", x, y, np.full(x.shape, 100.0))
+    (out / "dsm.tif").touch()
+    done = invoke(command, out)
+    assert done.exit_code == 2
+    assert "dsm.tif cannot be read: it is damaged or something else: move it away" in done.stderr
 
 
 def cell_of(place, x, y):

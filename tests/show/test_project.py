@@ -17,6 +17,7 @@ from helpers import exchanged, fail, flip_bit, invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from rasterio.crs import CRS
+from surfaces import write_raster
 
 from sat_intervals.products import INVALID
 from sat_intervals.raster import ControlPoint, Georeferencing
@@ -192,7 +193,7 @@ def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
     (out.parent / "right.tif").unlink()
     done = invoke("project", out)
     assert done.exit_code == 0
-    assert "dsm.tif belongs to another run and is left out: rerun sat-intervals dsm" in done.stderr
+    assert "dsm.tif is of another run or of earlier points and is left out: rerun sat-intervals dsm" in done.stderr
     assert "the right image is left out: " in done.stderr
     names = [name for _, name, _ in layers_of(read_project(out))]
     assert names == ["validity", "confidence", "interval width", "disparity", "truth", "left"]
@@ -221,6 +222,15 @@ def test_write_project__ends_where_a_surface_is_replaced_meanwhile(run, monkeypa
     done = invoke("project", out)
     assert done.exit_code == 1
     assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
+
+
+def test_write_project__leaves_out_the_truth_beside_another_image(run):
+    out, _, _ = run
+    write_raster(out.parent / "left.tif", np.ones((1, 9, 9)), PLACE.transform)
+    done = invoke("project", out)
+    assert done.exit_code == 0
+    for name in ("left", "truth"):
+        assert re.search(f"the {name} image is left out: .*left.tif has 9 x 9 pixels, but had 60 x 80", done.stderr)
 
 
 @pytest.mark.parametrize("name", ["left", "truth"])

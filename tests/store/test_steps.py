@@ -5,7 +5,7 @@ import pytest
 
 from sat_intervals.store.folder import LocalFolder
 from sat_intervals.store.manifest import MANIFEST
-from sat_intervals.store.removal import BORDERS
+from sat_intervals.store.removal import BORDERS, COSTS, PIXELS
 from sat_intervals.store.steps import Steps
 
 
@@ -42,3 +42,15 @@ def test_write__replaces_a_damaged_file(steps):
     assert not steps.intact(BORDERS)("0_0_0")
     steps.write(BORDERS, "0_0_0", np.ones(3))
     assert steps.intact(BORDERS)("0_0_0")
+
+
+def test_drop_sources__deletes_files_of_tiles_only(steps):
+    for kind in (PIXELS, COSTS):
+        steps.folder.make(kind)
+        for name in ("0_0", "0_1"):
+            steps.write(kind, name, np.zeros(3))
+        for name in (".0_1." + 32 * "a", "9_9", "notes"):
+            (steps.folder.path / kind / name).write_text("mine")
+    steps.drop_sources({"0_0", "0_1"})
+    for kind in (PIXELS, COSTS):
+        assert {file.name for file in (steps.folder.path / kind).iterdir()} == {"9_9", "notes"}
