@@ -13,6 +13,8 @@ from sat_intervals.tiling import Grid, Window
 MANIFEST = "manifest.json"
 # Key of the checksum of all other keys.
 SEAL = "crc32"
+# Other commands than match and batch have no --overwrite.
+_WAY_OUT = "start again with --overwrite or move it away"
 # Keys of a file that do not matter if its SHA-256 agrees.
 _IGNORED = ("modified", "stamp")
 # Characters of a value that a message shows.
@@ -60,7 +62,9 @@ def parsed(manifest: str, folder: Folder) -> dict[str, Any]:
         if SEAL in there and unsealed(manifest) is None:
             raise ValueError("it is damaged")
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{folder}/{MANIFEST} cannot be read, {error}: start again with --overwrite") from error
+        raise StoreError(
+            f"{folder}/{MANIFEST} cannot be read, {error}: start again with --overwrite or move it away"
+        ) from error
     there.pop(SEAL, None)
     return there
 
@@ -76,7 +80,9 @@ def grid_of(manifest: Mapping[str, Any], folder: Folder) -> Grid:
     try:
         return Grid(Window(**manifest["region"]), int(manifest["settings"]["tiles"]["size"]))
     except (LookupError, TypeError, ValueError) as error:
-        raise StoreError(f"{folder}/{MANIFEST} is not a manifest of a run: start again with --overwrite") from error
+        raise StoreError(
+            f"{folder}/{MANIFEST} is not a manifest of a run: start again with --overwrite or move it away"
+        ) from error
 
 
 def check_same(there: str, folder: Folder, manifest: Mapping[str, Any]) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import os
+import re
 from shutil import copyfile, copytree
 
 import numpy as np
@@ -29,6 +30,7 @@ from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
 from sat_intervals.run.tune import Tuned, best_of, candidates
 from sat_intervals.store.manifest import StoreError
+from sat_intervals.store.tiles import Store
 
 
 @pytest.fixture(scope="module")
@@ -478,3 +480,18 @@ def stronger(folder):
     file = folder / "stronger.yaml"
     file.write_text("sgm: {p2: 48}\n")
     return file
+
+
+def test_calibrate__names_a_damaged_manifest_that_a_killed_one_left_in_a_store(scene, tmp_path, monkeypatch):
+    store = "--store", tmp_path / "store"
+    whole = calibrated(scene, tmp_path / "whole.yaml", *store)
+    with monkeypatch.context() as killed:
+        killed.setattr(Store, "remove", lambda store: False)
+        calibrated(scene, tmp_path / "killed.yaml", *store)
+    manifest = next((tmp_path / "store").glob("*/manifest.json"))
+    manifest.write_bytes(manifest.read_bytes()[:-9])
+    refused = invoke("calibrate", scene, "--output", tmp_path / "again.yaml", "--name", "one", *store)
+    assert refused.exit_code == 2
+    assert re.search(f"{manifest} cannot be read, .*: start again with --overwrite or move it away", refused.stderr)
+    manifest.unlink()
+    assert calibrated(scene, tmp_path / "again.yaml", *store) == whole
