@@ -24,9 +24,9 @@ from sat_intervals.raster import (
     read_layers,
     read_small_image,
     read_small_layers,
-    read_tags,
 )
 from sat_intervals.raster.identity import check_not_replaced, checksum_of, is_changed, known_checksum, stamp_of
+from sat_intervals.raster.published import tags_beside
 from sat_intervals.raster.watching import watched
 from sat_intervals.store.manifest import SEAL, unsealed
 from sat_intervals.tiling import Window, strips
@@ -162,7 +162,8 @@ class Run:
         image, left = open_image(path), self.report["inputs"]["left"]
         size = image.height, image.width
         here = self.region.in_words
-        if size == self.shape and (there := read_tags(image.path).get("REGION", here)) != here:
+        tags = tags_beside(image.path, left)
+        if size == self.shape and (there := tags.get("REGION", here)) != here:
             raise SatIntervalsError(f"{image.path} is of {there}, {self.out} of {here}: give one of this run")
         if size == self.shape:
             return Layer(image, 0, 0)

@@ -32,7 +32,7 @@ from sat_intervals.raster import (
     utm_of,
     watched_rasters,
 )
-from sat_intervals.raster.seal import seal_of
+from sat_intervals.raster.published import POINTS_FILE, checksum_of_points
 from sat_intervals.results import Run
 from sat_intervals.tiling import Window
 
@@ -101,7 +101,7 @@ def make_surface(
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
-    tags |= _tag_of_points(runs) | {"HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}"}
+    tags |= _origin(runs, geoid)
     projection = _projection(runs, crs, geoid)
     clouds = _clouds(runs, projection, choices, progress)
     cells = _cells(clouds, resolution, radius, grid)
@@ -127,10 +127,10 @@ def make_surface(
     }
 
 
-def _tag_of_points(runs: Sequence[Run]) -> dict[str, str]:
-    """Return the tag by which `is_surface_of` recognises the points; those of earlier versions have no CRC-32."""
-    seals = [seal_of(run.out / "points.tif") for run in runs]
-    return {"POINTS": " ".join(filter(None, seals))} if any(seals) else {}
+def _origin(runs: Sequence[Run], geoid: Path | None) -> dict[str, str]:
+    """Return the tags of the points, by which `is_surface_of` recognises them, and of what heights refer to."""
+    points = " ".join(checksum_of_points(run.out / POINTS_FILE) for run in runs)
+    return {"POINTS": points, "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}"}
 
 
 def _counts(cells: Cells, clouds: Sequence[PointCloud]) -> dict[str, int]:

@@ -16,7 +16,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.location import GroundLattice, Location
 from sat_intervals.heights.point_files import PointFile, watched_points
 from sat_intervals.heights.point_sight import PointSight
-from sat_intervals.heights.points import point_near_the_middle, triangulated
+from sat_intervals.heights.points import point_near_the_middle, read_points, triangulated
 from sat_intervals.heights.raster_sight import RasterSight, Scene, Shift
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
 from sat_intervals.heights.sensors import Sensors
@@ -31,11 +31,13 @@ from sat_intervals.raster import (
     check_as_made,
     check_made_by,
     check_place,
+    read_layers,
     replaceable,
     truth_file,
     utm_of,
     watched_rasters,
 )
+from sat_intervals.raster.published import tag_of_left
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -45,6 +47,8 @@ _SAMPLE = 100_000
 _AROUND = 500.0
 # Positions along both axes of a region at which the row misfit is measured.
 _CHECKED = 9
+# Points that are compared with those of the models and grids, and metres between heights that are not the same.
+_COMPARED, _OTHER = 100, 0.1
 # Correlation of disparities and truth below which left and right are swapped, and pixels that it takes.
 _SWAPPED, _ENOUGH = -0.5, 500
 
@@ -131,9 +135,12 @@ def make_truth(
     if registers:
         triangulated([run.out])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
+    if registers:
+        work.check_points()
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))
     tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), "REGION": run.region.in_words, **MARK}
+    tags |= tag_of_left(run.report["inputs"]["left"])
     tags["SHIFT"] = " ".join(f"{part:.3f}" for part in shift) + " m"
     tally = _Tally(run)
     with (
@@ -192,6 +199,21 @@ class _Work:
     def _middle(self) -> tuple[tuple[int, int], tuple[int, int]]:
         region = self.run.region
         return (region.row, region.height), (region.column, region.width)
+
+    def check_points(self) -> None:
+        """Raise if the points of the run were made with other models or grids."""
+        region, out = self.run.region, self.run.out
+        for window in self.run.windows():
+            points, known = read_points(out / "points.tif", window)
+            row, column = (axis[:: max(1, axis.size // _COMPARED)] for axis in np.nonzero(known))
+            if row.size:
+                disparity = read_layers(out / "intervals.tif", window, band=1)[row, column]
+                made = self._sensors.triangulate(region.row + window.row + row, region.column + column, disparity)
+                if (np.abs(made[:, 2] - points[2, row, column]) > _OTHER).any():
+                    raise SatIntervalsError(
+                        f"{out / 'points.tif'} was made with other models or grids: give these, or triangulate again"
+                    )
+                return
 
     def registration(self, progress: Progress) -> Registration:
         """Return the shift from the reference to the points of the run."""

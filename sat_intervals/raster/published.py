@@ -1,7 +1,10 @@
-"""Compare ``points.tif`` with what was published with it, and surface models with the points beside them."""
+"""Compare files of a run with what they were made from: points, surface models, truths and ranges."""
 
 import json
+import logging
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
@@ -11,6 +14,10 @@ from sat_intervals.raster.publishing import POINTS_REPORT
 from sat_intervals.raster.seal import check_seal, seal_of
 
 POINTS_FILE = POINT_FILES[0].name
+# Tag of what belongs to a left image.
+_LEFT = "LEFT_SHA256"
+
+_LOG = logging.getLogger(__name__)
 
 
 def check_points(out: Path) -> None:
@@ -65,9 +72,28 @@ def is_surface_of(surface: Path, run: str) -> bool:
 
     Earlier versions did not note the points.
     """
-    tags = _tags(surface)
-    points, made_from = seal_of(surface.with_name(POINTS_FILE)), tags.get("POINTS", "").split()
-    return run in tags.get("RUNS", "").split() and (not points or not made_from or points in made_from)
+    tags, points = _tags(surface), surface.with_name(POINTS_FILE)
+    made_from = tags.get("POINTS", "").split()
+    is_of_points = not made_from or not points.exists() or checksum_of_points(points) in made_from
+    return is_of_points and run in tags.get("RUNS", "").split()
+
+
+def checksum_of_points(points: Path) -> str:
+    """Return the CRC-32 in a file, or that of a file without one: eight hexadecimal digits."""
+    return seal_of(points) or f"{checksum_of(points)['crc32']:08x}"
+
+
+def tag_of_left(left: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tag by which `tags_beside` recognises the left image of an `identity`; empty without its SHA-256."""
+    return {_LEFT: left["sha256"]} if "sha256" in left else {}
+
+
+def tags_beside(path: str | Path, left: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tags of a raster; warn if it was made for another image than that of the `identity` ``left``."""
+    tags = read_tags(path)
+    if (made_for := tags.get(_LEFT)) and made_for != left.get("sha256", made_for):
+        _LOG.warning("%s was made for another left image than %s: check that it is of this pair", path, left["path"])
+    return tags
 
 
 def _tags(path: Path) -> dict[str, str]:

@@ -65,9 +65,7 @@ def check_seal(path: str | Path, files: Iterable[str]) -> None:
 
 
 def seal_of(path: Path) -> str | None:
-    """Return the CRC-32 in a local GeoTIFF, eight hexadecimal digits; None without a file or one in it."""
-    if not path.exists():
-        return None
+    """Return the CRC-32 in a local GeoTIFF, eight hexadecimal digits; None without one in it."""
     with open_regular(path) as stream:
         seal = _SEAL.search(stream.read(_BEGINNING))
     return seal and seal[1].decode()

@@ -25,7 +25,8 @@ from sat_intervals.raster import (
     replaceable,
     watched_rasters,
 )
-from sat_intervals.raster.identity import check_not_replaced
+from sat_intervals.raster.identity import check_not_replaced, identity
+from sat_intervals.raster.published import tag_of_left, tags_beside
 from sat_intervals.tiling import Window
 
 # Side of the cells that a raster of ranges is reduced to, in pixels.
@@ -43,6 +44,8 @@ def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Co
     """
     search = config.disparity
     raster = read_ranges(search.grid, left) if search.grid else None
+    if search.grid:
+        tags_beside(search.grid, identity(left.path))
     found = None
     if raster is None and (search.is_auto or search.local):
         found = find()
@@ -93,7 +96,7 @@ def write_ranges(path: Path, ranges: LocalRanges, left: Image, before: Mapping[s
     SatIntervalsError
         The file cannot be written, or another one came there.
     """
-    shape, tags = (left.height, left.width), {_OF: left.path, **MARK}
+    shape, tags = (left.height, left.width), {_OF: left.path, **tag_of_left(identity(left.path)), **MARK}
     with OutputWriter(path.parent, [ranges_file(path.name)], *shape, left.georeferencing, tags) as writer:
         for row in range(0, left.height, _STRIP):
             window = Window(row, 0, min(_STRIP, left.height - row), left.width)

@@ -311,6 +311,18 @@ def test_evaluate_run__takes_no_truth_beside_another_image(run, pair, tmp_path):
     assert evaluate_run(tmp_path / "out", moved / "truth.tif") == expected
 
 
+def test_evaluate__warns_of_a_truth_of_another_left_image(run, pair, tmp_path):
+    truth, left = tmp_path / "truth.tif", json.loads((run / "run.json").read_text())["inputs"]["left"]
+    shutil.copy(pair / "truth.tif", truth)
+    for made_for, said in ((left["sha256"], ""), (64 * "0", f"{truth} was made for another left image than")):
+        with rasterio.open(truth, "r+") as file:
+            file.update_tags(LEFT_SHA256=made_for)
+        done = invoke("evaluate", run, "--truth", truth, "--quiet")
+        assert done.exit_code == 0
+        assert said in done.stderr
+        assert bool(said) == bool(done.stderr)
+
+
 # ---- Tables and pairs --------------------------------------------------------------------------------------
 def report_of(accuracy):
     area = {"accuracy": accuracy, "relative_size": 0.1, "relative_overestimation": None}

@@ -378,7 +378,8 @@ def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
         ),
         (["--points", metres, "--ellipsoid"], files, "metres.csv has no CRS: give it with --crs"),
         (["--points", tmp_path / "none.las", "--ellipsoid"], files, "none.las: no such file"),
-        ([*ones], swapped, "models and grids of left and right are swapped"),
+        (ones, swapped, "points.tif was made with other models or grids: give these, or triangulate again"),
+        ([*ones, "--no-register"], swapped, "models and grids of left and right are swapped"),
         ([*ones, "--output", reference], files, "was not made by sat-intervals"),
     ):
         result = invoke("reference", out, *words, *sensor_words(cameras_given))
@@ -576,3 +577,22 @@ def test_reference_command__a_surface_gives_the_disparities_of_its_run_back(shar
     assert np.isfinite(difference).mean() > 0.4
     assert abs(np.nanmedian(difference)) < 0.05
     assert np.nanmedian(np.abs(difference)) < 0.05
+
+
+def test_reference__notes_the_left_image_of_the_run(relief, tmp_path):
+    out, files, reference = relief
+    out = shutil.copytree(out, tmp_path / "out")
+    report = json.loads((out / "run.json").read_text())
+
+    def of_image(digit):
+        report["inputs"]["left"]["sha256"] = 64 * digit
+        (out / "run.json").write_text(json.dumps(report))
+
+    of_image("0")
+    given = ["--heights", reference, "--ellipsoid", *sensor_words(files)]
+    assert invoke("reference", out, *given).exit_code == 0
+    for digit in "01":
+        of_image(digit)
+        done = invoke("evaluate", out, "--truth", out / "truth.tif")
+        assert done.exit_code == 0
+        assert ("truth.tif was made for another left image" in done.stderr) == (digit == "1")

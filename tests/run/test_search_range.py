@@ -175,6 +175,16 @@ def test_range__writes_no_raster_beside_a_mask_that_appears_meanwhile(folder, tm
     assert (result.exit_code, [file.name for file in tmp_path.iterdir()]) == (2, ["ranges.tif.msk"])
 
 
+def test_match__warns_of_ranges_of_another_left_image(folder, tmp_path):
+    images, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "range.tif"
+    assert invoke("range", *images, "--output", file, "-q").exit_code == 0
+    said = f"{file} was made for another left image than {images[1]}: check that it is of this pair"
+    for order in (1, -1):
+        done = invoke("match", *images[::order], tmp_path / f"out{order}", "--range-grid", file, "--tile-size", 128)
+        assert done.exit_code == 0
+        assert (said in done.stderr) == (order == -1)
+
+
 def test_range__writes_the_ranges_that_match_reads(folder, tmp_path):
     images = folder / "left.tif", folder / "right.tif"
     assert invoke("range", *images, "--output", tmp_path / "range.tif", "-q").exit_code == 0
