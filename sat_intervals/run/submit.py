@@ -4,7 +4,7 @@ import logging
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -68,7 +68,13 @@ class Submission:
                 self._fill()
                 yield None
                 continue
-            result, error = _end_of(future)
+            ended = _end_of(future)
+            if ended is None:
+                future.add_done_callback(self._ended.put)  # the scheduler has it computed again
+                self._fill()
+                yield None
+                continue
+            result, error = ended
             task, is_alone, _ = self._in_flight.pop(str(future.key))
             future.release()
             is_blamed = isinstance(error, KilledWorker) and not is_alone
@@ -156,13 +162,14 @@ class _Heartbeats:
             _LOG.warning("waiting for %s, silent for %.0f s", ", ".join(silent), SILENT)
 
 
-def _end_of(future: Future[Any]) -> tuple[Any, BaseException | None]:
-    """Return result and error of a future; one of them is None."""
-    with _scheduler_errors():
-        error: BaseException | None = future.exception()
+def _end_of(future: Future[Any]) -> tuple[Any, BaseException | None] | None:
+    """Return result and error of a finished future, one of which is None; None if its worker has left with both."""
+    with _scheduler_errors(), suppress(TimeoutError):
+        error: BaseException | None = future.exception(timeout=CHECK_EVERY)
         if future.cancelled():
             raise ClosedClientError(f"{future.key} is lost")
-        return (future.result(), None) if error is None else (None, error)
+        return (future.result(timeout=CHECK_EVERY), None) if error is None else (None, error)
+    return None
 
 
 @contextmanager

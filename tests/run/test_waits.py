@@ -15,7 +15,8 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from helpers import COMMAND, invoke
+from distributed import Client, LocalCluster
+from helpers import COMMAND, invoke, wait_until
 
 from sat_intervals import load_config, open_image
 from sat_intervals.config import Cluster, ConfigError, Mccnn
@@ -273,6 +274,29 @@ def test_heartbeats__name_a_silent_worker_after_half_a_minute(monkeypatch):
     now[0] = 31.0
     heartbeats.check(worker)
     assert messages == ["waiting for one, silent for 30 s"]
+
+
+@pytest.mark.process
+def test_submission__looks_around_while_a_result_that_left_with_its_worker_is_computed_again(monkeypatch):
+    following, left = Submission._next, []
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+
+        def leaves_with_the_result(submission):
+            future = following(submission)
+            if future and not left:
+                left.extend(local.workers.values())
+                local.sync(left[0].close)
+                wait_until(lambda: not client.nthreads(), "the worker's end", 10)
+                threading.Timer(7.0, local.scale, [2]).start()
+            return future
+
+        monkeypatch.setattr(Submission, "_next", leaves_with_the_result)
+        *meanwhile, last = Submission(client, iter([Task(0, abs, (-3,), 0)]))
+    assert (last.result, last.error) == (3, None)
+    assert {*meanwhile} == {None}
 
 
 @pytest.mark.process
