@@ -1,10 +1,12 @@
 """Submit tasks to a dask cluster with a bounded number in flight, and handle lost workers."""
 
+import asyncio
 import logging
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from concurrent import futures
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -55,6 +57,7 @@ class Submission:
         self._submitted = 0
         self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
         self._in_flight: dict[str, tuple[Task, bool, Future[Any]]] = {}
+        self._reading: dict[str, futures.Future[tuple[Any, BaseException | None]]] = {}
         self._suspects: list[Task] = []
         self._limit, self._checked = 2, float("-inf")
         self._workers: set[str] = set() if known is None else known
@@ -63,19 +66,13 @@ class Submission:
     def __iter__(self) -> Iterator[Outcome | None]:
         self._fill()
         while self._in_flight:
-            future = self._next()
-            if future is None:
-                self._fill()
-                yield None
-                continue
-            ended = _end_of(future)
+            ended = self._next()
             if ended is None:
-                future.add_done_callback(self._ended.put)  # the scheduler has it computed again
                 self._fill()
                 yield None
                 continue
-            result, error = ended
-            task, is_alone, _ = self._in_flight.pop(str(future.key))
+            key, result, error = ended
+            task, is_alone, future = self._in_flight.pop(key)
             future.release()
             is_blamed = isinstance(error, KilledWorker) and not is_alone
             if is_blamed:
@@ -87,12 +84,24 @@ class Submission:
             if not self._in_flight and self._suspects:
                 self._submit(self._suspects.pop(), is_alone=True)
 
-    def _next(self) -> Future[Any] | None:
-        """Wait for the next finished future; return None after a few seconds."""
+    def _next(self) -> tuple[str, Any, BaseException | None] | None:
+        """Return key, result and error of a task that has ended; None after a few seconds without one.
+
+        Its worker may have left with both: then they are computed again, if there is another worker.
+        """
         try:
-            return self._ended.get(timeout=CHECK_EVERY)
+            future = self._ended.get(timeout=CHECK_EVERY)
         except Empty:
             return None
+        key = str(future.key)
+        if key not in self._reading:
+            loop: Any = self._client.loop
+            self._reading[key] = asyncio.run_coroutine_threadsafe(_end_of(self._client, future), loop.asyncio_loop)
+        if not futures.wait([self._reading[key]], timeout=CHECK_EVERY).done:
+            self._ended.put(future)
+            return None
+        with _scheduler_errors():
+            return key, *self._reading.pop(key).result()
 
     def _fill(self) -> None:
         """Submit tasks until two per current core are in flight."""
@@ -162,14 +171,12 @@ class _Heartbeats:
             _LOG.warning("waiting for %s, silent for %.0f s", ", ".join(silent), SILENT)
 
 
-def _end_of(future: Future[Any]) -> tuple[Any, BaseException | None] | None:
-    """Return result and error of a finished future, one of which is None; None if its worker has left with both."""
-    with _scheduler_errors(), suppress(TimeoutError):
-        error: BaseException | None = future.exception(timeout=CHECK_EVERY)
-        if future.cancelled():
-            raise ClosedClientError(f"{future.key} is lost")
-        return (future.result(timeout=CHECK_EVERY), None) if error is None else (None, error)
-    return None
+async def _end_of(client: Client, future: Future[Any]) -> tuple[Any, BaseException | None]:
+    """Return result and error of a future; one of them is None. It may take for ever, and must not be cancelled."""
+    error: BaseException | None = await future.exception(asynchronous=True)
+    if future.cancelled():
+        raise ClosedClientError(f"{future.key} is lost")
+    return (await client.gather(future, asynchronous=True), None) if error is None else (None, error)
 
 
 @contextmanager

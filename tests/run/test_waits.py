@@ -1,5 +1,6 @@
 """Nothing waits forever: pipes in place of files, YAML that expands without end, silent workers."""
 
+import asyncio
 import json
 import logging
 import os
@@ -16,7 +17,7 @@ import psutil
 import pytest
 import rasterio
 from distributed import Client, LocalCluster
-from helpers import COMMAND, invoke, wait_until
+from helpers import COMMAND, invoke
 
 from sat_intervals import load_config, open_image
 from sat_intervals.config import Cluster, ConfigError, Mccnn
@@ -278,24 +279,24 @@ def test_heartbeats__name_a_silent_worker_after_half_a_minute(monkeypatch):
 
 @pytest.mark.process
 def test_submission__looks_around_while_a_result_that_left_with_its_worker_is_computed_again(monkeypatch):
-    following, left = Submission._next, []
+    end_of, left = submit._end_of, []
     with (
         LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as local,
         Client(local) as client,
     ):
 
-        def leaves_with_the_result(submission):
-            future = following(submission)
-            if future and not left:
-                left.extend(local.workers.values())
-                local.sync(left[0].close)
-                wait_until(lambda: not client.nthreads(), "the worker's end", 10)
-                threading.Timer(7.0, local.scale, [2]).start()
-            return future
+        async def after_its_worker_left(client, future):
+            left.extend(local.workers.values())
+            await left[0].close()
+            while local.scheduler.workers:
+                await asyncio.sleep(0.01)
+            threading.Timer(7.0, local.scale, [2]).start()
+            return await end_of(client, future)
 
-        monkeypatch.setattr(Submission, "_next", leaves_with_the_result)
+        monkeypatch.setattr(submit, "_end_of", after_its_worker_left)
         *meanwhile, last = Submission(client, iter([Task(0, abs, (-3,), 0)]))
-    assert (last.result, last.error) == (3, None)
+    assert (last.result, last.error, len(left)) == (3, None, 1)
+    assert len(meanwhile) > 2
     assert {*meanwhile} == {None}
 
 
