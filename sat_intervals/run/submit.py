@@ -172,7 +172,10 @@ class _Heartbeats:
 
 
 async def _end_of(client: Client, future: Future[Any]) -> tuple[Any, BaseException | None]:
-    """Return result and error of a future; one of them is None. It may take for ever, and must not be cancelled."""
+    """Return result and error of a future; one of them is None.
+
+    It may take for ever. Nobody cancels it, since dask then complains on stderr of what was not retrieved.
+    """
     error: BaseException | None = await future.exception(asynchronous=True)
     if future.cancelled():
         raise ClosedClientError(f"{future.key} is lost")
@@ -184,5 +187,5 @@ def _scheduler_errors() -> Iterator[None]:
     """Turn the loss of the scheduler into a RunError."""
     try:
         yield
-    except (OSError, ClosedClientError) as error:
+    except (OSError, ClosedClientError, futures.CancelledError) as error:
         raise RunError("the dask scheduler is gone; rerun the same command: it resumes") from error

@@ -62,9 +62,7 @@ def parsed(manifest: str, folder: Folder) -> dict[str, Any]:
         if SEAL in there and unsealed(manifest) is None:
             raise ValueError("it is damaged")
     except (ValueError, RecursionError) as error:
-        raise StoreError(
-            f"{folder}/{MANIFEST} cannot be read, {error}: start again with --overwrite or move it away"
-        ) from error
+        raise StoreError(f"{folder}/{MANIFEST} cannot be read, {error}: {_WAY_OUT}") from error
     there.pop(SEAL, None)
     return there
 
@@ -80,9 +78,7 @@ def grid_of(manifest: Mapping[str, Any], folder: Folder) -> Grid:
     try:
         return Grid(Window(**manifest["region"]), int(manifest["settings"]["tiles"]["size"]))
     except (LookupError, TypeError, ValueError) as error:
-        raise StoreError(
-            f"{folder}/{MANIFEST} is not a manifest of a run: start again with --overwrite or move it away"
-        ) from error
+        raise StoreError(f"{folder}/{MANIFEST} is not a manifest of a run: {_WAY_OUT}") from error
 
 
 def check_same(there: str, folder: Folder, manifest: Mapping[str, Any]) -> None:

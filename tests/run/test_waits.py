@@ -301,6 +301,20 @@ def test_submission__looks_around_while_a_result_that_left_with_its_worker_is_co
 
 
 @pytest.mark.process
+def test_submission__ends_when_the_scheduler_is_lost_while_a_result_is_read(monkeypatch):
+    async def lost(client, future):
+        raise asyncio.CancelledError
+
+    monkeypatch.setattr(submit, "_end_of", lost)
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as local,
+        Client(local) as client,
+        pytest.raises(RunError, match="the dask scheduler is gone; rerun the same command: it resumes"),
+    ):
+        list(Submission(client, iter([Task(0, abs, (-3,), 0)])))
+
+
+@pytest.mark.process
 def test_submission__goes_on_without_a_worker_that_is_stopped(tmp_path, monkeypatch):
     warned = heard(monkeypatch)
     monkeypatch.setattr(submit, "SILENT", 2.0)
