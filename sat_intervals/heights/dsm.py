@@ -32,7 +32,7 @@ from sat_intervals.raster import (
     utm_of,
     watched_rasters,
 )
-from sat_intervals.raster.published import POINTS_FILE, checksum_of_points
+from sat_intervals.raster.published import POINTS_FILE, checksum_of_points, folders_of
 from sat_intervals.results import Run
 from sat_intervals.tiling import Window
 
@@ -101,7 +101,7 @@ def make_surface(
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
-    tags |= _origin(runs, geoid)
+    tags |= _origin(runs, path, geoid)
     projection = _projection(runs, crs, geoid)
     clouds = _clouds(runs, projection, choices, progress)
     cells = _cells(clouds, resolution, radius, grid)
@@ -127,10 +127,11 @@ def make_surface(
     }
 
 
-def _origin(runs: Sequence[Run], geoid: Path | None) -> dict[str, str]:
-    """Return the tags of the points, by which `is_surface_of` recognises them, and of what heights refer to."""
+def _origin(runs: Sequence[Run], path: Path, geoid: Path | None) -> dict[str, str]:
+    """Return the tags of points and folders, which `is_surface_of` compares, and of what heights refer to."""
     points = " ".join(checksum_of_points(run.out / POINTS_FILE) for run in runs)
-    return {"POINTS": points, "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}"}
+    folders = folders_of(path, [run.out for run in runs])
+    return {"POINTS": points, "FOLDERS": folders, "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}"}
 
 
 def _counts(cells: Cells, clouds: Sequence[PointCloud]) -> dict[str, int]:

@@ -2,7 +2,8 @@
 
 import json
 import logging
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from sat_intervals.errors import SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of, known_checksum
 from sat_intervals.raster.layers import read_alone, read_tags
-from sat_intervals.raster.publishing import POINTS_REPORT
+from sat_intervals.raster.publishing import POINTS_REPORT, RUN_REPORT
 from sat_intervals.raster.seal import check_seal, seal_of
 
 POINTS_FILE = POINT_FILES[0].name
@@ -70,12 +71,34 @@ def is_points_of(points: Path, run: str) -> bool:
 def is_surface_of(surface: Path, run: str) -> bool:
     """Return whether a surface model is of a run and of the points beside it, if any; raises as `is_points_of`.
 
-    Earlier versions did not note the points.
+    Its other runs must still be the ones that it was made from, too, where they are in the same folders. Earlier
+    versions noted neither points nor folders.
     """
-    tags, points = _tags(surface), surface.with_name(POINTS_FILE)
-    made_from = tags.get("POINTS", "").split()
-    is_of_points = not made_from or not points.exists() or checksum_of_points(points) in made_from
-    return is_of_points and run in tags.get("RUNS", "").split()
+    tags, beside = _tags(surface), surface.with_name(POINTS_FILE)
+    runs, points = (tags.get(name, "").split() for name in ("RUNS", "POINTS"))
+    if run not in runs or (points and beside.exists() and checksum_of_points(beside) not in points):
+        return False
+    folders = [surface.parent / name for name in json.loads(tags.get("FOLDERS", "[]"))]
+    return all(map(_is_as_it_was, folders, runs, points))
+
+
+def folders_of(surface: Path, outs: Iterable[Path]) -> str:
+    """Return the folders of a surface's runs, relative to its own, for its tag ``FOLDERS``."""
+    return json.dumps([os.path.relpath(out.resolve(), surface.parent.resolve()) for out in outs])
+
+
+def _is_as_it_was(out: Path, run: str, points: str) -> bool:
+    """Return whether a folder has the run that ended at this time and its points of this CRC-32, or lacks them."""
+    report, file = out / RUN_REPORT, out / POINTS_FILE
+    try:
+        if file.exists() and checksum_of_points(file) != points:
+            return False
+        if not report.exists():
+            return True
+        with open_regular(report) as stream:
+            return bool(json.loads(stream.read())["finished"] == run)
+    except (OSError, ValueError, LookupError, TypeError, RecursionError, SatIntervalsError):
+        return False
 
 
 def checksum_of_points(points: Path) -> str:

@@ -202,8 +202,10 @@ class OutputWriter:
         *,
         replaceable: Mapping[str, str] = MappingProxyType({}),
         announce: Callable[[list[str]], None] = lambda stamps: None,
-    ) -> None:
+    ) -> dict[str, str]:
         """Rename the files to their final names, all of them or none; `publishing.publish` has the rules.
+
+        Return their `stamps`.
 
         Parameters
         ----------
@@ -231,8 +233,10 @@ class OutputWriter:
                     raise OSError(errno.EIO, "the content read back differs from that written")
         self._check_beside_places()  # some may have appeared
         self._hidden.check_complete()
-        announce(list(stamps(self._hidden.opened_files, names).values()))
+        published = stamps(self._hidden.opened_files, names)
+        announce(list(published.values()))
         self._hidden.publish(names, replaceable, self._failing, compared)
+        return published
 
     @contextmanager
     def _failing(self, path: Path) -> Iterator[None]:

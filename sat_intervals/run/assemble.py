@@ -20,6 +20,7 @@ from sat_intervals.raster.identity import compared
 from sat_intervals.run.copying import assemble_files
 from sat_intervals.run.inputs import appeared_file
 from sat_intervals.run.job import Job
+from sat_intervals.run.output import check_still_published
 from sat_intervals.run.quality import quality_of, warnings_of
 from sat_intervals.run.scale import checked_scale
 from sat_intervals.run.seams import seam_report
@@ -49,8 +50,8 @@ def assemble(
     progress: Progress,
     *,
     keep_tiles: bool = False,
-) -> dict[str, Any]:
-    """Write the files of a run whose tiles are done; return the content of run.json without its checksum.
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Write the files of a run whose tiles are done; return the content of run.json without its checksum, and `stamps`.
 
     Parameters
     ----------
@@ -99,9 +100,9 @@ def assemble(
         report = _report(job, records, scale, parts.values(), seconds, writer.build())
         for line in report["warnings"]:
             _LOG.warning("%s", line)
-        _publish(job, writer, report, keep_tiles=keep_tiles)
+        published = _publish(job, writer, report, keep_tiles=keep_tiles)
         progress("files", steps, steps)
-    return report
+    return report, published
 
 
 def _check_content(job: Job, name: str | None) -> None:
@@ -121,19 +122,34 @@ def _check_content(job: Job, name: str | None) -> None:
         raise RemovedTilesError(f"{file} appeared during the run, whose tiles are deleted: rerun the command")
 
 
-def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> None:
+def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> dict[str, str]:
     def announce(stamps: list[str]) -> None:
         if not keep_tiles:
             job.store.mark_finished(job.name, stamps)
 
     there = replaceable_files(job.store.home, job.store.run) or {}
-    writer.publish(("run.json", sealed(report) + "\n"), replaceable=there, announce=announce)
+    published = writer.publish(("run.json", sealed(report) + "\n"), replaceable=there, announce=announce)
     try:
         job.store.mark_replaced()
         if keep_tiles:  # otherwise the parts are removed with them
             job.parts().drop()
     except OSError as error:  # the run is complete
         _LOG.warning("parts of the files stay in %s: %s", job.store.folder, reason(error))
+    return published
+
+
+def end_run(job: Job, published: Mapping[str, str], *, keep_tiles: bool) -> None:
+    """Remove the tiles of a run whose files are published, unless they are kept.
+
+    Raises
+    ------
+    RunError
+        A file is no longer the published one of these `stamps`.
+    """
+    if not keep_tiles:
+        check_still_published(job.out, published, has_tiles=True)
+        remove_tiles(job)
+    check_still_published(job.out, published, has_tiles=False)
 
 
 def remove_tiles(job: Job) -> bool:

@@ -27,7 +27,7 @@ from sat_intervals.raster import (
     write_file,
 )
 from sat_intervals.raster.identity import check_not_replaced, identifiers
-from sat_intervals.run.assemble import remove_tiles
+from sat_intervals.run.assemble import end_run
 from sat_intervals.run.before import report_before, tidy
 from sat_intervals.run.job import Job, Search, prepare
 from sat_intervals.run.output import OUTPUTS, is_complete
@@ -314,9 +314,8 @@ def _assembled(client: Workers, matched: Matched, keep_tiles: bool, progress: Pr
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
-        if not keep_tiles:
-            remove_tiles(job)
+            report, published = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
+        end_run(job, published, keep_tiles=keep_tiles)
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
     return {"state": "done", **{name: report[name] for name in _KEPT}}

@@ -3,11 +3,11 @@
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
+from sat_intervals.errors import RunError, SatIntervalsError, check_regular, open_regular
 from sat_intervals.raster import RUN_FILES, examined, restore, stamps
 from sat_intervals.raster.beside import check_place
 from sat_intervals.raster.identity import checksum_of
@@ -118,10 +118,26 @@ def check_as_published(out: Path) -> None:
     """
     _, noted = finished_run(out / "tiles") or ("", [])
     before = dict(zip(OUTPUTS, noted, strict=False))  # a damaged mark has fewer, which is no reason to trust a file
+    if name := _changed(out, before):
+        raise SatIntervalsError(
+            f"{out / name} was changed after the run, but the tiles still exist: delete it and rerun the same "
+            "command to make it again"
+        )
+
+
+def check_still_published(out: Path, published: Mapping[str, str], *, has_tiles: bool) -> None:
+    """Raise if a file of a run is not the one that it has just published, with the way out with or without tiles.
+
+    Raises
+    ------
+    RunError
+        Names the first file that no longer has its one of these `stamps`.
+    """
+    if name := _changed(out, published):
+        way_out = "delete it and rerun the same command" if has_tiles else "move it away and rerun with --overwrite"
+        raise RunError(f"{out / name} was changed or moved away before the run ended: {way_out}")
+
+
+def _changed(out: Path, before: Mapping[str, str]) -> str | None:
     now = stamps(out, OUTPUTS)
-    for name in OUTPUTS:
-        if now.get(name) != before.get(name):
-            raise SatIntervalsError(
-                f"{out / name} was changed after the run, but the tiles still exist: delete it and rerun the same "
-                "command to make it again"
-            )
+    return next((name for name in OUTPUTS if now.get(name) != before.get(name)), None)

@@ -14,7 +14,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.results import open_run
-from sat_intervals.run.assemble import assemble, remove_tiles
+from sat_intervals.run.assemble import assemble, end_run, remove_tiles
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
@@ -122,9 +122,10 @@ def _match_pair(
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
             match()
-            report = assemble_repaired(job, connection.client, match, seconds, progress, keep_tiles=keep_tiles)
-        if not keep_tiles:
-            remove_tiles(job)
+            report, published = assemble_repaired(
+                job, connection.client, match, seconds, progress, keep_tiles=keep_tiles
+            )
+        end_run(job, published, keep_tiles=keep_tiles)
     return report
 
 
@@ -149,7 +150,7 @@ def assemble_repaired(
     progress: Progress,
     *,
     keep_tiles: bool,
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], dict[str, str]]:
     """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles or parts."""
     for _ in range(_TRIES):
         try:

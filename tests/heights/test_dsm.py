@@ -107,6 +107,25 @@ def test_surface__of_earlier_points_is_left_out(tmp_path, command):
 
 
 @pytest.mark.parametrize("command", ["stac", "project", "plot"])
+@pytest.mark.parametrize("changed", ["points.tif", "run.json"])
+def test_surface__of_several_runs_is_left_out_where_another_of_them_was_made_again(tmp_path, command, changed):
+    y, x = np.mgrid[:20, :20]
+    one, other = (write_points(tmp_path / name, x, y, np.full(x.shape, 100.0)) for name in "ab")
+    make_surface([one, other], one / "dsm.tif", resolution=1.0, crs="EPSG:32631")
+    assert json.loads(read_tags(one / "dsm.tif")["FOLDERS"]) == [".", "../../b/out"]
+    assert "dsm.tif is" not in invoke(command, one).stderr
+    again = write_points(tmp_path / "c", x, y, np.full(x.shape, 101.0), run=read_tags(other / "points.tif")["RUN"])
+    shutil.copy(again / changed, other / changed)
+    done = invoke(command, one)
+    assert done.exit_code == 0
+    assert "dsm.tif is " in done.stderr
+    (other / changed).write_text("damaged")
+    assert "dsm.tif is " in invoke(command, one).stderr
+    shutil.rmtree(other)  # nothing to compare with
+    assert "dsm.tif is" not in invoke(command, one).stderr
+
+
+@pytest.mark.parametrize("command", ["stac", "project", "plot"])
 def test_surface__that_cannot_be_read_is_named(tmp_path, command):
     y, x = np.mgrid[:20, :20]
     out = write_points(tmp_path / "run", x, y, np.full(x.shape, 100.0))

@@ -347,6 +347,29 @@ def test_match__overwrites_tiles_in_a_store_whose_manifest_a_power_loss_damaged(
     assert not list(store.glob("*/records/*"))
 
 
+@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize("how", ["half", "bit", "gone"])
+@pytest.mark.parametrize("moment", ["with its tiles", "with kept tiles", "without its tiles"])
+def test_match__fails_where_its_files_are_changed_before_it_ends(scene, tmp_path, monkeypatch, name, how, moment):
+    out = tmp_path / "out"
+    file, step = out / name, Store.remove if moment == "without its tiles" else Store.mark_replaced
+
+    def changed_after(store):
+        done = step(store)
+        damage(file, how)
+        return done
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, step.__name__, changed_after)
+        said = match(scene, out, *["--keep-tiles"] * (moment == "with kept tiles"), status=1)
+    way_out = "delete it and rerun the same command" if moment == "with its tiles" else "move it away and rerun with"
+    assert f"{file} was changed or moved away before the run ended: {way_out}" in said
+    file.unlink(missing_ok=True)
+    match(scene, out, *["--overwrite"] * (moment != "with its tiles"))
+    assert_same(scene, out)
+    assert not (out / "tiles").exists()
+
+
 @pytest.mark.parametrize(
     ("name", "how"),
     [("intervals.tif", "half"), ("validity.tif", "bit"), *itertools.product(["run.json"], ["half", "bit", "empty"])],
