@@ -63,7 +63,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
 
         lines = "\n".join(f"  {name}: {error}" for name, error in failed.items())
         raise RunError(
-            f"{len(failed)} of {len(report)} pairs failed; rerun the same command: it matches only the missing pairs:\n"
-            f"{lines}"
+            f"{len(failed)} of {len(report)} pairs failed; fix the causes and rerun the same command: it matches only "
+            f"the missing pairs:\n{lines}"
         )
     run.check_strict([*(line for end in report.values() for line in end.get("warnings", ())), *of_points])

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
 
 from sat_intervals.config import Config, calibration_of
 from sat_intervals.errors import RemovedTilesError, RunError
@@ -43,6 +43,13 @@ _COUNTS_MEANING = {
 _LOG = logging.getLogger(__name__)
 
 
+class Assembled(NamedTuple):
+    """The content of ``run.json`` without its checksum, and the `stamps` of the published files."""
+
+    report: dict[str, Any]
+    published: dict[str, str]
+
+
 def assemble(
     job: Job,
     client: Callable[[], Workers],
@@ -50,8 +57,8 @@ def assemble(
     progress: Progress,
     *,
     keep_tiles: bool = False,
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """Write the files of a run whose tiles are done; return the content of run.json without its checksum, and `stamps`.
+) -> Assembled:
+    """Write the files of a run whose tiles are done.
 
     Parameters
     ----------
@@ -102,7 +109,7 @@ def assemble(
             _LOG.warning("%s", line)
         published = _publish(job, writer, report, keep_tiles=keep_tiles)
         progress("files", steps, steps)
-    return report, published
+    return Assembled(report, published)
 
 
 def _check_content(job: Job, name: str | None) -> None:
@@ -138,18 +145,19 @@ def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_til
     return published
 
 
-def end_run(job: Job, published: Mapping[str, str], *, keep_tiles: bool) -> None:
-    """Remove the tiles of a run whose files are published, unless they are kept.
+def end_run(job: Job, assembled: Assembled, *, keep_tiles: bool) -> dict[str, Any]:
+    """Remove the tiles of a run whose files are published, unless they are kept; return its report.
 
     Raises
     ------
     RunError
-        A file is no longer the published one of these `stamps`.
+        A file is no longer the published one.
     """
     if not keep_tiles:
-        check_still_published(job.out, published, has_tiles=True)
+        check_still_published(job.out, assembled.published, has_tiles=True)
         remove_tiles(job)
-    check_still_published(job.out, published, has_tiles=False)
+    check_still_published(job.out, assembled.published, has_tiles=False)
+    return assembled.report
 
 
 def remove_tiles(job: Job) -> bool:

@@ -314,8 +314,8 @@ def _assembled(client: Workers, matched: Matched, keep_tiles: bool, progress: Pr
     try:
         with job.store.needed(job.manifest):
             check_failures(job, failures)
-            report, published = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
-        end_run(job, published, keep_tiles=keep_tiles)
+            made = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
+        report = end_run(job, made, keep_tiles=keep_tiles)
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
     return {"state": "done", **{name: report[name] for name in _KEPT}}

@@ -94,6 +94,8 @@ def _published(file: Path) -> dict[str, Any] | None:
         return dict(report.get("files", {})) if {"settings", "inputs", "tiles"} <= report.keys() else None
     except FileNotFoundError:
         return {}
+    except PermissionError as error:
+        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}: change its rights") from error
     except (OSError, ValueError, AttributeError, TypeError, RecursionError):
         return None
 

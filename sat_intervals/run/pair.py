@@ -14,7 +14,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import RUN_FILES, Image, remove_scratch
 from sat_intervals.results import open_run
-from sat_intervals.run.assemble import assemble, end_run, remove_tiles
+from sat_intervals.run.assemble import Assembled, assemble, end_run, remove_tiles
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
@@ -122,11 +122,8 @@ def _match_pair(
             progress("kernels", 1, 1)
         with job.store.needed(job.manifest):
             match()
-            report, published = assemble_repaired(
-                job, connection.client, match, seconds, progress, keep_tiles=keep_tiles
-            )
-        end_run(job, published, keep_tiles=keep_tiles)
-    return report
+            made = assemble_repaired(job, connection.client, match, seconds, progress, keep_tiles=keep_tiles)
+        return end_run(job, made, keep_tiles=keep_tiles)
 
 
 def find_on(
@@ -150,7 +147,7 @@ def assemble_repaired(
     progress: Progress,
     *,
     keep_tiles: bool,
-) -> tuple[dict[str, Any], dict[str, str]]:
+) -> Assembled:
     """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles or parts."""
     for _ in range(_TRIES):
         try:

@@ -76,6 +76,8 @@ class LocalFolder:
                 return file.read()
         except FileNotFoundError:
             return None
+        except IsADirectoryError as error:
+            raise _is_folder(self.path / name) from error
 
     def read_parts(self, parts: Sequence[tuple[str, int, int]]) -> list[bytes | None]:
         """See `Folder`."""
@@ -250,6 +252,8 @@ class LocalFolder:
             except OSError as error:
                 if isinstance(error, (FileNotFoundError, FileExistsError)) and not is_late:
                     continue  # deleted by the last owner of the lock
+                if isinstance(error, IsADirectoryError):
+                    raise _is_folder(file) from error
                 raise SatIntervalsError(f"{self} cannot be written: {error.strerror}: choose another folder") from error
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -349,3 +353,7 @@ def _opened(file: Path, flags: int) -> int:
         os.close(lock)
         raise OSError(errno.EINVAL, f"{file.name} is not a regular file")
     return lock
+
+
+def _is_folder(place: Path) -> SatIntervalsError:
+    return SatIntervalsError(f"{place} is a folder: move it away")

@@ -1,5 +1,6 @@
 """A damaged store, or one in a folder with files of the user: right bytes or a clear error, and nothing lost."""
 
+import errno
 import itertools
 import json
 import os
@@ -23,7 +24,7 @@ from sat_intervals.config.pairs import PairOfBatch
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.results import open_run
-from sat_intervals.run import before
+from sat_intervals.run import before, output
 from sat_intervals.run import pair as run
 from sat_intervals.run.assemble import assemble
 from sat_intervals.run.batch import match_batch
@@ -393,11 +394,23 @@ MARKS = [".sat-intervals.finished", ".sat-intervals.replacing"]
 
 
 @pytest.mark.parametrize("name", ["manifest.json", ".sat-intervals.store", *MARKS, "arrays.zarr/zarr.json"])
-def test_match__does_not_wait_for_a_pipe_among_its_tiles(scene, tmp_path, name):
+@pytest.mark.parametrize(("make", "kind"), [(os.mkfifo, "a named pipe"), (os.mkdir, "a folder: move it away\n")])
+def test_match__names_a_pipe_or_folder_among_its_tiles(scene, tmp_path, name, make, kind):
     tiles = unfinished(scene, tmp_path / "out")
     (tiles / name).unlink(missing_ok=True)
-    os.mkfifo(tiles / name)
-    assert f"{tiles / name} is a named pipe" in match(scene, tmp_path / "out", status=2)
+    make(tiles / name)
+    assert f"{tiles / name} is {kind}" in match(scene, tmp_path / "out", status=2)
+
+
+def test_match__names_a_report_that_it_may_not_read(scene, tmp_path, monkeypatch):
+    out = shutil.copytree(scene / "kept", tmp_path / "out")
+
+    def refused(path):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(output, "open_regular", refused)
+    said = match(scene, out, "--overwrite", status=2)
+    assert f"{out / 'run.json'} cannot be read: Permission denied: change its rights\n" in said
 
 
 def with_files(folder, names):
