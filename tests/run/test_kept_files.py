@@ -455,9 +455,10 @@ def test_match_pair__is_complete_where_its_tiles_cannot_be_removed(small_pair, m
     tiles, publish = folder / "out" / "tiles", OutputWriter.publish
 
     def and_exchanged(*arguments, **named):
-        publish(*arguments, **named)
+        published = publish(*arguments, **named)
         tiles.rename(folder / "away")
         tiles.symlink_to(folder / "away")
+        return published
 
     monkeypatch.setattr(OutputWriter, "publish", and_exchanged)
     report = match_pair(folder / "left.tif", folder / "right.tif", folder / "out", settings)
@@ -945,7 +946,7 @@ def test_match__takes_no_run_that_was_copied_there_for_its_own(runs, tmp_path, m
     def publish_after_a_copy(*arguments, **options):
         for name in NAMES:
             shutil.copy(folder / "two" / name, out)
-        publish(*arguments, **options)
+        return publish(*arguments, **options)
 
     monkeypatch.setattr(OutputWriter, "publish", publish_after_a_copy)
     with pytest.raises(RunError, match="is not of this run"):
