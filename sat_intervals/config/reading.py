@@ -117,6 +117,8 @@ def read_yaml(file: Path) -> Mapping[str, Any]:
         preset = isinstance(error, FileNotFoundError) and file.suffix == ".yaml" and file.stem in PRESETS
         hint = f" (give --preset {file.stem} for the preset of the package)" if preset else ""
         raise ConfigError(f"{file}: {error.strerror}{hint}") from error
+    if not values:
+        raise ConfigError(f"{file} has no settings, or was cut off: restore it, or leave it out for the defaults")
     if {"key", "levels"} <= values.keys():
         raise ConfigError(f"{file} is a calibration: give it by --calibration, with --coverage")
     return values

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.products import POINTS
 from sat_intervals.raster import read_layers, read_shape, read_tags
 from sat_intervals.raster.published import check_points
@@ -50,6 +50,8 @@ def read_points(path: Path, window: Window) -> tuple[np.ndarray, np.ndarray]:
         A pixel has some of longitude, latitude and height, but not all.
     """
     bands = read_layers(path, window)
+    if len(bands) != len(POINTS):
+        raise RunError(f"{path} was replaced by another file while it was read: rerun the command")
     known = np.isfinite(bands[: POINT["height"] + 1])
     if (known != known[0]).any():
         raise SatIntervalsError(f"{path} is damaged, some pixels have only part of a point: triangulate again")

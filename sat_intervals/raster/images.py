@@ -200,6 +200,22 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
         ) from error
 
 
+def check_holds(dataset: DatasetReader, path: str, window: Window, band: int = 1) -> None:
+    """Raise if a raster lacks a window or a band that it had when it was opened before.
+
+    Raises
+    ------
+    RunError
+        Gives its size now.
+    """
+    bottom, right = window.row + window.height, window.column + window.width
+    if bottom > dataset.height or right > dataset.width or band > dataset.count:
+        raise RunError(
+            f"{path} has {dataset.count} x {dataset.height} x {dataset.width} pixels now, and others when it was "
+            "opened: another file took its place: rerun the command"
+        )
+
+
 def _absolute(path: str | os.PathLike[str]) -> str:
     """Return the absolute path of a local file, and other GDAL names unchanged.
 

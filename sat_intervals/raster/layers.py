@@ -20,7 +20,7 @@ from sat_intervals.errors import SatIntervalsError, check_regular
 from sat_intervals.raster import gdal
 from sat_intervals.raster.beside import check_beside, check_place
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.images import opened
+from sat_intervals.raster.images import check_holds, opened
 from sat_intervals.raster.publishing import (
     OutputError,
     check_opened,
@@ -250,6 +250,8 @@ def read_layers(path: str | os.PathLike[str], window: Window | None = None, band
     """
     area = window and RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(str(path), window) as dataset:
+        if window:
+            check_holds(dataset, str(path), window, band or 1)
         return np.asarray(dataset.read(band, window=area))
 
 

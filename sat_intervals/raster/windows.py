@@ -9,7 +9,7 @@ from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import InputError
 from sat_intervals.products import MASKED, NO_DATA
-from sat_intervals.raster.images import Image, opened
+from sat_intervals.raster.images import Image, check_holds, opened
 from sat_intervals.tiling import View, Views, Window
 
 # Types whose values are all exact in float32.
@@ -102,6 +102,7 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
     area = RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(image.path, window) as dataset:
         image.check_complete(dataset)
+        check_holds(dataset, image.path, window, max(image.band, image.alpha or 1))
         values = dataset.read(image.band, window=area, out_shape=shape)
         usable = np.isfinite(values) & _differs(values, image.nodata)
         # GDAL's mask of a band uses only the first of mask, no-data value and alpha: combine them here.
@@ -112,6 +113,7 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
     state = ~usable * np.uint8(NO_DATA)
     if image.mask is not None:
         with opened(image.mask, window) as dataset:
+            check_holds(dataset, image.mask, window)
             state[dataset.read(1, window=area, out_shape=shape) != 0] |= MASKED
     return values, state
 

@@ -1,6 +1,7 @@
 """Surface models from made-up points."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -32,6 +33,7 @@ from sat_intervals.kernels.splat import AGREEING, COUNT, MEDIAN, NEAREST, cell_b
 from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
 from sat_intervals.raster import (
     POINT_FILES,
+    RUN_FILES,
     Georeferencing,
     OutputWriter,
     Projection,
@@ -123,6 +125,24 @@ def test_surface__of_several_runs_is_left_out_where_another_of_them_was_made_aga
     assert "dsm.tif is " in invoke(command, one).stderr
     shutil.rmtree(other)  # nothing to compare with
     assert "dsm.tif is" not in invoke(command, one).stderr
+
+
+@pytest.mark.parametrize("shape", [(20, 20), (9, 9)])
+def test_dsm__names_points_that_another_raster_replaces_while_it_reads_them(tmp_path, monkeypatch, shape):
+    y, x = np.mgrid[:20, :20]
+    out = write_points(tmp_path / "run", x, y, np.full(x.shape, 100.0))
+    middle = of_dsm.point_near_the_middle
+
+    def replaced_after(runs):
+        place = middle(runs)
+        write_file(out / "points.tif", RUN_FILES[0], np.ones((4, *shape)))
+        return place
+
+    monkeypatch.setattr(of_dsm, "point_near_the_middle", replaced_after)
+    done = invoke("dsm", out, "--resolution", "1")
+    assert done.exit_code == 1
+    assert re.search(r"points\.tif (was replaced by another file|has 4 x 9 x 9 pixels now)", done.stderr), done.stderr
+    assert not (out / "dsm.tif").exists()
 
 
 @pytest.mark.parametrize("command", ["stac", "project", "plot"])

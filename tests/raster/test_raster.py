@@ -30,7 +30,7 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
 
-from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
     POINT_FILES,
@@ -1103,3 +1103,21 @@ def test_whole_file__deletes_what_a_killed_process_left_and_nothing_else(tmp_pat
         new.write_text("whole")
     assert sorted(tmp_path.iterdir()) == [foreign, path]
     assert (path.read_text(), foreign.read_text()) == ("whole", "mine")
+
+
+@pytest.mark.parametrize("shape", [(2, 9, 20), (2, 10, 19), (1, 10, 20)])
+def test_reading__names_a_raster_that_one_of_another_size_replaced(tmp_path, shape):
+    """Else it gives fewer pixels than were asked for, which fails somewhere else."""
+
+    def write(count, height, width):
+        kind = {"transform": rasterio.Affine.scale(0.5, -0.5), "dtype": "uint8"}
+        with rasterio.open(tmp_path / "a.tif", "w", "GTiff", width, height, count, **kind) as dataset:
+            dataset.write(np.ones((count, height, width), np.uint8))
+
+    write(2, 10, 20)
+    image, window = open_image(tmp_path / "a.tif", band=2), Window(4, 5, 6, 15)
+    write(*shape)
+    said = rf"a.tif has {shape[0]} x {shape[1]} x {shape[2]} pixels now, .*: another file took its place: rerun"
+    for read in (lambda: read_window(image, window), lambda: read_layers(image.path, window, 2)):
+        with pytest.raises(RunError, match=said):
+            read()
