@@ -327,7 +327,7 @@ def _checked_place(file: Path, bands: int, region: Window, published: dict[str, 
     GDAL decodes most flipped bits of a compressed block without an error. Earlier versions wrote no checksums.
     """
     if not file.exists():
-        raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or rerun match")
+        raise SatIntervalsError(f"{file} is missing: give the folder of a finished run, or match with --overwrite")
     check_file(file, "move it away and match again with --overwrite")
     if published and published != checksum_of(file):
         raise SatIntervalsError(

@@ -136,7 +136,8 @@ def make_truth(
         triangulated([run.out])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     if registers:
-        work.check_points()
+        with run.unchanged("points.tif"):
+            work.check_points()
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))
     tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), "REGION": run.region.in_words, **MARK}

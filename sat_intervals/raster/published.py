@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.errors import SatIntervalsError, open_regular
+from sat_intervals.errors import InputError, SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of, known_checksum
 from sat_intervals.raster.layers import read_alone, read_tags
@@ -122,5 +122,5 @@ def tags_beside(path: str | Path, left: Mapping[str, Any]) -> dict[str, str]:
 def _tags(path: Path) -> dict[str, str]:
     try:
         return read_tags(path)
-    except SatIntervalsError as error:
+    except InputError as error:
         raise SatIntervalsError(f"{path} cannot be read: it is damaged or something else: move it away") from error

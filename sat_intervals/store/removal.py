@@ -77,6 +77,8 @@ def drop_earlier(folder: Folder | None, *, is_at_home: bool, overwrite: bool) ->
 
 def unusable(folder: Folder, error: OSError, how: str) -> StoreError:
     """Return the error for a folder of tiles that cannot be ``how``, such as "used", with the way out."""
+    if Path(str(folder)).is_symlink():
+        return StoreError(f"{folder} is a symbolic link: move it away")
     way_out = "move it away" if error.errno in _REPLACED else "make room, check its rights or choose another folder"
     if "://" in str(folder):
         way_out = _ON_SERVER

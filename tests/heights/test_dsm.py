@@ -1,6 +1,7 @@
 """Surface models from made-up points."""
 
 import json
+import os
 import re
 import shutil
 import signal
@@ -153,6 +154,8 @@ def test_surface__that_cannot_be_read_is_named(tmp_path, command):
     done = invoke(command, out)
     assert done.exit_code == 2
     assert "dsm.tif cannot be read: it is damaged or something else: move it away" in done.stderr
+    os.mkfifo(out / "dsm.tif.aux.xml")
+    assert "dsm.tif.aux.xml is a named pipe" in invoke(command, out).stderr
 
 
 def cell_of(place, x, y):

@@ -23,6 +23,7 @@ from sat_intervals.raster import MARK, Georeferencing, Projection, Vertical, wri
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
     from sat_intervals.heights import point_files, point_sight
+    from sat_intervals.heights import reference as of_reference
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
     from sat_intervals.heights.sensors import Sensors
     from sat_intervals.heights.triangulate import triangulate
@@ -405,6 +406,21 @@ def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_
     with pytest.raises(RunError, match=r"heights.tif was replaced or changed while it was read: rerun the command"):
         make_truth(out, SensorFiles(*files), given_heights, path=tmp_path / "truth.tif", progress=replace)
     assert not (tmp_path / "truth.tif").exists()
+
+
+def test_reference_command__names_the_run_that_is_replaced_while_its_points_are_checked(relief, tmp_path, monkeypatch):
+    out, files, heights = relief
+    out = shutil.copytree(out, tmp_path / "out")
+    read = of_reference.read_layers
+
+    def moved(path, *arguments, **named):
+        os.utime(path, ns=(0, 0))
+        return read(path, *arguments, **named) + 5
+
+    monkeypatch.setattr(of_reference, "read_layers", moved)
+    done = invoke("reference", out, "--heights", heights, "--ellipsoid", *sensor_words(files))
+    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
+    assert f"the run in {out} was replaced while it was read: rerun the command" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["p.dbf", "p.csvt", "p.gpkg-wal"])

@@ -338,6 +338,15 @@ def test_match__does_not_say_that_it_removed_tiles_without_a_sign_of_a_run(scene
     assert contents(out / "tiles" / "arrays.zarr") == tiles
 
 
+def test_match__names_a_link_in_the_place_of_its_folder_in_a_store(scene, tmp_path):
+    store = tmp_path / "store"
+    match(scene, tmp_path / "out", "--store", store, "--keep-tiles")
+    (folder,) = store.iterdir()
+    folder.symlink_to(folder.rename(tmp_path / "elsewhere"))
+    said = match(scene, tmp_path / "other", "--store", store, status=2)
+    assert f"{folder} is a symbolic link: move it away\n" in said
+
+
 @pytest.mark.parametrize("how", ["empty", "half", "gone"])
 def test_match__overwrites_tiles_in_a_store_whose_manifest_a_power_loss_damaged(scene, tmp_path, how):
     out, store = tmp_path / "out", tmp_path / "store"
