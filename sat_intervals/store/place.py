@@ -5,6 +5,7 @@ names too, and only folders named after their own manifest or mark are deleted t
 """
 
 import json
+import os
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, digest, parsed
 
 # File in the folder of a run that names the location of its tiles, if they are elsewhere.
 PLACE = ".sat-intervals.store"
+# File beside tiles in a store that has the path of `home`, whose run made them.
+HOME = ".sat-intervals.home"
 
 
 class ElsewhereError(StoreError):
@@ -67,3 +70,11 @@ def run_of(folder: Folder) -> str:
     with suppress(StoreError):
         run = digest(parsed(folder.read(MANIFEST) or "", folder))
     return run if str(folder).endswith(run) else ""
+
+
+def is_of_another(folder: Folder, home: Path) -> bool:
+    """Return whether another folder made the tiles in a folder of a store and still names it: this one is a copy."""
+    maker = Path(folder.read(HOME) or home)
+    if not maker.is_absolute() or os.path.realpath(maker) == os.path.realpath(home):
+        return False
+    return folder_at(maker).read(PLACE) == json.dumps(str(folder))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sat_intervals.store.folder import MADE, Folder, folder_at
 from sat_intervals.store.manifest import MANIFEST, StoreError, grid_of, parsed
-from sat_intervals.store.place import PLACE, run_of
+from sat_intervals.store.place import HOME, PLACE, is_of_another, run_of
 
 # Errors that mean that a link or another folder took the place of one.
 _REPLACED = errno.ELOOP, errno.ESTALE
@@ -22,7 +22,7 @@ BORDERS, PIXELS, COSTS, PARTS = "borders", "pixels", "costs", "parts"
 FOLDERS = RECORDS, FAILURES, BORDERS, PIXELS, COSTS, PARTS
 NORMALIZATION, SEARCH = "normalization.json", "range.json"
 _OF_RUN = re.compile(
-    rf"{re.escape(MADE)}|{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
+    rf"{re.escape(MADE)}|{re.escape(HOME)}|{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
 )
 _PART = re.compile(rf"{PARTS}/(?:[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)|[0-9a-f]{{8}}_current)")
 _OF_TILE = re.compile(
@@ -54,8 +54,10 @@ def drop(folder: Folder) -> bool:
     return is_dropped or not names
 
 
-def drop_earlier(folder: Folder | None, *, is_at_home: bool, overwrite: bool) -> None:
-    """Delete the tiles of an earlier run, if there are any; those in a store that cannot be reached are kept.
+def drop_earlier(folder: Folder | None, home: Path, *, overwrite: bool) -> None:
+    """Delete the tiles of an earlier run in the folder ``home``, if there are any.
+
+    Those in a store that cannot be reached, or that another folder made of which this is a copy, are kept.
 
     Raises
     ------
@@ -64,9 +66,9 @@ def drop_earlier(folder: Folder | None, *, is_at_home: bool, overwrite: bool) ->
     """
     if folder is None:
         return
-    if not is_at_home:
+    if folder != folder_at(home):
         with suppress(OSError):
-            if overwrite and (run := run_of(folder)):
+            if overwrite and (run := run_of(folder)) and not is_of_another(folder, home):
                 drop(folder.of_run(run))
         return
     try:

@@ -23,7 +23,7 @@ from sat_intervals.errors import RemovedTilesError, RunError, SatIntervalsError
 from sat_intervals.store.folder import MADE, Folder, folder_at, mark
 from sat_intervals.store.manifest import MANIFEST, StoreError, check_same, digest, grid_of, parsed, sealed, unsealed
 from sat_intervals.store.marks import FINISHED, REPLACING, check_replacing
-from sat_intervals.store.place import PLACE, ElsewhereError, place_of
+from sat_intervals.store.place import HOME, PLACE, ElsewhereError, is_of_another, place_of
 from sat_intervals.store.removal import (
     ARRAYS,
     FAILURES,
@@ -151,7 +151,7 @@ class Store:
             if self.elsewhere and (there := unsealed(folder.read(MANIFEST))) and digest(there) != self.run:
                 raise StoreError(f"{folder} has the tiles of another run, which were moved there: move them away")
             self._place.make("")  # fails before anything is deleted
-            drop_earlier(None if text else before, is_at_home=before == home, overwrite=overwrite)
+            drop_earlier(None if text else before, self.home, overwrite=overwrite)
             if overwrite or (text is None and not self.elsewhere):
                 drop(folder if self.elsewhere else home)
             self._place.make("")
@@ -165,6 +165,8 @@ class Store:
             if overwrite:
                 home.write(REPLACING, json.dumps({"run": self.run, "files": dict(replaceable or {})}))
             if self.elsewhere:
+                if not is_of_another(folder, self.home):
+                    folder.write(HOME, str(self.home))
                 home.write(PLACE, json.dumps(str(folder)))
             else:
                 home.delete(PLACE)

@@ -338,6 +338,21 @@ def test_match__does_not_say_that_it_removed_tiles_without_a_sign_of_a_run(scene
     assert contents(out / "tiles" / "arrays.zarr") == tiles
 
 
+@pytest.mark.parametrize("way", ["copy", "renamed"])
+def test_match__overwrites_no_tiles_in_a_store_that_the_original_of_its_folder_made(scene, tmp_path, way):
+    store, out, other = (tmp_path / name for name in ("store", "out", "other"))
+    match(scene, out, "--store", store, "--keep-tiles")
+    (folder,) = store.iterdir()
+    before = contents(folder)
+    shutil.copytree(out, other) if way == "copy" else out.rename(other)
+    match(scene, other, "--store", store, "--overwrite", "--tile-size", "128")
+    assert folder.exists() == (way == "copy")
+    if way == "copy":
+        assert contents(folder) == before
+        match(scene, out, "--store", store, "--overwrite", "--tile-size", "128")
+    assert not any(store.iterdir())
+
+
 def test_match__names_a_link_in_the_place_of_its_folder_in_a_store(scene, tmp_path):
     store = tmp_path / "store"
     match(scene, tmp_path / "out", "--store", store, "--keep-tiles")
