@@ -14,7 +14,7 @@ from sat_intervals.store.manifest import MANIFEST, StoreError, digest, parsed
 
 # File in the folder of a run that names the location of its tiles, if they are elsewhere.
 PLACE = ".sat-intervals.store"
-# File beside tiles in a store that has the path of `home`, whose run made them.
+# File beside tiles in a store that names the `home` whose run made them.
 HOME = ".sat-intervals.home"
 
 
@@ -74,7 +74,10 @@ def run_of(folder: Folder) -> str:
 
 def is_of_another(folder: Folder, home: Path) -> bool:
     """Return whether another folder made the tiles in a folder of a store and still names it: this one is a copy."""
-    maker = Path(folder.read(HOME) or home)
-    if not maker.is_absolute() or os.path.realpath(maker) == os.path.realpath(home):
+    try:
+        maker = json.loads(folder.read(HOME) or "null")
+        if not os.path.isabs(maker) or os.path.realpath(maker) == os.path.realpath(home):
+            return False
+    except (ValueError, TypeError, RecursionError):  # missing or damaged
         return False
     return folder_at(maker).read(PLACE) == json.dumps(str(folder))

@@ -166,7 +166,7 @@ class Store:
                 home.write(REPLACING, json.dumps({"run": self.run, "files": dict(replaceable or {})}))
             if self.elsewhere:
                 if not is_of_another(folder, self.home):
-                    folder.write(HOME, str(self.home))
+                    folder.write(HOME, json.dumps(str(self.home)))
                 home.write(PLACE, json.dumps(str(folder)))
             else:
                 home.delete(PLACE)

@@ -353,6 +353,17 @@ def test_match__overwrites_no_tiles_in_a_store_that_the_original_of_its_folder_m
     assert not any(store.iterdir())
 
 
+@pytest.mark.parametrize("text", ["", "{", "5", '"/a\\u0000"', '"s3://bucket/tiles"'])
+def test_match__overwrites_tiles_whose_note_of_their_maker_is_damaged(scene, tmp_path, text):
+    store = tmp_path / "store"
+    match(scene, tmp_path / "out", "--store", store, "--keep-tiles")
+    (note,) = store.glob("*/.sat-intervals.home")
+    assert json.loads(note.read_text()) == str(tmp_path / "out" / "tiles")
+    note.write_text(text)
+    match(scene, tmp_path / "out", "--store", store, "--overwrite", "--tile-size", "128")
+    assert not any(store.iterdir())
+
+
 def test_match__names_a_link_in_the_place_of_its_folder_in_a_store(scene, tmp_path):
     store = tmp_path / "store"
     match(scene, tmp_path / "out", "--store", store, "--keep-tiles")
