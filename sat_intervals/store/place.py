@@ -76,8 +76,9 @@ def is_of_another(folder: Folder, home: Path) -> bool:
     """Return whether another folder made the tiles in a folder of a store and still names it: this one is a copy."""
     try:
         maker = json.loads(folder.read(HOME) or "null")
-        if not os.path.isabs(maker) or os.path.realpath(maker) == os.path.realpath(home):
-            return False
-    except (ValueError, TypeError, RecursionError):  # missing or damaged
+        is_elsewhere = os.path.isabs(maker) and os.path.realpath(maker) != os.path.realpath(home)
+        return is_elsewhere and folder_at(maker).read(PLACE) == json.dumps(str(folder))
+    except PermissionError:  # that of another user, who may still need them
+        return True
+    except (NotADirectoryError, ValueError, TypeError, RecursionError):  # the note is missing or damaged
         return False
-    return folder_at(maker).read(PLACE) == json.dumps(str(folder))

@@ -22,7 +22,8 @@ BORDERS, PIXELS, COSTS, PARTS = "borders", "pixels", "costs", "parts"
 FOLDERS = RECORDS, FAILURES, BORDERS, PIXELS, COSTS, PARTS
 NORMALIZATION, SEARCH = "normalization.json", "range.json"
 _OF_RUN = re.compile(
-    rf"{re.escape(MADE)}|{re.escape(HOME)}|{MANIFEST}|{NORMALIZATION}|{SEARCH}|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
+    rf"{re.escape(MADE)}|{re.escape(HOME)}|{MANIFEST}|{NORMALIZATION}|{SEARCH}"
+    rf"|{ARRAYS}/(u?int\d+/|right/|seams/|histogram/)?zarr\.json"
 )
 _PART = re.compile(rf"{PARTS}/(?:[0-9a-f]{{32}}_\d+_\d+(?:\.json|_[a-z]+)|[0-9a-f]{{8}}_current)")
 _OF_TILE = re.compile(

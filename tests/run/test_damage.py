@@ -353,7 +353,7 @@ def test_match__overwrites_no_tiles_in_a_store_that_the_original_of_its_folder_m
     assert not any(store.iterdir())
 
 
-@pytest.mark.parametrize("text", ["", "{", "5", '"/a\\u0000"', '"s3://bucket/tiles"'])
+@pytest.mark.parametrize("text", ["", "{", "5", '"/a\\u0000"', '"s3://bucket/tiles"', '"/dev/null"'])
 def test_match__overwrites_tiles_whose_note_of_their_maker_is_damaged(scene, tmp_path, text):
     store = tmp_path / "store"
     match(scene, tmp_path / "out", "--store", store, "--keep-tiles")
