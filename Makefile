@@ -5,8 +5,6 @@ EXTRAS ?= test,lint,plot
 
 BIN := $(VENV)/bin
 READY := $(VENV)/.has-$(EXTRAS)
-MINUTES ?= 60
-SEED ?= 1
 
 # One worker runs a whole file, so that its fixtures are prepared once.
 PYTEST := $(BIN)/python -m pytest $(OPTIONS)
@@ -15,7 +13,7 @@ PARALLEL := -n logical --maxprocesses 8 --dist loadfile
 # Python keeps the bytecode of what it imports: each process would otherwise compile it again, in seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lint hostile bench bench-seams surface-bounds tune calibration coverage pictures docs dist clean
+.PHONY: demo test test-all lint bench bench-seams surface-bounds tune calibration coverage pictures docs dist clean
 
 demo: $(VENV)/.has-plot
 	$(BIN)/sat-intervals demo demo-out --overwrite --size 800 800
@@ -40,12 +38,6 @@ lint: $(READY)
 # The tables of docs/speed.md: this project beside its peers; about fifteen minutes.
 bench: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/table.py
-
-# Hostile use at random moments for an hour, or MINUTES=5: prints what it finds and keeps it in build/hostile.
-hostile: $(VENV)/.has-dsm,plot,test
-	rm -rf build/hostile
-	mkdir -p build
-	$(BIN)/python tests/hostile.py build/hostile --minutes $(MINUTES) --seed $(SEED)
 
 # The tables of docs/speed.md on exact seams; about seven minutes.
 bench-seams: $(VENV)/.has-bench

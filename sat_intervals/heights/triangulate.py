@@ -16,8 +16,8 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import POINT_FILES, OutputWriter, examined, read_tags
 from sat_intervals.raster.identity import checksum_of
+from sat_intervals.raster.old_publishing import POINTS_REPORT
 from sat_intervals.raster.published import POINTS_FILE, published_points
-from sat_intervals.raster.publishing import POINTS_REPORT
 from sat_intervals.raster.seal import is_as_made
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window

@@ -28,9 +28,9 @@ from sat_intervals.raster.layers import (
     write_layer,
     write_once,
 )
+from sat_intervals.raster.old_publishing import OutputError, examined, stamps
 from sat_intervals.raster.overviews import read_small_image, read_small_layers
 from sat_intervals.raster.projection import Projection, geoid_grid, grid_mapping, utm_of
-from sat_intervals.raster.publishing import OutputError, examined, stamps
 from sat_intervals.raster.space import check_space, file_bytes, part_bytes
 from sat_intervals.raster.surfaces import (
     check_reference,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sat_intervals.raster.files import File
 from sat_intervals.raster.identity import checksum_of
-from sat_intervals.raster.publishing import (
+from sat_intervals.raster.old_publishing import (
     POINTS_REPORT,
     REPLACED,
     REPORTS,

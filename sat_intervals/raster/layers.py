@@ -21,7 +21,7 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.beside import check_beside, check_place
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.images import check_holds, opened
-from sat_intervals.raster.publishing import (
+from sat_intervals.raster.old_publishing import (
     OutputError,
     check_opened,
     check_own,

@@ -11,7 +11,7 @@ from sat_intervals.errors import InputError, SatIntervalsError, open_regular
 from sat_intervals.raster.files import POINT_FILES
 from sat_intervals.raster.identity import checksum_of, known_checksum
 from sat_intervals.raster.layers import read_alone, read_tags
-from sat_intervals.raster.publishing import POINTS_REPORT, RUN_REPORT
+from sat_intervals.raster.old_publishing import POINTS_REPORT, RUN_REPORT
 from sat_intervals.raster.seal import check_seal, seal_of
 
 POINTS_FILE = POINT_FILES[0].name

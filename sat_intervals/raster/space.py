@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sat_intervals.raster.files import File
-from sat_intervals.raster.publishing import OutputError
+from sat_intervals.raster.old_publishing import OutputError
 
 WAY_OUT = "free disk space or choose another folder"
 # Errors of the path: more space does not help.

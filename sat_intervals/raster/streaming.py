@@ -16,7 +16,7 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.raster.blocks import BLOCK, COLUMNS, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import File
-from sat_intervals.raster.publishing import open_own
+from sat_intervals.raster.old_publishing import open_own
 
 # Bytes of a pixel of which COLUMNS are compressed at a time, fewer of larger ones: each thread has some copies.
 _PIXEL = 16

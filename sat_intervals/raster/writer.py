@@ -26,7 +26,7 @@ from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.hidden import HiddenFolder
 from sat_intervals.raster.identity import checksum_of, checksum_of_text
 from sat_intervals.raster.layers import SUM_WRAPS, sum_of_bits
-from sat_intervals.raster.publishing import OutputError, flush, stamps
+from sat_intervals.raster.old_publishing import OutputError, flush, stamps
 from sat_intervals.raster.space import check_space, file_bytes, way_out
 from sat_intervals.raster.streaming import Stream
 

@@ -9,7 +9,7 @@ from typing import Any
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.progress import Progress
 from sat_intervals.raster import OutputWriter, Part, run_files
-from sat_intervals.raster.publishing import open_own
+from sat_intervals.raster.old_publishing import open_own
 from sat_intervals.run.job import Job
 from sat_intervals.run.parts import codecs_of, rows_of_levels
 from sat_intervals.run.strips import on_worker
