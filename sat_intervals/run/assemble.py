@@ -1,35 +1,47 @@
-"""Assemble the files of a run from its tiles: strips, final bands, report."""
+"""Put the files of a run together from finished parts, compare its inputs, and publish."""
 
+import filecmp
+import json
 import logging
+import os
 import platform
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from sat_intervals.config import Config, calibration_of
-from sat_intervals.errors import RemovedTilesError, RunError
-from sat_intervals.match.postprocess import ConfidenceScale
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
-from sat_intervals.raster import OutputError, OutputWriter, run_files
-from sat_intervals.raster.identity import compared
-from sat_intervals.run.copying import assemble_files
-from sat_intervals.run.inputs import appeared_file
-from sat_intervals.run.job import Job
-from sat_intervals.run.output import check_still_published
+from sat_intervals.raster import OutputError, OutputWriter, Part, run_files
+from sat_intervals.raster.publishing import write_file
+from sat_intervals.run.inputs import check_unchanged
+from sat_intervals.run.job import Job, origin_of, remove_tiles
 from sat_intervals.run.quality import quality_of, warnings_of
-from sat_intervals.run.scale import checked_scale
 from sat_intervals.run.seams import seam_report
+from sat_intervals.run.state import RUN_REPORT
 from sat_intervals.run.statistics import Tally
-from sat_intervals.run.strips import finish_strips
-from sat_intervals.run.workers import Workers, reason
-from sat_intervals.store.manifest import sealed
-from sat_intervals.store.marks import replaceable_files
-from sat_intervals.store.tiles import Records
+from sat_intervals.run.strips import (
+    PartKey,
+    check_codecs,
+    damaged_parts,
+    finish_strips,
+    part_name,
+    parts_of,
+    rows_of_levels,
+)
+from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, reason
+from sat_intervals.store.arrays import DamagedFileError
+from sat_intervals.store.folder import folder_at
+from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PARTS, PIXELS, Tables, home_of
 
 # Meanings of some of the counts, for readers of run.json.
 _COUNTS_MEANING = {
@@ -39,15 +51,10 @@ _COUNTS_MEANING = {
     "causes": "invalid pixels, each under its first flag that makes it invalid; with valid they add up to pixels",
     "flags": "pixels with the flag, valid or not; a pixel may have several flags",
 }
+# Threads of this process that copy parts which workers cannot copy: one reads while another writes.
+_THREADS = 2
 
 _LOG = logging.getLogger(__name__)
-
-
-class Assembled(NamedTuple):
-    """The content of ``run.json`` without its checksum, and the `stamps` of the published files."""
-
-    report: dict[str, Any]
-    published: dict[str, str]
 
 
 def assemble(
@@ -56,20 +63,23 @@ def assemble(
     seconds: dict[str, float],
     progress: Progress,
     *,
-    keep_tiles: bool = False,
-) -> Assembled:
-    """Write the files of a run whose tiles are done.
+    overwrite: bool,
+    keep_tiles: bool,
+) -> dict[str, Any]:
+    """Write and publish the files of a run whose tiles are done; return the content of ``run.json``.
 
     Parameters
     ----------
     job
         The pair.
     client
-        Returns the client of the cluster that finishes strips.
+        Returns the workers.
     seconds
         Times of earlier stages; those of this one are added.
     progress
         Called after each strip.
+    overwrite
+        Whether files of another run may be replaced.
     keep_tiles
         Whether the tiles are kept.
 
@@ -78,105 +88,54 @@ def assemble(
     DamagedTilesError
         Tiles must be matched, or strips finished again.
     RunError
-        A strip failed, or a file cannot be written.
+        A strip failed, a file cannot be written, or an input has changed.
     SatIntervalsError
-        No pixel could be matched.
+        No pixel could be matched, or a file would be replaced.
     """
-    region = job.store.grid.region
-    place = job.left.georeferencing.shifted(region)
-    files = run_files(job.config.products.compression)
-    records = job.store.records()
-    scale = checked_scale(job, records)
+    region, tables = job.store.grid.region, job.store.tables()
+    scale = scale_of(job, tables)
+    with logged_stage(seconds, "bands"):
+        parts = finish_strips(job, client, scale, progress)
+    files, place = run_files(job.config.products.compression), job.left.georeferencing.shifted(region)
     with (
         _resumable(),
         OutputWriter(job.out, files, region.height, region.width, place, _tags(job.config)) as writer,
-        compared(job.files) as differing,  # no step reads images any more
     ):
-        with logged_stage(seconds, "bands"):
-            parts, workers = finish_strips(job, client, scale, records, progress)
         with logged_stage(seconds, "files"):
-            assemble_files(job, writer, parts, workers, progress)
-            if keep_tiles:  # strips of a killed run are finished without reading its tiles again
-                job.store.keep(records)
-            job.check_inputs()
-            steps = len(files) * len(parts)
-            progress("files", steps, steps)  # a last chance to interrupt the run before it publishes
+            _copy_parts(job, writer, parts, client, progress)
+            made = writer.build()
         with logged_stage(seconds, "inputs"):
-            _check_content(job, differing())
-        _add_seconds(seconds, records)
-        report = _report(job, records, scale, parts.values(), seconds, writer.build())
+            check_unchanged(job.inputs, job.left, job.right, job.config)
+        report = _report(job, tables, scale, parts.values(), seconds)
         for line in report["warnings"]:
             _LOG.warning("%s", line)
-        published = _publish(job, writer, report, keep_tiles=keep_tiles)
-        progress("files", steps, steps)
-    return Assembled(report, published)
+        _publish(job, writer, made, report, overwrite=overwrite)
+    end_tiles(job, keep_tiles=keep_tiles)
+    return report
 
 
-def _check_content(job: Job, name: str | None) -> None:
-    """Raise if the content of an input has changed or a file beside it has appeared.
-
-    If no time of the input has changed, the tiles are deleted, since they cannot be trusted.
-    """
-    if name is not None:
-        job.check_inputs()
-        job.store.remove()
-        raise RemovedTilesError(
-            f"{name} was changed during the run without a change of its modification time, as through a memory map: "
-            "the tiles of the run are deleted: rerun the command when the file is complete"
-        )
-    if file := appeared_file(job.left, job.right, job.files):
-        job.store.remove()
-        raise RemovedTilesError(f"{file} appeared during the run, whose tiles are deleted: rerun the command")
+def _publish(
+    job: Job, writer: OutputWriter, made: Mapping[str, Path], report: dict[str, Any], *, overwrite: bool
+) -> None:
+    """Give the files their names, ``run.json`` last; files that are there must be the same, unless ``overwrite``."""
+    for name, new in made.items():
+        there = job.out / name
+        if not overwrite and there.exists() and not filecmp.cmp(there, new, shallow=False):
+            raise SatIntervalsError(f"{there} is not of this run: move it away or give --overwrite; the tiles are kept")
+    (job.out / RUN_REPORT).unlink(missing_ok=True)  # with --overwrite: never beside files of another run
+    writer.publish()
+    write_file(job.out / RUN_REPORT, (json.dumps(report, indent=1) + "\n").encode())
 
 
-def _publish(job: Job, writer: OutputWriter, report: dict[str, Any], *, keep_tiles: bool) -> dict[str, str]:
-    def announce(stamps: list[str]) -> None:
-        if not keep_tiles:
-            job.store.mark_finished(job.name, stamps)
-
-    there = replaceable_files(job.store.home, job.store.run) or {}
-    published = writer.publish(("run.json", sealed(report) + "\n"), replaceable=there, announce=announce)
+def end_tiles(job: Job, *, keep_tiles: bool) -> None:
+    """Remove the tiles of a complete run, or what is beside them if they are kept."""
     try:
-        job.store.mark_replaced()
-        if keep_tiles:  # otherwise the parts are removed with them
-            job.parts().drop()
+        if keep_tiles:
+            job.store.remove([BORDERS, PIXELS, COSTS, PARTS, FAILURES])
+        else:
+            remove_tiles(job.out)
     except OSError as error:  # the run is complete
-        _LOG.warning("parts of the files stay in %s: %s", job.store.folder, reason(error))
-    return published
-
-
-def end_run(job: Job, assembled: Assembled, *, keep_tiles: bool) -> dict[str, Any]:
-    """Remove the tiles of a run whose files are published, unless they are kept; return its report.
-
-    Raises
-    ------
-    RunError
-        A file is no longer the published one.
-    """
-    if not keep_tiles:
-        check_still_published(job.out, assembled.published, has_tiles=True)
-        remove_tiles(job)
-    check_still_published(job.out, assembled.published, has_tiles=False)
-    return assembled.report
-
-
-def remove_tiles(job: Job) -> bool:
-    """Remove the tiles of a complete run, if they can be reached; return whether none are left."""
-    try:
-        if job.store.remove():
-            return True
-    except OSError as error:
-        _LOG.warning("the tiles of the complete run stay: %s", reason(error))
-    else:
-        _LOG.warning("files in %s stay: they have no sign that they are of this run", job.store.folder)
-    return False
-
-
-def _add_seconds(seconds: dict[str, float], records: Records) -> None:
-    """Add the seconds of all tiles by stage, and the total."""
-    for stage in ("read", "match", "write"):
-        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in records.values())
-    seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
+        _LOG.warning("tiles of the complete run stay: %s", reason(error))
 
 
 @contextmanager
@@ -188,6 +147,101 @@ def _resumable() -> Iterator[None]:
         raise RunError(f"{error}; rerun the same command: it resumes from the tiles, which are all done") from error
 
 
+# ---- Parts -------------------------------------------------------------------------------------------------
+def _copy_parts(
+    job: Job,
+    writer: OutputWriter,
+    metas: Mapping[PartKey, Mapping[str, Any]],
+    client: Callable[[], Workers],
+    progress: Progress,
+) -> None:
+    """Copy the finished parts of a run into its files, on workers that share its folder, else in this process."""
+    files, of = run_files(job.config.products.compression), parts_of(job)
+    done, total, damaged = 0, len(files) * len(metas), list[str]()
+    with _copiers(job, client) as copiers:
+
+        def copy_parts(path: Path, parts: Iterable[tuple[int, Part]]) -> None:
+            nonlocal done
+            retries = job.config.cluster.retries
+            tasks = (
+                Task(part.source, copy_part, (job, of, *part.source, path.absolute(), offset), retries)
+                for offset, part in parts
+            )
+            for outcome in copiers.outcomes(tasks):
+                if outcome is not None and outcome.error is not None:
+                    if isinstance(outcome.error, (OSError, SatIntervalsError)):
+                        raise outcome.error
+                    raise RunError(f"a part of {path} could not be copied: {reason(outcome.error)}") from outcome.error
+                if outcome is not None:
+                    done += 1
+                    damaged.extend(filter(None, [outcome.result]))
+                progress("files", done, total)
+
+        progress("files", 0, total)
+        for file in files:
+            levels = [
+                [Part(metas[level, row]["blocks"][file.kind], ((level, row), file.kind)) for row in range(count)]
+                for level, count in enumerate(rows_of_levels(job.store.grid.region))
+            ]
+            writer.assemble(file.name, levels, copy_parts)
+    if damaged:
+        raise damaged_parts(job, sorted(set(damaged)))
+
+
+@contextmanager
+def _copiers(job: Job, client: Callable[[], Workers]) -> Iterator[Workers]:
+    """Yield the workers if they reach the folder of the run, else threads of this process."""
+    if job.store.folder == folder_at(home_of(job.out)):
+        yield client()
+    else:
+        with closing(Threads(_THREADS)) as threads:
+            yield threads
+
+
+def copy_part(job: Job, of: str, key: PartKey, kind: str, path: Path, offset: int) -> str | None:
+    """Write a part into a file at an offset; return its name if it is damaged or missing. Runs on a worker."""
+    with picklable_errors():
+        check_codecs(job, of)
+        try:
+            with job.store.opened(PARTS, part_name(key), of) as archive:
+                content = archive[kind]
+        except DamagedFileError:
+            return part_name(key)
+        # not for reading: NFS would write whole pages, over bytes of the neighbours
+        with open(os.open(path, os.O_WRONLY), "wb") as stream:
+            stream.seek(offset)
+            stream.write(content.data)
+            stream.flush()
+            os.fsync(stream.fileno())
+    return None
+
+
+# ---- Scale of confidence -----------------------------------------------------------------------------------
+def scale_of(job: Job, tables: Tables) -> ConfidenceScale:
+    """Return the scale of confidence of a run; NaN without confidence. Raise if no pixel could be matched."""
+    if not tables.histogram.any():
+        raise _nothing_matched(job, tables)
+    nothing = ConfidenceScale(np.nan, np.nan)
+    return confidence_scale(job.config.ambiguity, tables.histogram) if job.config.ambiguity else nothing
+
+
+def _nothing_matched(job: Job, tables: Tables) -> SatIntervalsError:
+    records = tables.records.values()
+    usable = {side: sum(record["usable_pixels"][side] for record in records) for side in ("left", "right")}
+    empty = [image.path for image, side in ((job.left, "left"), (job.right, "right")) if not usable[side]]
+    search, window = job.config.disparity, job.config.cost.window
+    reason = (
+        f"all pixels of {' and '.join(empty)} are no data or masked"
+        if empty
+        else f"nowhere do both images have {window} x {window} usable pixels"
+    )
+    return SatIntervalsError(
+        f"no pixel of {job.left.path} can be matched in {job.right.path} over disparities {search.minimum} to "
+        f"{search.maximum}, {reason}: check no-data values, masks, window and search range"
+    )
+
+
+# ---- Report ------------------------------------------------------------------------------------------------
 def _tags(config: Config) -> dict[str, str]:
     """Return the tags of the output files."""
     tags = {
@@ -207,7 +261,7 @@ def _tags(config: Config) -> dict[str, str]:
 @cache
 def _versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that results depend on, read once from their files."""
-    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "zarr", "rasterio", "pyproj")
+    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "rasterio", "pyproj")
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
@@ -230,23 +284,27 @@ def _counts(config: Config, parts: Iterable[Mapping[str, Any]]) -> dict[str, Any
 
 def _report(
     job: Job,
-    records: Records,
+    tables: Tables,
     scale: ConfidenceScale,
     parts: Iterable[Mapping[str, Any]],
     seconds: dict[str, float],
-    files: dict[str, dict[str, int]],
 ) -> dict[str, Any]:
     """Return the content of run.json."""
     grid = job.store.grid
     config = job.config
+    for stage in ("read", "match", "write"):
+        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in tables.records.values())
+    seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
     statistics = job.statistics()
     counts = _counts(config, parts)
-    quality = quality_of(job, records)
+    quality = quality_of(job, tables.records)
     return {
+        "run": job.name,
         "finished": datetime.now(UTC).isoformat(timespec="microseconds"),  # distinguishes runs
         "settings": config.model_dump(mode="json"),
         "requested": {"disparity": job.requested},
         "search": job.found and job.found.report(),
+        "origin": origin_of(job.inputs),
         "local_ranges": job.local and job.local.report() | {"share": job.local.share},
         "inputs": job.inputs,
         "tiles": {
@@ -265,10 +323,9 @@ def _report(
         "validity_bits": {
             flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
         },
-        "overlap_left": seam_report(job.store.seams(records), grid) if job.store.has_seams else None,
+        "overlap_left": None if tables.seams is None else seam_report(tables.seams, grid),
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": dict(_versions()),
-        "files": files,
         "quality": quality,
         "warnings": warnings_of(job, counts, quality),
     }

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import resource
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,25 +15,24 @@ from sat_intervals.config import Config, load_config, named_files, read_yaml
 from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
-from sat_intervals.progress import Progress, add_seconds
-from sat_intervals.raster import (
-    Image,
-    OutputError,
-    examined,
-    open_image,
-    other_files,
-    watched_rasters,
-    write_file,
-)
+from sat_intervals.progress import Progress
+from sat_intervals.raster import Image, OutputError, open_image
 from sat_intervals.raster.identity import check_not_replaced, identifiers
-from sat_intervals.run.assemble import end_run
-from sat_intervals.run.before import report_before, tidy
+from sat_intervals.raster.publishing import write_file
 from sat_intervals.run.job import Job, Search, prepare
-from sat_intervals.run.output import OUTPUTS, is_complete
-from sat_intervals.run.pair import Matched, assemble_repaired, check_failures, find_on, match_jobs, measure_images
+from sat_intervals.run.pair import (
+    Matched,
+    check_failures,
+    complete_before,
+    find_on,
+    match_and_assemble,
+    match_jobs,
+    measure_images,
+)
+from sat_intervals.run.state import OUTPUTS
 from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Connection, Workers
-from sat_intervals.store.folder import LocalFolder
+from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
@@ -86,53 +84,35 @@ def match_batch(
     file = Path(config) if isinstance(config, (str, Path)) else None
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs
     common = load_config(sections, overrides, file=file)
-    own = {pair.name: {**(overrides or {}), **_merged(overrides or {}, pair.settings)} for pair in pairs}
-    checks = _watched(sections, overrides, pairs)
-    _check_not_replaced(pairs, [file, *named_files(sections), *named_files(overrides)], out, overwrite)
+    _check_not_replaced(pairs, [file, *named_files(sections), *named_files(overrides)], out)
     _raise_file_limit()
-    with ExitStack() as stack:
-        stack.enter_context(LocalFolder(out).locked())
+    with locked(out), ExitStack() as stack:
         report = _Report(out)
-        note = report.note
-        connection = stack.enter_context(Connection(common.cluster, out))
-        find = partial(find_on, connection, {}, progress)
-        note({pair.name: {"state": "waiting"} for pair in pairs})
-        jobs: dict[str, Job] = {}
-        for number, pair in enumerate(pairs):
-            progress("pairs", number, len(pairs))
-            try:
-                settings = load_config(sections, own[pair.name], preset_wins=True, file=file)
-                before = None if overwrite else _done_before(pair, out, settings, checks[pair.name])
-                if before is None:
-                    jobs[pair.name] = _begun(pair, out, settings, overwrite, stack, find, checks[pair.name])
-                else:
-                    tidy(out / pair.name, keep_tiles, common.cluster.store)
-                    note({pair.name: {"state": "done before", **before}})
-            except Exception as error:  # one pair's failure must not stop the others
-                note({pair.name: _failed(error)})
-        progress("pairs", len(pairs), len(pairs))
-        for name, how in _matched(jobs, connection, keep_tiles, progress):
-            note({name: how})
+        report.note({pair.name: {"state": "waiting"} for pair in pairs})
+        with Connection(common.cluster, out) as connection:
+            find = partial(find_on, connection, {}, progress)
+            jobs: dict[str, Job] = {}
+            for number, pair in enumerate(pairs):
+                progress("pairs", number, len(pairs))
+                try:
+                    own = {**(overrides or {}), **_merged(overrides or {}, pair.settings)}
+                    settings = load_config(sections, own, preset_wins=True, file=file)
+                    job = _prepared(pair, out, settings, overwrite=overwrite, find=find)
+                    stack.enter_context(locked(job.out))
+                    if job.begin(overwrite=overwrite):
+                        jobs[pair.name] = job
+                    else:
+                        before = complete_before(job, keep_tiles=keep_tiles)
+                        report.note({pair.name: {"state": "done before"} | {key: before[key] for key in _KEPT}})
+                except Exception as error:  # one pair's failure must not stop the others
+                    report.note({pair.name: _failed(error)})
+            progress("pairs", len(pairs), len(pairs))
+            for name, how in _matched(jobs, connection, progress, overwrite=overwrite, keep_tiles=keep_tiles):
+                report.note({name: how})
         for pair in pairs:
             if (how := _finished(pair, report.states[pair.name], finish)) is not report.states[pair.name]:
-                note({pair.name: how})
+                report.note({pair.name: how})
     return report.states
-
-
-def _watched(
-    sections: Mapping[str, Any] | None, overrides: Mapping[str, Any] | None, pairs: Sequence[PairOfBatch]
-) -> dict[str, Callable[[], None]]:
-    """Return functions by pair that raise if a file changed that settings of all pairs or of this one name.
-
-    Pairs share calibrations and ranges.
-    """
-    check_common = watched_rasters([*named_files(sections), *named_files(overrides)])
-
-    def check_both(check_own: Callable[[], None]) -> None:
-        check_common()
-        check_own()
-
-    return {pair.name: partial(check_both, watched_rasters(named_files(pair.settings))) for pair in pairs}
 
 
 class _Report:
@@ -141,80 +121,42 @@ class _Report:
     def __init__(self, folder: Path) -> None:
         self.states: dict[str, dict[str, Any]] = {}
         self._file = folder / REPORT
-        with examined(folder, [REPORT]) as self._there:
-            read_report(folder)
+        read_report(folder)
 
     def note(self, states: Mapping[str, dict[str, Any]]) -> None:
-        """Add states and write the file; raise if it is no longer the one written before."""
+        """Add states and write the file."""
         for name, how in states.items():
             _LOG.info("pair %s: %s", name, how.get("error", how["state"]))
         self.states.update(states)
-        text = json.dumps(self.states, indent=1) + "\n"
         try:
-            stamp = write_file(self._file, text.encode(), self._there)
+            write_file(self._file, (json.dumps(self.states, indent=1) + "\n").encode())
         except OutputError as error:
             raise RunError(f"{error}, and rerun the batch: it resumes") from error
-        self._there = {REPORT: stamp}
 
 
-def _check_not_replaced(
-    pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path, overwrite: bool
-) -> None:
+def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Path | None], out: Path) -> None:
     """Raise if an input of any pair, or another file that is read, is an output of any pair, or two pairs share one."""
     folders: dict[object, Path] = {}
     for folder in (out / pair.name for pair in pairs):
         for found in identifiers(folder):
             if (other := folders.setdefault(found, folder)) != folder:
                 raise SatIntervalsError(f"{other} and {folder} are the same folder: remove the link")
-    written = [out / pair.name for pair in pairs if overwrite or not is_complete(out / pair.name)]
     images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
-    files = {str(name) for name in (*others, *images, *named) if name and os.path.isfile(name)}
-    check_not_replaced(
-        [file for name in sorted(files) for file in (name, *other_files(name))],
-        [out / REPORT, *(folder / name for folder in written for name in OUTPUTS)],
-        [folder / "tiles" for folder in written],
-    )
+    outputs = [out / REPORT, *(folder / name for folder in folders.values() for name in OUTPUTS)]
+    check_not_replaced([*others, *images, *named], outputs, [folder / "tiles" for folder in folders.values()])
 
 
-def _images(pair: PairOfBatch) -> tuple[Image, Image]:
+def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, find: Search) -> Job:
     def opened(side: str, path: str, mask: str | None) -> Image:
         options = {name: pair.reading.get(f"{side}_{name}", pair.reading.get(name)) for name in ("band", "nodata")}
         return open_image(path, **options, mask=mask)
 
-    return opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
-
-
-def _window(pair: PairOfBatch) -> Window | None:
-    return Window(*pair.window) if pair.window else None
-
-
-def _done_before(
-    pair: PairOfBatch, out: Path, settings: Config, check_named: Callable[[], None]
-) -> dict[str, Any] | None:
-    """Return counts and seconds of a pair's complete run, None without one; raise if settings or images differ."""
-    report = report_before(*_images(pair), out / pair.name, settings, _window(pair))
-    check_named()
-    return report and {name: report[name] for name in _KEPT if name in report}
-
-
-def _begun(
-    pair: PairOfBatch,
-    out: Path,
-    settings: Config,
-    overwrite: bool,
-    stack: ExitStack,
-    find: Search,
-    check_named: Callable[[], None],
-) -> Job:
-    """Prepare the job of a pair, lock its folder and open its store."""
-    job = prepare(
-        *_images(pair), out / pair.name, settings, window=_window(pair), overwrite=overwrite, pair=pair.name, find=find
+    left, right = opened("left", pair.left, pair.left_mask), opened("right", pair.right, pair.right_mask)
+    window = Window(*pair.window) if pair.window else None
+    return prepare(
+        left, right, out / pair.name, settings, window=window, overwrite=overwrite, pair=pair.name, find=find
     )
-    check_named()  # all pairs have the same calibration and the same ranges
-    stack.enter_context(LocalFolder(job.store.home).locked())
-    job.begin(overwrite=overwrite)
-    return job
 
 
 def _failed(error: Exception) -> dict[str, Any]:
@@ -249,7 +191,7 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
 
 
 def _matched(
-    jobs: Mapping[str, Job], connection: Connection, keep_tiles: bool, progress: Progress
+    jobs: Mapping[str, Job], connection: Connection, progress: Progress, *, overwrite: bool, keep_tiles: bool
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Match the tiles of all jobs; assemble finished jobs in a thread meanwhile."""
     if not jobs:
@@ -257,18 +199,18 @@ def _matched(
     for config in {_kernels(job.config): job.config for job in jobs.values()}.values():
         compile_kernels(config)
     assembling: dict[Future[dict[str, Any]], str] = {}
-    with _thread() as (thread, check), connection:
+    with _thread() as (thread, check):
         client, measured = connection.client(), {}
         for name, job in jobs.items():
             try:
-                with job.store.needed(job.manifest):
-                    measure_images(client, job, progress)
+                measure_images(client, job, progress)
                 measured[name] = job
             except Exception as error:  # one pair's failure must not stop the others
                 yield name, _failed(error)
         names = {id(job): name for name, job in measured.items()}
+        assembled = partial(_assembled, client, check, overwrite=overwrite, keep_tiles=keep_tiles)
         for matched in match_jobs(client, list(measured.values()), progress):
-            assembling[thread.submit(_assembled, client, matched, keep_tiles, check)] = names[id(matched.job)]
+            assembling[thread.submit(assembled, matched)] = names[id(matched.job)]
             for future in [future for future in assembling if future.done()]:
                 yield assembling.pop(future), future.result()
         total = len(assembling)
@@ -302,20 +244,13 @@ def _kernels(config: Config) -> str:
     return repr((config.cost, search.local, search.grid, sgm and sgm.penalty, cross_check and cross_check.method))
 
 
-def _assembled(client: Workers, matched: Matched, keep_tiles: bool, progress: Progress) -> dict[str, Any]:
+def _assembled(
+    client: Workers, progress: Progress, matched: Matched, *, overwrite: bool, keep_tiles: bool
+) -> dict[str, Any]:
     job, failures, seconds = matched
-
-    def match() -> None:
-        measure_images(client, job, progress)
-        for again in match_jobs(client, [job], progress):
-            check_failures(job, again.failures)
-            add_seconds(seconds, again.seconds)
-
     try:
-        with job.store.needed(job.manifest):
-            check_failures(job, failures)
-            made = assemble_repaired(job, lambda: client, match, seconds, progress, keep_tiles=keep_tiles)
-        report = end_run(job, made, keep_tiles=keep_tiles)
+        check_failures(job, failures)
+        report = match_and_assemble(job, lambda: client, seconds, progress, overwrite=overwrite, keep_tiles=keep_tiles)
     except Exception as error:  # one pair's failure must not stop the others
         return _failed(error)
     return {"state": "done", **{name: report[name] for name in _KEPT}}

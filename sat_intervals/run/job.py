@@ -1,6 +1,6 @@
-"""Prepare a pair for matching: open and check its images, folder, tiles and store."""
+"""Prepare a pair for matching: images, search range, inputs, tiles, and the state of its folder."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
@@ -9,7 +9,7 @@ from typing import Any
 
 from sat_intervals.config import Config, Mccnn, load_config, resolved
 from sat_intervals.config.weights import weights_file
-from sat_intervals.errors import SatIntervalsError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
@@ -23,31 +23,30 @@ from sat_intervals.raster import (
     check_pair,
     check_space,
     file_bytes,
+    files_of,
     open_image,
     part_bytes,
-    read_files,
     run_files,
 )
-from sat_intervals.raster.identity import check_not_replaced, check_unchanged
-from sat_intervals.run.inputs import check_onnxruntime, describe_inputs
+from sat_intervals.raster.identity import check_not_replaced
+from sat_intervals.run.inputs import describe_inputs, identities
 from sat_intervals.run.local_ranges import searched
-from sat_intervals.run.output import OUTPUTS, check_output, check_replaceable, holds_run, is_complete, replaceable
-from sat_intervals.run.parts import codecs_of, parts_of, rows_of_levels
 from sat_intervals.run.schedule import blocks_of, handed_bytes
+from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
 from sat_intervals.run.workers import parse_memory, readers
-from sat_intervals.store.before import inputs_before, search_before
 from sat_intervals.store.folder import folder_at
-from sat_intervals.store.manifest import digest
-from sat_intervals.store.marks import finished_run
-from sat_intervals.store.parts import Parts
-from sat_intervals.store.tiles import LAYOUT, DamagedTilesError, Store
+from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, read_manifest, write_manifest
+from sat_intervals.store.tiles import LAYOUT, ONCE, TILES, DamagedTilesError, Store, home_of, store_bytes
 from sat_intervals.tiling import Grid, Tile, Window
 
-Search = Callable[[Image, Image, dict[str, dict[str, Any]]], Found]
-"""Finds the search range of two images, whose files have these identities."""
+Search = Callable[[Image, Image], Found]
+"""Finds the search range of two images."""
 
 # Settings without effect on tiles; those of the preset itself are listed one by one.
 _NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
+# Files of `ONCE`.
+_STATISTICS, _RANGE = "statistics", "range"
+_NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 
 
 @dataclass(frozen=True)
@@ -61,23 +60,21 @@ class Job:
     config
         Settings.
     store
-        Store and grid of the tiles.
+        The tiles.
     out
         Folder of the run.
     inputs
-        Description of the images and of the MC-CNN weights for run.json.
-    files
-        `identity` of each file that the images are read from, by the name it is opened with.
+        See `describe_inputs`.
     requested
         The section ``disparity`` as the user gave it.
     found
         What the search for the range found, None if none was made.
-    grid
+    ranges_digest
         Digest of the local search ranges, None without them.
     local
         The local search ranges; not on workers, which read them from the store.
     has_files
-        Whether files and a report are made of the tiles; `calibrate` only measures them.
+        Whether files are made of the tiles; `calibrate` only measures them.
     """
 
     left: Image
@@ -86,17 +83,17 @@ class Job:
     store: Store
     out: Path
     inputs: dict[str, Any]
-    files: dict[str, dict[str, Any]]
     requested: dict[str, Any]
     found: Found | None = None
-    grid: str | None = None
+    ranges_digest: str | None = None
     local: LocalRanges | None = None
     has_files: bool = True
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """Return all that decides the bytes of a tile."""
-        return _manifest(self.config, self.inputs, self.store.grid.region, self.grid)
+        """Return all that decides the bytes of a tile, and where the tiles are."""
+        made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest)
+        return made | {PLACE: str(self.store.folder)}
 
     @property
     def hands_states_on(self) -> bool:
@@ -110,114 +107,81 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Return a unique name of the run: a digest of all that decides the bytes of its files."""
+        """Return the name of the run: a digest of all that decides the bytes of its files."""
         return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster", "preset"})})
 
-    def is_finished(self) -> bool:
-        """Return whether the folder has the files of this run, which was killed before it removed its tiles."""
-        noted = finished_run(self.store.home)
-        return is_complete(self.out) and noted is not None and noted[0] == self.name
-
-    def begin(self, *, overwrite: bool = False) -> None:
-        """Open the store; call it while its folder is locked.
-
-        With ``overwrite`` the files of an earlier run are kept until this one replaces them; to resume, omit it.
-        """
-        if not overwrite and is_complete(self.out):  # another run may have ended before this one got the lock
-            raise holds_run(self.out, OUTPUTS)
-        check_output(self.out, overwrite, has_transform=self.left.georeferencing.transform is not None)
-        self.store.open(self.manifest, overwrite=overwrite, replaceable=replaceable(self.out, overwrite=overwrite))
-        if self.found or self.local:
-            search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
-            self.store.write_search(search, _origin(self.inputs))
+    def begin(self, *, overwrite: bool = False) -> bool:
+        """Open the store and return True; False if the run is complete. Call it while the folder is locked."""
+        step = next_step(self.out, self.manifest, self.name, overwrite=overwrite)
+        if step == "complete":
+            return False
+        home = home_of(self.out)
+        if step == "start anew":
+            remove_tiles(self.out)
+        try:
+            write_manifest(home, self.manifest)
+            if self.found or self.local:
+                search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
+                self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), **search)
+        except OSError as error:
+            raise _unusable(self.store, error) from error
         if waiting := self.waiting():
-            self.store.steps.check_space(self._handed_bytes())
-        if self.has_files:
-            self.check_space(waiting, len(self.parts().done()))
+            self._check_space(waiting)
+        return True
 
-    def parts(self, codecs: Mapping[str, Any] | None = None) -> Parts:
-        """Return the parts of the files; ``codecs`` are those that make them, by default those of this process."""
-        return parts_of(self.store, self.name, codecs or codecs_of(self.config))
-
-    def check_space(self, tiles: Sequence[Tile], parts: int) -> None:
-        """Raise if local disks have no room for what a run has yet to write.
-
-        Parameters
-        ----------
-        tiles
-            The tiles that are not done.
-        parts
-            Number of parts of the files that are done.
-
-        Raises
-        ------
-        OutputError
-            Gives free and needed space.
-        """
-        region = self.store.grid.region
-        files = run_files(self.config.products.compression)
-        final = file_bytes(files, region.height, region.width)
-        share = 1 - parts / sum(rows_of_levels(region))
-        before = self.store.stored_bytes(tiles) + round(share * part_bytes(files, region.height, region.width))
-        if tiles:
-            before += self.store.steps.missing_bytes(self._handed_bytes())
-        if self.store.elsewhere is None:
-            check_space(self.out, before + final, "tiles, files and their parts")
+    def _check_space(self, waiting: list[Tile]) -> None:
+        """Raise if disks have no room for what a run has yet to write."""
+        region, files = self.store.grid.region, run_files(self.config.products.compression)
+        share = len(waiting) / len(self.store.grid)
+        tiles = store_bytes(self.store.grid, self.config.subpixel_levels)
+        handed = handed_bytes(self.store.grid, self.config, (self.left, self.right))
+        before = share * (tiles + handed) + self.has_files * part_bytes(files, region.height, region.width)
+        final = self.has_files * file_bytes(files, region.height, region.width)
+        if self.store.folder == folder_at(home_of(self.out)):
+            check_space(self.out, round(before + final), "tiles, files and their parts")
             return
         check_space(self.out, final, "files")
-        place = self.store.folder.place("")
-        if isinstance(place, Path):
-            check_space(place, before, "tiles and parts of files")
+        if self.store.folder.is_local:
+            check_space(Path(self.store.folder.place).parent, round(before), "tiles and parts of files")
 
-    def _handed_bytes(self) -> int:
-        return handed_bytes(self.store.grid, self.config, (self.left, self.right))
+    def check_version(self) -> None:
+        """Raise if this process, a worker, would write other bytes than the command."""
+        if self.store.run != digest(self.manifest):
+            raise RunError("this worker has another version of sat-intervals: install the same for all")
+        wanted = self.inputs.get("weights", {}).get("onnxruntime")
+        if wanted and (here := version("onnxruntime")) != wanted:
+            raise RunError(f"onnxruntime is {here} here, but the run has {wanted}: install the same for all workers")
 
-    def check_inputs(self) -> None:
-        """Raise if an input changed since the start of the run, or this process has another onnxruntime.
+    def write_statistics(self, statistics: PairStatistics) -> None:
+        """Keep mean and standard deviation of both images for all tiles."""
+        self.store.write(ONCE, _STATISTICS, **statistics.report())
 
-        Raises
-        ------
-        ChangedInputError
-            Names the first changed input.
-        """
-        check_unchanged(self.files)
-        check_onnxruntime(self.inputs)
+    def has_statistics(self) -> bool:
+        """Return whether the statistics of `write_statistics` are there, or the run needs none."""
+        return not self.config.cost.needs_statistics or self.store.meta(ONCE, _STATISTICS) is not None
 
     def statistics(self) -> PairStatistics | None:
-        """Return mean and standard deviation of both images, None if the run needs none.
-
-        Raises
-        ------
-        DamagedTilesError
-            They are missing in the store; a retry restores them.
-        """
+        """Return mean and standard deviation of both images, None if the run needs none."""
         if not self.config.cost.needs_statistics:
             return None
-        normalization = self.store.normalization()
-        if normalization is None:
+        kept = self.store.meta(ONCE, _STATISTICS)
+        if kept is None:
             raise DamagedTilesError(
                 f"the image statistics in {self.store.folder} are missing: rerun the same command: it resumes"
             )
-        return PairStatistics.of_report(normalization)
+        kept.pop("of")
+        return PairStatistics.of_report(kept)
 
     def ranges(self) -> LocalRanges | None:
-        """Return the local search ranges, None without them.
-
-        Raises
-        ------
-        DamagedTilesError
-            They are missing in the store.
-        """
-        if not self.config.disparity.is_local:
-            return None
-        if self.local is None:
-            stored = (self.store.search(_origin(self.inputs)) or {}).get("ranges")
-            if stored is None or digest(stored) != self.grid:
-                raise DamagedTilesError(
-                    f"the local search ranges in {self.store.folder} are missing: rerun the same command: it resumes"
-                )
-            return LocalRanges.of_report(stored)
-        return self.local
+        """Return the local search ranges, None without them."""
+        if not self.config.disparity.is_local or self.local is not None:
+            return self.local
+        kept = self.store.meta(ONCE, _RANGE, origin_of(self.inputs)) or {}
+        if kept.get("ranges") is None or digest(kept["ranges"]) != self.ranges_digest:
+            raise DamagedTilesError(
+                f"the local search ranges in {self.store.folder} are missing: rerun the same command: it resumes"
+            )
+        return LocalRanges.of_report(kept["ranges"])
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what workers read from the store, see `ranges`."""
@@ -225,7 +189,7 @@ class Job:
 
     def waiting(self) -> list[Tile]:
         """Return the tiles that are not done."""
-        done = self.store.done()
+        done = self.store.names(TILES)
         return [tile for tile in self.store.grid if tile.name not in done]
 
 
@@ -242,66 +206,84 @@ def prepare(
 ) -> Job:
     """Check all that can be checked before tiles are matched; parameters as in `match_pair`.
 
-    ``pair`` distinguishes otherwise equal pairs of a batch in an external store. ``find`` finds a search range that is
-    not given; one that an interrupted run has found is taken over.
+    ``pair`` is a prefix of the tiles' folder in an external store. ``find`` finds a search range that is not given; one
+    that an earlier run of the same images has found is taken over.
     """
-    config = resolved(load_config(config))
-    out = Path(out)
+    config, out = resolved(load_config(config)), Path(out)
     requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
     region = checked_region(left, window)
     if not config.disparity.is_auto:
         check_tiles(fitted_to_jobs(config), region)
-    check_output(out, overwrite, has_transform=left.georeferencing.transform is not None)
-    home = out / "tiles"
-    inputs, files = describe_inputs(left, right, config, inputs_before(home, config.cluster.store))
-    before = None if overwrite else _found_before(home, config.cluster.store, inputs)
-    config, found, local = searched(config, left, lambda: before or _find(find, left, right, files))
-    marked = digest(local.report()) if local else None
+    check_folder(out, overwrite=overwrite)
+    before = _before(out)
+    inputs = describe_inputs(left, right, config, identities(before.get("inputs", {})))
+    config, found, local = searched(config, left, lambda: _found(before, inputs, find, left, right))
     checked_pair(left, right, config)
     config = fitted_to_jobs(config)
     check_tiles(config, region)
-    ranges = config.disparity.grid
-    read = [*files, *(read_files(ranges) if ranges else ()), inputs["weights"]["path"] if "weights" in inputs else None]
-    run = digest(_manifest(config, inputs, region, marked))
-    elsewhere = _elsewhere(config.cluster.store, home, "-".join(filter(None, (pair, run))))
-    # folders of runs in a local store: their names end with a digest
-    stores = Path(elsewhere).parent.glob("*" + 32 * "[0-9a-f]") if elsewhere and "://" not in elsewhere else ()
-    check_not_replaced(read, [out / name for name in OUTPUTS], [home, *stores])
-    if overwrite:
-        check_replaceable(out)
-    grid = Grid(region, config.tiles.size)
-    count = config.disparity.count
-    most = config.largest_ambiguity
-    levels = config.subpixel_levels
-    has_seams = config.tiles.overlap != "exact"
-    store = Store(home.absolute(), grid, count, most, levels, has_seams, run, elsewhere)
-    return Job(left, right, config, store, out, inputs, files, requested, found, marked, local)
+    read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
+    check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
+    ranges = digest(local.report()) if local else None
+    run = digest(_manifest(config, inputs, region, ranges))
+    store = config.cluster.store
+    place = f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out)
+    kept = Store(folder_at(place), Grid(region, config.tiles.size), run)
+    return Job(left, right, config, kept, out, inputs, requested, found, ranges, local)
 
 
-def _elsewhere(store: str | None, home: Path, name: str) -> str | None:
-    """Return the folder of a run in the store that the user names, None if its tiles are at home."""
-    if not store or folder_at(store) == folder_at(home):
-        return None
-    return str(folder_at(store).inside(name))
+def _before(out: Path) -> dict[str, Any]:
+    """Return the manifest of an earlier run in a folder, or its report; empty without both."""
+    try:
+        return read_manifest(home_of(out)) or read_report(out) or {}
+    except StoreError:
+        return {}
 
 
-def _find(find: Search | None, left: Image, right: Image, files: dict[str, dict[str, Any]]) -> Found:
+def _found(
+    before: Mapping[str, Any], inputs: Mapping[str, Any], find: Search | None, left: Image, right: Image
+) -> Found:
+    """Return the search range that an earlier run of the same images has found, else find it."""
+    kept: Mapping[str, Any] | None = None
+    if PLACE in before:
+        kept = (Store(folder_at(before[PLACE]), _NO_TILES, "").meta(ONCE, _RANGE, origin_of(inputs)) or {}).get("found")
+    elif before.get("search") and before.get("origin") == origin_of(inputs):
+        kept = before["search"]
+    if kept:
+        return Found.of_report(kept)
     if find is None:
         raise SatIntervalsError("the search range is auto: give it as numbers")
-    return find(left, right, files)
+    return find(left, right)
 
 
-def _origin(inputs: Mapping[str, Any]) -> str:
+def origin_of(inputs: Mapping[str, Any]) -> str:
     """Return a digest of all that decides which search range is found."""
     images = {side: inputs[side] for side in ("left", "right")}
     return digest({"version": _version(), "kernels": FINGERPRINT, "inputs": images})
 
 
-def _found_before(home: Path, store: str | None, inputs: Mapping[str, Any]) -> Found | None:
-    """Return the search range that an interrupted run of the same images has stored, None without one."""
-    search = search_before(home, store, _origin(inputs))
-    return Found.of_report(search["found"]) if search and search["found"] else None
+def remove_tiles(out: Path) -> None:
+    """Delete the tiles of the run in a folder, wherever they are, the manifest last."""
+    home = home_of(out)
+    try:
+        manifest = read_manifest(home)
+    except StoreError:
+        manifest = None
+    for place in {str(folder_at(home)), *([manifest[PLACE]] if manifest else [])}:
+        Store(folder_at(place), _NO_TILES, "").remove()
+    (home / MANIFEST).unlink(missing_ok=True)
+    folder_at(home).remove_if_empty()
+
+
+def _unusable(store: Store, error: OSError) -> StoreError:
+    """Return the error for a store that cannot be written."""
+    way_out = "make room, check its rights or choose another folder"
+    if not store.folder.is_local:
+        way_out = (
+            "check the URL, the credentials, and whether the package of its file system is installed (pip install "
+            "'sat-intervals[remote]' for s3://)"
+        )
+    return StoreError(f"{store.folder} cannot be used: {error.strerror or error}: {way_out}")
 
 
 @cache
@@ -310,14 +292,14 @@ def _version() -> str:
     return version("sat-intervals")
 
 
-def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, grid: str | None) -> dict[str, Any]:
+def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, ranges: str | None) -> dict[str, Any]:
     """Return all that decides the bytes of a tile; of a calibration only its levels."""
     settings = config.model_dump(mode="json", exclude=_NOT_OF_TILES)
     levels = config.cuts
     if levels is not None:
         settings["interval"] = {"high": levels.high, "low": levels.low, "steps": config.bound_steps}
     return {
-        **({"local_ranges": grid} if grid else {}),
+        **({"local_ranges": ranges} if ranges else {}),
         "version": _version(),
         "kernels": FINGERPRINT,
         "layout": LAYOUT,

@@ -1,6 +1,6 @@
 """The search range and the local ranges of a pair: given, found, or read from the raster that the user gives."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +14,18 @@ from sat_intervals.raster import (
     MARK,
     Image,
     OutputWriter,
-    check_as_made,
-    check_made_by,
-    check_place,
     open_image,
-    other_files,
     ranges_file,
     read_shape,
     read_window,
-    replaceable,
-    watched_rasters,
 )
-from sat_intervals.raster.identity import check_not_replaced, identity
+from sat_intervals.raster.identity import identity
 from sat_intervals.raster.published import tag_of_left, tags_beside
 from sat_intervals.tiling import Window
 
 # Side of the cells that a raster of ranges is reduced to, in pixels.
 _CELL = 64
-# Tag of the rasters that `write_ranges` may replace: the image.
+# Tag of the rasters of `write_ranges`: the image.
 _OF = "RANGES_OF"
 # Rows written at a time.
 _STRIP = 256
@@ -68,40 +62,14 @@ def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
     return config.model_copy(update={"disparity": config.disparity.model_copy(update=ends)})
 
 
-def replaceable_ranges(path: Path, left: Image, right: Image) -> dict[str, str]:
-    """Return the `stamps` of the file that `write_ranges` may replace, if it exists.
-
-    Raises
-    ------
-    SatIntervalsError
-        It is a file of the images, was not made by this tool, was changed since, or GDAL would read another one with
-        it.
-    """
-    names = [name for image in (left, right) for name in (image.path, image.mask) if name]
-    check_not_replaced([file for name in names for file in (name, *other_files(name))], [path])
-    with replaceable(path.parent, [ranges_file(path.name)]) as there:
-        check_made_by(path, "range", _OF)
-        check_as_made(path)
-    check_place(path, has_transform=left.georeferencing.transform is not None)
-    return there
-
-
-def write_ranges(path: Path, ranges: LocalRanges, left: Image, before: Mapping[str, str]) -> None:
-    """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image.
-
-    ``before`` are the `replaceable_ranges`.
-
-    Raises
-    ------
-    SatIntervalsError
-        The file cannot be written, or another one came there.
-    """
+def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
+    """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
     shape, tags = (left.height, left.width), {_OF: left.path, **tag_of_left(identity(left.path)), **MARK}
     with OutputWriter(path.parent, [ranges_file(path.name)], *shape, left.georeferencing, tags) as writer:
         for row in range(0, left.height, _STRIP):
             window = Window(row, 0, min(_STRIP, left.height - row), left.width)
             writer.write(row, np.stack(ranges.at(window)))
-        writer.publish(replaceable=before)
+        writer.publish()
 
 
 def read_ranges(path: str, left: Image) -> LocalRanges:
@@ -113,9 +81,8 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
     Raises
     ------
     SatIntervalsError
-        The raster does not fit the image, a minimum is above its maximum, or it was replaced meanwhile.
+        The raster does not fit the image, or a minimum is above its maximum.
     """
-    check_unchanged = watched_rasters([path])
     bands, height, width = read_shape(path)
     if (bands, height, width) != (len(RANGES), left.height, left.width):
         raise SatIntervalsError(
@@ -130,7 +97,6 @@ def read_ranges(path: str, left: Image) -> LocalRanges:
             "image"
         )
     rows = [_row_of_cells(images, Window(row, 0, min(_CELL, height - row), width)) for row in range(0, height, _CELL)]
-    check_unchanged()
     minimum, maximum = (np.stack(bound) for bound in zip(*rows, strict=True))
     return LocalRanges(minimum, maximum, _CELL, _CELL)
 

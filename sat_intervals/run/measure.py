@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Calibration, Config, Interval, Mccnn, key_of
+from sat_intervals.config import Calibration, Config, Interval, key_of
 from sat_intervals.config.calibration import COVERAGES
-from sat_intervals.config.weights import weights_file
-from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.measurement import FIELDS, HIGH, QUANTILES, SCHEMES, Measured, ladder, measure
 from sat_intervals.match.memory import STRIP_PIXELS
@@ -29,14 +29,12 @@ from sat_intervals.match.postprocess import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, Layer, open_image, watched_images
-from sat_intervals.raster.watching import watched
-from sat_intervals.run.inputs import appeared_file
+from sat_intervals.raster import Image, Layer, open_image
+from sat_intervals.run.assemble import scale_of
+from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
-from sat_intervals.run.scale import checked_scale
 from sat_intervals.run.workers import Workers, connected
-from sat_intervals.store.folder import LocalFolder
 from sat_intervals.tiling import Window
 
 FEWEST = 1000  # pixels with truth, of all pairs
@@ -126,21 +124,16 @@ def measure_subjects(
         Tiles failed.
     """
     found: list[Measured] = []
-    cost = subjects[0].config.cost
-    check_truths = watched_images(subject.truth.image for subject in subjects)
-    check_weights = watched([weights_file(cost.weights)] if isinstance(cost, Mccnn) else [])
     key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
     with (
-        LocalFolder(folder).scratch("calibrate", r"\d+|logs") as scratch,
-        connected(subjects[0].config.cluster, scratch) as client,
+        TemporaryDirectory(prefix=".calibrate-", dir=folder) as name,
+        connected(subjects[0].config.cluster, scratch := Path(name)) as client,
     ):
         for number, subject in enumerate(subjects):
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
             found += _of_subject(client, subject, levels, scratch / str(number), len(subjects) == 1, one)
-    check_truths()
-    check_weights()  # between subjects: each job checks its own
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found, key
@@ -173,8 +166,7 @@ def _of_subject(
                 check_failures(job, matched.failures)
                 gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)
                 gauge.add(job, 2 * jobs.index(job))
-                if file := appeared_file(job.left, job.right, job.files):
-                    raise ChangedInputError(f"{file} appeared while {job.left.path} was matched: rerun the command")
+                check_unchanged(job.inputs, job.left, job.right, job.config)
                 job.store.remove()
     assert gauge is not None  # there are jobs
     return gauge.measured()
@@ -185,7 +177,6 @@ def _begun(subject: Subject, levels: np.ndarray, out: Path, stack: ExitStack) ->
     config = _at_levels(subject.config, float(levels[0]), float(levels[1]), None)
     job = prepare(subject.left, subject.right, out, config, window=subject.window, pair=out.parent.name)
     job = replace(job, has_files=False)
-    stack.enter_context(LocalFolder(job.store.home).locked())
     job.begin()
     stack.callback(job.store.remove)
     return job
@@ -276,10 +267,10 @@ class _Gauge:
 
 def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:
     """Yield first row of the region, raw rows with their halo, ``first`` and ``last`` of `with_halo`, and the scale."""
-    records, region = job.store.records(), job.store.grid.region
-    scale = checked_scale(job, records)
+    region, count = job.store.grid.region, job.config.disparity.count
+    scale = scale_of(job, job.store.tables())
     row = 0
-    raw = (RawRows(**strip) for strip in job.store.strips(max(1, STRIP_PIXELS // region.width), records))
+    raw = (RawRows(**strip) for strip in job.store.strips(max(1, STRIP_PIXELS // region.width), count))
     for rows, first, last in with_halo(raw, halo(job.config)):
         yield row, rows, first, last, scale
         row += last - first

@@ -2,28 +2,27 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sat_intervals.config import Config, load_config
-from sat_intervals.errors import ChangedInputError, RunError
+from sat_intervals.config import load_config
+from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
 from sat_intervals.match.search_range import Found
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
-from sat_intervals.raster import RUN_FILES, Image, remove_scratch
+from sat_intervals.raster import Image
 from sat_intervals.results import open_run
-from sat_intervals.run.assemble import Assembled, assemble, end_run, remove_tiles
+from sat_intervals.run.assemble import assemble, end_tiles
 from sat_intervals.run.job import Job, prepare
-from sat_intervals.run.output import check_as_published
 from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.search_range import search_range
 from sat_intervals.run.tile import match_block, measure_block, trace_block
 from sat_intervals.run.workers import Connection, Task, Workers, check_not_full, reason
-from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.removal import BORDERS
-from sat_intervals.store.tiles import DamagedTilesError
+from sat_intervals.store.lock import locked
+from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError, home_of
 from sat_intervals.tiling import Tile, Window
 
 # How often damaged tiles are matched again; more damage means a broken disk.
@@ -66,7 +65,7 @@ def match_pair(
 
     Returns
     -------
-    The content of ``run.json`` without its checksum.
+    The content of ``run.json``.
 
     Raises
     ------
@@ -75,120 +74,89 @@ def match_pair(
     RunError
         Tiles failed; no output was published.
     """
-    config = load_config(config)
-    with Connection(config.cluster, Path(out)) as connection:
-        return _match_pair((left, right), out, config, connection, window, keep_tiles, overwrite, progress)
+    config, out, seconds = load_config(config), Path(out), dict[str, float]()
+    with Connection(config.cluster, out) as connection:
+        find = partial(find_on, connection, seconds, progress)
+        with logged_stage(seconds, "start"):
+            job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=find)
+        with locked(out):
+            if not job.begin(overwrite=overwrite):
+                return complete_before(job, keep_tiles=keep_tiles)
+            with logged_stage(seconds, "kernels"):
+                progress("kernels", 0, 1)
+                compile_kernels(job.config, hands_states_on=job.hands_states_on)
+                progress("kernels", 1, 1)
+            return match_and_assemble(
+                job, connection.client, seconds, progress, overwrite=overwrite, keep_tiles=keep_tiles
+            )
 
 
-def _match_pair(
-    pair: tuple[str | Path | Image, str | Path | Image],
-    out: str | Path,
-    config: Config,
-    connection: Connection,
-    window: Window | None,
-    keep_tiles: bool,
-    overwrite: bool,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Match a pair on a cluster; see `match_pair`."""
-    seconds: dict[str, float] = {}
-
-    find = partial(find_on, connection, seconds, progress)
-    with logged_stage(seconds, "start"):
-        job = prepare(*pair, out, config, window=window, overwrite=overwrite, find=find)
-
-    def match() -> None:
-        with logged_stage(seconds, "tiles"):
-            if job.waiting() or not _is_measured(job):
-                client = connection.client()
-                with logged_stage(seconds, "tiles.images"):
-                    measure_images(client, job, progress)
-                for matched in match_jobs(client, [job], progress):
-                    check_failures(job, matched.failures)
-                    add_seconds(seconds, matched.seconds)
-
-    with LocalFolder(job.store.home).locked():
-        if not overwrite and job.is_finished():
-            check_as_published(job.out)
-            run = open_run(job.out)
-            done = "; its remaining tiles were removed" if remove_tiles(job) else ""
-            remove_scratch(job.out, RUN_FILES)
-            _LOG.warning("the run in %s was already complete%s", job.out, done)
-            return run.report
-        job.begin(overwrite=overwrite)
-        with logged_stage(seconds, "kernels"):
-            progress("kernels", 0, 1)
-            compile_kernels(job.config, hands_states_on=job.hands_states_on)
-            progress("kernels", 1, 1)
-        with job.store.needed(job.manifest):
-            match()
-            made = assemble_repaired(job, connection.client, match, seconds, progress, keep_tiles=keep_tiles)
-        return end_run(job, made, keep_tiles=keep_tiles)
+def complete_before(job: Job, *, keep_tiles: bool) -> dict[str, Any]:
+    """Return the report of a run that was already complete; remove tiles that a death left."""
+    report = open_run(job.out).report
+    if home_of(job.out).exists():
+        end_tiles(job, keep_tiles=keep_tiles)
+    _LOG.warning("the run in %s was already complete", job.out)
+    return report
 
 
-def find_on(
-    connection: Connection,
-    seconds: dict[str, float],
-    progress: Progress,
-    left: Image,
-    right: Image,
-    files: dict[str, dict[str, Any]],
-) -> Found:
+def find_on(connection: Connection, seconds: dict[str, float], progress: Progress, left: Image, right: Image) -> Found:
     """Find the search range of a pair on a cluster; see `search_range`. The time is added to ``seconds``."""
     with logged_stage(seconds, "start.range"):
-        return search_range(connection.client(), left, right, files, progress)
+        return search_range(connection.client(), left, right, progress)
 
 
-def assemble_repaired(
+def match_and_assemble(
     job: Job,
     client: Callable[[], Workers],
-    match: Callable[[], None],
     seconds: dict[str, float],
     progress: Progress,
     *,
+    overwrite: bool,
     keep_tiles: bool,
-) -> Assembled:
-    """Write the files of a run, see `assemble`; call ``match`` again for damaged tiles or parts."""
-    for _ in range(_TRIES):
+) -> dict[str, Any]:
+    """Match the tiles of a run that are not done, and write its files, see `assemble`; damaged tiles are made again."""
+    for attempt in range(_TRIES + 1):
         try:
-            return assemble(job, client, seconds, progress, keep_tiles=keep_tiles)
+            _match_tiles(job, client, seconds, progress)
+            return assemble(job, client, seconds, progress, overwrite=overwrite, keep_tiles=keep_tiles)
         except DamagedTilesError as error:
-            job.store.check(job.manifest)
+            if attempt == _TRIES:
+                raise
             _LOG.warning("%s; trying this now", error)
-            match()
-    return assemble(job, client, seconds, progress, keep_tiles=keep_tiles)
+    raise AssertionError  # not reached
 
 
-def _is_measured(job: Job) -> bool:
-    """Return whether the store has mean and standard deviation of both images, or the run needs none."""
-    return not job.config.cost.needs_statistics or job.store.normalization() is not None
+def _match_tiles(job: Job, client: Callable[[], Workers], seconds: dict[str, float], progress: Progress) -> None:
+    with logged_stage(seconds, "tiles"):
+        with logged_stage(seconds, "tiles.images"):
+            if not job.has_statistics():
+                measure_images(client(), job, progress)
+        if job.waiting():
+            for matched in match_jobs(client(), [job], progress):
+                check_failures(job, matched.failures)
+                add_seconds(seconds, matched.seconds)
 
 
 def measure_images(client: Workers, job: Job, progress: Progress) -> None:
-    """Measure mean and standard deviation of both images and store them, if the cost needs them and they are missing.
+    """Measure mean and standard deviation of both images and keep them, if the cost needs them and they are missing.
 
     Raises
     ------
     RunError
         An image cannot be read.
     """
-    if _is_measured(job):
-        return
-    job.store.write_normalization(
-        PairStatistics(*(_measured(client, image, job, progress) for image in (job.left, job.right))).report()
-    )
+    if not job.has_statistics():
+        images = job.left, job.right
+        job.write_statistics(PairStatistics(*(_measured(client, image, job, progress) for image in images)))
 
 
 def _measured(client: Workers, image: Image, job: Job, progress: Progress) -> ImageStatistics:
-    windows = blocks(image.height, image.width)
-    retries = job.config.cluster.retries
+    windows, retries = blocks(image.height, image.width), job.config.cluster.retries
     found: dict[int, Moments] = {}
-    for outcome in client.outcomes(
-        (Task(i, measure_block, (image, block, job.files), retries) for i, block in enumerate(windows))
-    ):
+    tasks = (Task(i, measure_block, (image, block), retries) for i, block in enumerate(windows))
+    for outcome in client.outcomes(tasks):
         if outcome is not None and outcome.error is not None:
-            if isinstance(outcome.error, ChangedInputError):
-                raise outcome.error
             raise RunError(f"{image.path} could not be measured: {reason(outcome.error)}") from outcome.error
         if outcome is not None:
             found[outcome.label] = outcome.result
@@ -197,10 +165,7 @@ def _measured(client: Workers, image: Image, job: Job, progress: Progress) -> Im
 
 
 def check_failures(job: Job, failures: dict[str, BaseException]) -> None:
-    """Raise if tiles failed, with their names and reasons, or with the input that changed."""
-    for error in failures.values():
-        if isinstance(error, ChangedInputError):
-            raise error
+    """Raise if tiles failed, with their names and reasons."""
     if failures:
         lines = "\n".join(f"  tile {name}: {reason(error)}" for name, error in sorted(failures.items()))
         waiting = " or wait for their path states" if job.hands_states_on else ""
@@ -242,24 +207,26 @@ def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iter
             schedules[i].ended(step)
             add_seconds(matched[i].seconds, seconds or {})  # of tracing; a tile keeps its own in its record
         elif schedules[i].failed(step):
-            if step.wavefront is not None and not isinstance(error, ChangedInputError):
+            if step.wavefront is not None:
                 error = RunError(f"tracing its path states, wavefront {step.wavefront}: {reason(error)}")
             for tile in jobs[i].store.grid.within(step.block.core):
                 matched[i].failures.setdefault(tile.name, error)
-                jobs[i].store.write_failure(tile.name, reason(error))
+                with suppress(OSError):  # a full disk must not end the run
+                    jobs[i].store.write(FAILURES, tile.name, reason=reason(error))
         _LOG.debug("%s: tile %s %s", jobs[i].out, step.name, f"failed: {reason(error)}" if error else "done")
         done = total - sum(map(len, schedules))
         progress("tiles", done, total)
         if not schedules[i]:
-            if not matched[i].failures:
-                jobs[i].store.steps.drop_sources({tile.name for tile in jobs[i].store.grid})
+            if not matched[i].failures:  # nothing needs them any more
+                jobs[i].store.remove([PIXELS, COSTS])
             yield matched[i]
     assert not any(schedules)  # else steps would wait for each other
 
 
 def _schedule(job: Job, tiles: Sequence[Tile]) -> Schedule:
     store, blocks = job.store, job.blocks
-    is_done = store.steps.intact(BORDERS) if job.hands_states_on else None
+    there = store.names(BORDERS) if tiles and job.hands_states_on else set[str]()
+    is_done = (lambda name: name in there and store.is_intact(BORDERS, name)) if job.hands_states_on else None
     together = blocks.size // store.grid.size
     places = {(tile.grid_row // together, tile.grid_column // together) for tile in tiles}
     return Schedule(blocks, [blocks.tile(*place) for place in sorted(places)], is_done, together)

@@ -25,7 +25,7 @@ from sat_intervals.run.pair import match_pair
 from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
 from sat_intervals.run.workers import cores_of_process, readers, reason, tiles_at_once
-from sat_intervals.store.zarr_arrays import STORED_BYTES
+from sat_intervals.store.tiles import store_bytes
 from sat_intervals.tiling import Grid, Window
 
 # Side of the sample, a window at the centre of the image; with exact seams up to twice as high and four times as wide.
@@ -114,7 +114,7 @@ def plan(
     progress("kernels", 0, 1)
     compile_kernels(config)
     seconds, extra = _expected(left, right, config, workers, grid)
-    pixels, files = region.height * region.width, run_files(config.products.compression)
+    files = run_files(config.products.compression)
     together = workers if config.cluster.kind == "threads" else cores_of_process(config.cluster)
     waiting = readers(config.cluster) * waiting_bytes(config)
     task = max(tile_bytes(config), strip_bytes(*strip, config.products.compression))
@@ -127,7 +127,7 @@ def plan(
         worker_bytes=PROCESS_BYTES + waiting + task,
         together=together,
         together_bytes=PROCESS_BYTES + waiting + together * task,
-        disk_bytes=pixels * (STORED_BYTES + 2 * config.subpixel_levels)
+        disk_bytes=store_bytes(grid, config.subpixel_levels)
         + part_bytes(files, region.height, region.width)
         + file_bytes(files, region.height, region.width)
         + handed_bytes(grid, config, (left, right)),

@@ -1,5 +1,6 @@
 """Tell what is odd about a pair: search range, no data, rows, noise."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,6 @@ from sat_intervals.config import Disparity, unreached
 from sat_intervals.match.sampling import Look, summary
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
-from sat_intervals.store.tiles import Records
 from sat_intervals.tiling import Window
 
 # Number of disparities up to which refinement alone can widen an interval to the whole search range.
@@ -30,7 +30,7 @@ def is_plain(image: Image) -> bool:
     return image.nodata is None and not image.use_mask and image.alpha is None and image.mask is None
 
 
-def quality_of(job: Job, records: Records) -> dict[str, Any]:
+def quality_of(job: Job, records: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the quality of a pair, see `Found`: as the search for the range measured it, else from the tiles."""
     if job.found:
         return job.found.quality

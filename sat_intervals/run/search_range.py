@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
+from sat_intervals.errors import RunError
 from sat_intervals.match.memory import check_memory
 from sat_intervals.match.normalization import BLOCK, blocks
 from sat_intervals.match.sampling import Look, Sample, coarse_rows, look, samples, summary
@@ -24,14 +24,11 @@ from sat_intervals.match.search_range import (
 )
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, read_window, watched_images
-from sat_intervals.raster.watching import read_unchanged
+from sat_intervals.raster import Image, read_window
 from sat_intervals.run.quality import COLLAR, is_plain
-from sat_intervals.run.workers import Connection, Task, Workers, reason
+from sat_intervals.run.workers import Connection, Task, Workers, picklable_errors, reason
 from sat_intervals.tiling import Grid, Window
 
-_Files = dict[str, dict[str, Any]]
-_Result = TypeVar("_Result")
 _RETRIES = 2
 # Bytes of the window and the task of a block.
 _TASK = 500
@@ -44,37 +41,22 @@ class _Block(NamedTuple):
     smallest: float
 
 
-def reduce_block(image: Image, block: Window, step: Step, files: _Files) -> _Block:
+def reduce_block(image: Image, block: Window, step: Step) -> _Block:
     """Reduce a block of an image; runs on a worker."""
-
-    def work() -> _Block:
+    with picklable_errors():
         pixels, state = read_window(image, block)
         smallest = pixels.min(where=state == 0, initial=np.inf)
         return _Block(reduced(pixels, state, step), float(smallest))
 
-    return _checked(work, files)
 
-
-def look_at(left: Image, right: Image, sample: Sample, files: _Files) -> Look | None:
+def look_at(left: Image, right: Image, sample: Sample) -> Look | None:
     """Match a sample; runs on a worker."""
-
-    def work() -> Look | None:
+    with picklable_errors():
         views = (read_window(image, window) for image, window in zip((left, right), sample.views, strict=True))
         return look(sample, *views)
 
-    return _checked(work, files)
 
-
-def _checked(work: Callable[[], _Result], files: _Files) -> _Result:
-    """Do the work; raise if an input has changed meanwhile, and only errors that can be pickled."""
-    try:
-        return read_unchanged(files, work)
-    except SatIntervalsError as error:
-        error.__cause__ = error.__context__ = None
-        raise
-
-
-def search_range(client: Workers, left: Image, right: Image, files: _Files, progress: Progress) -> Found:
+def search_range(client: Workers, left: Image, right: Image, progress: Progress) -> Found:
     """Find the search range of a pair from the whole images, with its evidence.
 
     Parameters
@@ -83,8 +65,6 @@ def search_range(client: Workers, left: Image, right: Image, files: _Files, prog
         Of the cluster.
     left, right
         The images.
-    files
-        `identity` of their files.
     progress
         Called after each block.
 
@@ -104,7 +84,7 @@ def search_range(client: Workers, left: Image, right: Image, files: _Files, prog
     step = finest_step(left.height, max(left.width, right.width))
     small, collars = [], {}
     for side, image in (("left", left), ("right", right)):
-        pixels, smallest = _reduced(client, image, step, files, progress)
+        pixels, smallest = _reduced(client, image, step, progress)
         found = collar(pixels, smallest)
         if is_plain(image) and found.mean() > COLLAR:
             collars[side] = {"value": smallest, "share": round(float(found.mean()), 4)}
@@ -117,18 +97,15 @@ def search_range(client: Workers, left: Image, right: Image, files: _Files, prog
             f"{left.path} and {right.path}: {error}: give the search range with --disparity MIN MAX, or check that the "
             "images are an epipolar pair"
         ) from None
-    chosen = [(left, right, sample, files) for sample in samples(matches, coarse_rows(*matches.images, matches))]
+    chosen = [(left, right, sample) for sample in samples(matches, coarse_rows(*matches.images, matches))]
     looks = [found for _, found in _outcomes(client, look_at, chosen, lambda stage, done, total: None)]
     return replace(searched, quality=summary(looks) | {"collars": collars})
 
 
 def find_here(left: Image, right: Image, progress: Progress) -> Found:
     """Find the search range of a pair with the cores of this machine; see `search_range`."""
-    check_unchanged = watched_images([left, right])
     with Connection(Cluster(), Path()) as connection:
-        found = search_range(connection.client(), left, right, {}, progress)
-    check_unchanged()
-    return found
+        return search_range(connection.client(), left, right, progress)
 
 
 def _check_size(image: Image) -> None:
@@ -137,7 +114,7 @@ def _check_size(image: Image) -> None:
     check_memory(_TASK * number, f"{image.path}: {size} pixels in {number} blocks", "is it the right file?")
 
 
-def _reduced(client: Workers, image: Image, step: Step, files: _Files, progress: Progress) -> tuple[np.ndarray, float]:
+def _reduced(client: Workers, image: Image, step: Step, progress: Progress) -> tuple[np.ndarray, float]:
     """An image at the finest level, and its smallest usable value."""
     windows = [
         block
@@ -146,7 +123,7 @@ def _reduced(client: Workers, image: Image, step: Step, files: _Files, progress:
     ]
     small = np.full((image.height // step.rows, image.width // step.columns), np.nan, np.float32)
     smallest = np.inf
-    for number, found in _outcomes(client, reduce_block, [(image, each, step, files) for each in windows], progress):
+    for number, found in _outcomes(client, reduce_block, [(image, each, step) for each in windows], progress):
         row, column = windows[number].row // step.rows, windows[number].column // step.columns
         small[row : row + found.pixels.shape[0], column : column + found.pixels.shape[1]] = found.pixels
         smallest = min(smallest, found.smallest)
@@ -166,8 +143,6 @@ def _outcomes(
     done = 0
     for outcome in client.outcomes((Task(i, function, arguments, _RETRIES) for i, arguments in enumerate(tasks))):
         if outcome is not None and outcome.error is not None:
-            if isinstance(outcome.error, ChangedInputError):
-                raise outcome.error
             raise RunError(f"the search range could not be found: {reason(outcome.error)}") from outcome.error
         if outcome is not None:
             done += 1

@@ -12,11 +12,11 @@ from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.patch import Frame, patch_areas
 from sat_intervals.progress import timed
 from sat_intervals.raster import read_views
-from sat_intervals.raster.watching import read_unchanged
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.run.job import Job
 from sat_intervals.run.workers import is_remote
-from sat_intervals.store.removal import COSTS, PIXELS
+from sat_intervals.store.arrays import numbered
+from sat_intervals.store.tiles import COSTS, PIXELS
 from sat_intervals.tiling import Tile, Views, Window, hull
 
 
@@ -35,8 +35,7 @@ def frame_of(job: Job, tile: Tile) -> Frame:
 
 def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict[str, float]) -> Source:
     """Read both images in the windows of a block's tiles."""
-    job.store.check(job.manifest)
-    job.check_inputs()  # before any work
+    job.check_version()  # before any work
     statistics, network = job.statistics(), network_of(job.config.cost, job.inputs)
     windows = [view_windows(_areas(job, tile, ranges), job.config) for tile in job.store.grid.within(block.core)]
     left, right = map(hull, zip(*windows, strict=True))
@@ -52,16 +51,16 @@ def _views(job: Job, block: Tile, windows: tuple[Window, Window]) -> Views:
     """
     images = job.left, job.right
     are_kept = job.hands_states_on and not is_remote(job.config.cluster)
-    if are_kept and (kept := job.store.steps.read(PIXELS, block.name)) is not None:
+    if are_kept and (kept := job.store.read(PIXELS, block.name)) is not None:
         left, right = (
             restored_view(image, window, *kept[2 * i : 2 * i + 2])
             for i, (image, window) in enumerate(zip(images, windows, strict=True))
         )
         return left, right
-    views = read_unchanged(job.files, lambda: read_views(images, windows))
+    views = read_views(images, windows)
     if are_kept:
-        arrays = (array for image, view in zip(images, views, strict=True) for array in kept_view(image, view))
-        job.store.steps.write(PIXELS, block.name, *arrays)
+        arrays = [array for image, view in zip(images, views, strict=True) for array in kept_view(image, view)]
+        job.store.write(PIXELS, block.name, numbered(arrays))
     return views
 
 
@@ -85,12 +84,12 @@ def costed(
         with timed(seconds, "match"):
             return views, cost_areas(views, areas, config, *of_pair)
     with timed(seconds, "read"):
-        kept = job.store.steps.read(COSTS, name)
+        kept = job.store.read(COSTS, name)
     if kept is None:
         with timed(seconds, "costs"):
             made = cost_areas(views, areas, config, *of_pair)
             kept = [cost.costs.left[:, :, : area.disparities] for area, cost in zip(areas, made, strict=True)]
-            job.store.steps.write(COSTS, name, *kept)
+            job.store.write(COSTS, name, numbered(kept))
         return views, made
     missing = [padded_to_lanes(costs.shape[2]) - costs.shape[2] for costs in kept]
     padded = [np.pad(costs, [(0, 0), (0, 0), (0, more)]) for costs, more in zip(kept, missing, strict=True)]

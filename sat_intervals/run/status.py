@@ -8,14 +8,10 @@ from typing import Any
 from sat_intervals.config.pairs import REPORT
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import BLOCK
-from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.marks import is_replacing
-from sat_intervals.store.parts import parts_in
-from sat_intervals.store.place import ElsewhereError
-from sat_intervals.store.removal import BORDERS
-from sat_intervals.store.tiles import store_of
-
-__all__ = ["ElsewhereError", "Status", "is_replacing", "read_report", "read_status"]
+from sat_intervals.store.folder import folder_at
+from sat_intervals.store.lock import is_locked
+from sat_intervals.store.manifest import PLACE, StoreError, digest, grid_of, read_manifest
+from sat_intervals.store.tiles import BORDERS, PARTS, TILES, Store, home_of
 
 # States of the pairs of a batch.
 _STATES = "waiting", "done", "done before", "failed"
@@ -48,38 +44,35 @@ class Status:
     running: bool
 
 
-def read_status(home: Path, store: str | None = None) -> Status:
-    """Read the progress of a run from its store.
-
-    Parameters
-    ----------
-    home
-        Folder of the tiles in the folder of the run, even if they are elsewhere.
-    store
-        The store that the user names; without it only ``home`` is read.
+def read_status(out: Path) -> Status:
+    """Read the progress of a run from its tiles.
 
     Raises
     ------
     StoreError
-        There is no store, or it is not the one that the user names.
+        There are none, or their manifest is damaged.
     """
-    there = store_of(home, store)
-    handed_on = len(there.folder.inside(BORDERS).sizes())
+    manifest = read_manifest(home_of(out))
+    if manifest is None:
+        raise StoreError(f"{out} has no run: give the folder that match was given")
+    grid = grid_of(manifest)
+    store = Store(folder_at(manifest[PLACE]), grid, digest(manifest))
     return Status(
-        total=len(there.grid),
-        done=len(there.done()),
-        handed_on=handed_on,
-        strips=-(-there.grid.region.height // BLOCK),
-        strips_done=parts_in(there).strips_done(),
-        failed=there.failures(),
-        running=LocalFolder(home).is_locked(),
+        total=len(grid),
+        done=len(store.names(TILES)),
+        handed_on=len(store.names(BORDERS)),
+        strips=-(-grid.region.height // BLOCK),
+        strips_done=sum(name.startswith("0_") for name in store.names(PARTS)),
+        failed=store.failures(),
+        running=is_locked(out),
     )
 
 
 def read_report(out: Path) -> dict[str, dict[str, Any]] | None:
     """Read the report of `match_batch` in a folder, None without one."""
-    text = LocalFolder(out).read(REPORT)
-    if text is None:
+    try:
+        text = (out / REPORT).read_text(errors="replace")
+    except (FileNotFoundError, NotADirectoryError):
         return None
     try:
         states = {str(name): {"error": "", **ended} for name, ended in json.loads(text).items()}

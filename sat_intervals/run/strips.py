@@ -1,68 +1,89 @@
 """Finish strips of a run on workers: final bands, compressed as parts of the files, and overviews of finished parts.
 
 A strip is one row of blocks. It is computed in pieces, so memory depends on the width only. A row of blocks of an
-overview is made of two rows of the level below it, so the parts form a binary tree.
+overview is made of two rows of the level below it, so the parts form a binary tree. A part is one file, with the
+compressed bytes of each final file, and every second row and column for the level above.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from io import BytesIO
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
+from sat_intervals.config import Config
 from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.match import postprocess
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
 from sat_intervals.progress import Progress
-from sat_intervals.raster import BLOCK, RUN_FILES, compressed, run_files
+from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, run_files
 from sat_intervals.run.job import Job
-from sat_intervals.run.parts import codecs_of, rows_of_levels
 from sat_intervals.run.statistics import Tally
-from sat_intervals.run.workers import Task, Workers, check_not_full, computing, reason
-from sat_intervals.store.parts import PartKey, Parts
-from sat_intervals.store.tiles import DamagedTilesError, Records
+from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason
+from sat_intervals.store.arrays import DamagedFileError
+from sat_intervals.store.manifest import digest
+from sat_intervals.store.tiles import PARTS, DamagedTilesError
+from sat_intervals.tiling import Window
 
-# Pixels for the next level, not compressed: every second row and column of all files.
-_HALF = "half"
+PartKey = tuple[int, int]
+"""Level of a file, 0 for its pixels, and row of blocks from the top."""
+
+# What finishes rows decides their bytes, too. The number increases when parts change.
+_CODE = zlib.crc32(Path(postprocess.__file__).read_bytes()), 2
+_HALF = "half of {}"
+
+
+def rows_of_levels(region: Window) -> list[int]:
+    """Return the number of rows of blocks of each level."""
+    return [-(-region.height // (factor * BLOCK)) for factor in factors(region.height, region.width)]
+
+
+def codecs_of(config: Config) -> dict[str, Any]:
+    """Return what decides the bytes of parts in this process, beside the run."""
+    return codec_versions(config.products.compression) | {"code": _CODE}
+
+
+def parts_of(job: Job) -> str:
+    """Return what the parts of a run belong to: those of other settings or codecs are made again."""
+    return digest({"run": job.name, "codecs": codecs_of(job.config)})
+
+
+def part_name(key: PartKey) -> str:
+    """Return the name of a part's file."""
+    return f"{key[0]}_{key[1]}"
 
 
 def finish_strips(
-    job: Job, client: Callable[[], Workers], scale: ConfidenceScale, records: Records, progress: Progress
-) -> tuple[dict[PartKey, dict[str, Any]], Workers | None]:
-    """Make the parts of a run that are missing; return the records of all, and the workers if these were needed.
+    job: Job, client: Callable[[], Workers], scale: ConfidenceScale, progress: Progress
+) -> dict[PartKey, dict[str, Any]]:
+    """Make the parts of a run that are missing; return ``meta`` of all.
 
     Parameters
     ----------
     job
-        The pair.
+        The pair, whose tiles are done.
     client
-        Returns the client of the cluster; called if parts are missing.
+        Returns the workers; called if parts are missing.
     scale
         See `postprocess_rows`.
-    records
-        Records of all tiles.
     progress
         Called after each strip.
 
     Raises
     ------
     DamagedTilesError
-        Tiles must be matched again.
+        Tiles must be matched, or parts made again.
     RunError
         A strip failed.
     """
-    parts = job.parts()
-    region = job.store.grid.region
-    counts = rows_of_levels(region)
-    height = region.height
+    counts, height = rows_of_levels(job.store.grid.region), job.store.grid.region.height
     keys = [(level, row) for level in reversed(range(len(counts))) for row in range(counts[level])]
-    done = set(parts.done())
+    of = parts_of(job)
+    done = {key for key in keys if job.store.meta(PARTS, part_name(key), of)}
     waiting = [key for key in keys if key not in done]
-    job.check_space([], len(done))
-    parts.begin()
-    tiles: list[str] = []  # what is wrong with tiles
-    damaged: list[str] = []  # names of parts
+    damaged: list[str] = []
 
     def tasks() -> Iterator[Task | None]:
         while waiting:
@@ -71,25 +92,32 @@ def finish_strips(
                 yield None
             else:
                 waiting.remove(key)
-                yield _task(job, key, counts, scale, records)
+                yield _task(job, key, counts, scale, of)
 
-    workers = client() if waiting else None
-    for outcome in workers.outcomes(tasks()) if workers else ():
+    for outcome in client().outcomes(tasks()) if waiting else ():
         if outcome is not None and outcome.error is not None:
             _fail(job, outcome.label, outcome.error)
         if outcome is not None and outcome.result is not None:
-            # the other strips are finished before the tiles are matched again
-            (damaged if outcome.label[0] else tiles).append(outcome.result)
+            damaged.append(outcome.result)  # the other strips are finished before tiles are matched again
         elif outcome is not None:
             done.add(outcome.label)
         progress("bands", min(height, BLOCK * sum(level == 0 for level, _ in done)), height)
-    if tiles:
-        raise DamagedTilesError(tiles[0])
-    finished = parts.done()
-    if damaged := damaged or [parts.label(key) for key in sorted(set(keys) - finished.keys())]:
-        raise parts.damaged(damaged)
+    if damaged:
+        raise DamagedTilesError(damaged[0])
+    found = {key: job.store.meta(PARTS, part_name(key), of) for key in keys}
+    if missing := [part_name(key) for key in keys if found[key] is None]:
+        raise damaged_parts(job, missing)
     progress("bands", height, height)
-    return finished, workers
+    return {key: meta for key, meta in found.items() if meta is not None}
+
+
+def damaged_parts(job: Job, names: Sequence[str]) -> DamagedTilesError:
+    """Delete parts; return the error that says that they must be made again."""
+    job.store.delete(PARTS, names)
+    return DamagedTilesError(
+        f"parts {', '.join(names)} in {job.store.folder} are damaged or missing: rerun the same command: it makes "
+        "them again"
+    )
 
 
 def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
@@ -98,16 +126,11 @@ def _below(key: PartKey, counts: Sequence[int]) -> list[PartKey]:
     return [(level - 1, below) for below in (2 * row, 2 * row + 1) if level and below < counts[level - 1]]
 
 
-def _task(job: Job, key: PartKey, counts: Sequence[int], scale: ConfidenceScale, records: Records) -> Task:
-    codecs, retries = codecs_of(job.config), job.config.cluster.retries
+def _task(job: Job, key: PartKey, counts: Sequence[int], scale: ConfidenceScale, of: str) -> Task:
+    retries = job.config.cluster.retries
     if key[0]:
-        return Task(key, reduce_rows, (job, codecs, key, _below(key, counts)), retries)
-    top, bottom = _rows(job, key[1], halo(job.config))
-    grid = job.store.grid
-    needed = range(top // grid.size, -(-bottom // grid.size))
-    names = [grid.tile(row, column).name for row in needed for column in range(grid.columns)]
-    files = {name: {"files": records[name]["files"]} for name in names}
-    return Task(key, finish_strip, (job, codecs, key, files, scale), retries)
+        return Task(key, reduce_rows, (job, of, key, _below(key, counts)), retries)
+    return Task(key, finish_strip, (job, of, key, scale), retries)
 
 
 def _rows(job: Job, row: int, margin: int = 0) -> tuple[int, int]:
@@ -127,20 +150,16 @@ def _fail(job: Job, key: PartKey, error: BaseException) -> NoReturn:
     ) from error
 
 
-def finish_strip(
-    job: Job, codecs: Mapping[str, Any], key: PartKey, records: Records, scale: ConfidenceScale
-) -> str | None:
-    """Make the part of a strip; return what is wrong if tiles are damaged. Runs on a worker.
-
-    ``records`` are those of the tiles of its rows and their halo.
-    """
+def finish_strip(job: Job, of: str, key: PartKey, scale: ConfidenceScale) -> str | None:
+    """Make the part of a strip; return what is wrong if tiles are damaged. Runs on a worker."""
     # also while it reads and writes: more strips at once would need more memory than `check_tiles` allows for
-    with on_worker(job, codecs) as parts, computing(job.config.cluster):
+    with picklable_errors(), computing(job.config.cluster):
+        check_codecs(job, of)
         (first, last), (top, bottom) = _rows(job, key[1]), _rows(job, key[1], halo(job.config))
         shape, search = (last - first, job.store.grid.region.width), job.config.disparity
         intervals, validity = np.empty((4, *shape), np.float32), np.empty((1, *shape), np.uint16)
         tally, row = Tally(search.count, search.minimum), 0
-        raw = job.store.strips(max(1, STRIP_PIXELS // shape[1]), records, top, bottom)
+        raw = job.store.strips(max(1, STRIP_PIXELS // shape[1]), search.count, top, bottom)
         try:
             for final in postprocess_strip(
                 (RawRows(**piece) for piece in raw), first - top, shape[0], scale, job.config
@@ -150,67 +169,44 @@ def finish_strip(
                 tally.add(final)
         except DamagedTilesError as error:
             return str(error)
-        _write(job, parts, key, (intervals, validity), {"counts": tally.counts()})
+        _write(job, of, key, [intervals, validity], counts=tally.counts())
     return None
 
 
-def reduce_rows(job: Job, codecs: Mapping[str, Any], key: PartKey, below: Sequence[PartKey]) -> str | None:
-    """Make a row of blocks of an overview from parts of the level below; return the name of one that is damaged."""
-    with on_worker(job, codecs) as parts:
+def reduce_rows(job: Job, of: str, key: PartKey, below: Sequence[PartKey]) -> str | None:
+    """Make a row of blocks of an overview from parts of the level below; return what is wrong if one is damaged."""
+    with picklable_errors():
+        check_codecs(job, of)
         halves = []
-        for part in below:
-            record = parts.record(part)
-            if record is None:
-                return parts.label(part)
-            content = parts.read(part, _HALF, record["files"][_HALF])
-            if content is None:
-                return parts.label(part, _HALF)
-            halves.append(_half(content, record["half"]))
-        rasters = [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)]
-        _write(job, parts, key, rasters, {})
+        for part in map(part_name, below):
+            try:
+                with job.store.opened(PARTS, part, of) as archive:
+                    halves.append([archive[_HALF.format(file.kind)] for file in RUN_FILES])
+            except DamagedFileError:
+                return str(damaged_parts(job, [part]))
+        _write(job, of, key, [np.concatenate(of_file, axis=1) for of_file in zip(*halves, strict=True)])
     return None
 
 
-def _half(content: bytes, shape: Sequence[int]) -> list[np.ndarray]:
-    """Return the rasters of all files from the content of a half of ``shape``."""
-    rasters, start = [], 0
-    for file in RUN_FILES:
-        whole = len(file.bands), *shape
-        rasters.append(np.frombuffer(content, file.dtype, int(np.prod(whole)), start).reshape(whole))
-        start += rasters[-1].nbytes
-    return rasters
-
-
-def _write(job: Job, parts: Parts, key: PartKey, rasters: Sequence[np.ndarray], record: Mapping[str, Any]) -> None:
-    """Write a part, one content after another, so that only one is in memory."""
-    blocks, files = {}, {}
-    for file, raster in zip(run_files(job.config.products.compression), rasters, strict=True):
+def _write(job: Job, of: str, key: PartKey, rasters: list[np.ndarray], **meta: Any) -> None:
+    """Write a part; ``rasters`` are emptied on the way, to save memory."""
+    blocks, arrays = {}, []
+    is_top = key[0] + 1 == len(rows_of_levels(job.store.grid.region))
+    for file in run_files(job.config.products.compression):
+        raster = rasters.pop(0)
         made = compressed(raster, file)
-        blocks[file.kind], files[file.kind] = made.sizes, parts.write(key, file.kind, made.content)
-        del made
-    halves = [raster[:, ::2, ::2] for raster in rasters]
-    if key[0] + 1 < len(rows_of_levels(job.store.grid.region)):
-        content = BytesIO()
-        content.writelines(band.tobytes() for half in halves for band in half)
-        files[_HALF] = parts.write(key, _HALF, content.getvalue())
-    parts.write_record(key, {**record, "blocks": blocks, "half": halves[0].shape[1:], "files": files})
+        blocks[file.kind] = made.sizes
+        arrays.append((file.kind, np.frombuffer(made.content, np.uint8)))
+        if not is_top:
+            arrays.append((_HALF.format(file.kind), np.ascontiguousarray(raster[:, ::2, ::2])))
+    job.store.write(PARTS, part_name(key), arrays, of=of, blocks=blocks, **meta)
 
 
-@contextmanager
-def on_worker(job: Job, codecs: Mapping[str, Any]) -> Iterator[Parts]:
-    """Check that a worker makes the same bytes as the others; yield the parts of the run."""
-    try:
-        try:
-            job.store.check(job.manifest)
-        except OSError as error:
-            raise RunError(f"{job.store.folder} cannot be read: {reason(error)}") from error
-        here = codecs_of(job.config)
-        if here != codecs:
-            raise RunError(
-                f"this worker compresses with {here}, the command with {dict(codecs)}: install the same "
-                "version of rasterio for all"
-            )
-        yield job.parts(codecs)
-    except SatIntervalsError as error:
-        error.__cause__ = error.__context__ = None  # errors of GDAL cannot be pickled
-        raise
+def check_codecs(job: Job, of: str) -> None:
+    """Raise if this process, a worker, makes other bytes than the command."""
+    job.check_version()
+    if of != parts_of(job):
+        raise RunError(
+            f"this worker compresses with {codecs_of(job.config)}, the command with other versions: install the same "
+            "version of rasterio for all"
+        )

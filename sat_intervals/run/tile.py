@@ -3,11 +3,10 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import RunError
 from sat_intervals.kernels.confidence import ambiguity_histogram
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.borders import Border, Place, borders_of, in_order, rehulled, sources, trace_area
@@ -25,13 +24,13 @@ from sat_intervals.match.sampling import Look, look_in_tile
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
-from sat_intervals.raster.watching import read_unchanged
 from sat_intervals.run.job import Job
 from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.seams import seam_lines
 from sat_intervals.run.source import Source, costed, frame_of, read_source
-from sat_intervals.run.workers import computing
-from sat_intervals.store.removal import BORDERS
+from sat_intervals.run.workers import computing, picklable_errors
+from sat_intervals.store.arrays import numbered
+from sat_intervals.store.tiles import BORDERS
 from sat_intervals.tiling import Tile, Views, Window
 
 # Tiles along each side of the grid, at most, in which the quality of a pair is looked at.
@@ -43,24 +42,21 @@ Handed = dict[Place, list[Edge]]
 _LOG = logging.getLogger(__name__)
 
 
-def measure_block(image: Image, block: Window, files: dict[str, dict[str, Any]]) -> Moments:
-    """Compute the moments of a block of an image, one of ``files``; runs on a worker."""
-    try:
-        return read_unchanged(files, lambda: moments(*read_window(image, block)))
-    except SatIntervalsError as error:
-        error.__cause__ = error.__context__ = None
-        raise
+def measure_block(image: Image, block: Window) -> Moments:
+    """Compute the moments of a block of an image; runs on a worker."""
+    with picklable_errors():
+        return moments(*read_window(image, block))
 
 
 def match_block(job: Job, block: Tile) -> None:
     """Match the tiles of a block and write their intermediate products; runs on a worker."""
-    with _logged_failure(job, block.name):
+    with _logged_failure(job, block.name), picklable_errors():
         _match_block(job, block)
 
 
 def trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
     """Write the path states that a block hands on in a wavefront; return seconds by stage; runs on a worker."""
-    with _logged_failure(job, f"{block.name}, wavefront {wavefront},"):
+    with _logged_failure(job, f"{block.name}, wavefront {wavefront},"), picklable_errors():
         return _trace_block(job, block, wavefront)
 
 
@@ -68,18 +64,14 @@ def trace_block(job: Job, block: Tile, wavefront: int) -> dict[str, float]:
 def _logged_failure(job: Job, step: str) -> Iterator[None]:
     try:
         yield
-    except Exception as error:
+    except Exception:
         _LOG.info("tile %s failed; it is tried again at most %d times", step, job.config.cluster.retries, exc_info=True)
-        if isinstance(error, SatIntervalsError):
-            error.__cause__ = error.__context__ = None  # errors of GDAL cannot be pickled
         raise
 
 
 def _match_block(job: Job, block: Tile) -> None:
     read: dict[str, float] = {}
     tiles, ranges = job.store.grid.within(block.core), job.ranges()
-    for tile in tiles:
-        job.store.check_space(tile)
     source = read_source(job, block, ranges, read)
     handed: list[Handed] = []
     if job.hands_states_on:
@@ -116,8 +108,7 @@ def _match_tile(
     if handed:
         handed[LAST][_place(tile)] = patch.leaving
     with timed(seconds, "write"):
-        files = job.store.write_arrays(tile, products, job.manifest)
-    job.store.write_record(tile, {"usable_pixels": usable, "seconds": seconds, "files": files, "looks": looks})
+        job.store.write_tile(tile, products, usable_pixels=usable, seconds=seconds, looks=looks)
     _LOG.debug("tile %s: %s", tile.name, ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items()))
 
 
@@ -162,7 +153,8 @@ def _frames(job: Job, tile: Tile) -> list[Frame]:
 def _write_states(job: Job, block: Tile, wavefront: int, handed: Handed) -> None:
     """Write what the tiles of a block hand on: for each tile and view the states of its last column and row."""
     edges = [edge for tile in job.store.grid.within(block.core) for edge in handed[_place(tile)]]
-    job.store.steps.write(BORDERS, Step(block, wavefront).name, *(states for edge in edges for states in edge))
+    states = (states for edge in edges for states in edge)
+    job.store.write(BORDERS, Step(block, wavefront).name, numbered(states))
 
 
 def _handed(job: Job, block: Tile, wavefront: int, *, inside: bool = False) -> Handed:
@@ -185,14 +177,14 @@ def _handed(job: Job, block: Tile, wavefront: int, *, inside: bool = False) -> H
 def _states_of(job: Job, step: Step, wanted: Sequence[int]) -> list[list[Edge]]:
     """Read what some tiles of a step hand on in each view; trace it again if the file is missing or damaged."""
     count = 2 * (1 + job.config.matches_right_view)  # arrays of a tile
-    numbers = [number for i in wanted for number in range(i * count, (i + 1) * count)]
-    file = f"{job.store.folder}/{BORDERS}/{step.name}"
-    arrays = job.store.steps.read(BORDERS, step.name, numbers) if numbers else []
+    numbers = [str(number) for i in wanted for number in range(i * count, (i + 1) * count)]
+    file = f"{job.store.folder}/{BORDERS}/{step.name}.npz"
+    arrays = job.store.read(BORDERS, step.name, numbers) if numbers else []
     if arrays is None:
         assert step.wavefront is not None
         _LOG.warning("%s is missing or damaged: it is traced again", file)
         _trace_block(job, step.block, step.wavefront)
-        arrays = job.store.steps.read(BORDERS, step.name, numbers)
+        arrays = job.store.read(BORDERS, step.name, numbers)
     if arrays is None:
         raise RunError(
             f"{file} was damaged as soon as it was written: check the disk, then rerun the same command: it resumes"
@@ -227,9 +219,9 @@ def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     if job.config.subpixel_levels == 2:
         arrays |= {name: getattr(raw, name)[inner] for name in ("lower_low", "upper_low")}
     ambiguity = raw.ambiguity[inner]
-    histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.store.ambiguities)
+    histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.config.largest_ambiguity)
     if job.config.cross_check:
         arrays |= {"right_cost": patch.right.cost, "right_winner": patch.right.winner}
-    if job.store.has_seams:
+    if job.config.tiles.overlap != "exact":
         arrays["seams"] = seam_lines(raw, patch.output, tile.core, job.store.grid.size)
     return arrays | {"ambiguity": ambiguity, "histogram": histogram}

@@ -13,9 +13,9 @@ from threading import BoundedSemaphore
 from typing import Any, NamedTuple, Protocol, Self
 
 from sat_intervals.config import Cluster, ConfigError
-from sat_intervals.errors import RunError
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
-from sat_intervals.store.folder import LocalFolder, folder_at
+from sat_intervals.store.folder import folder_at
 
 # Seconds after which the caller is asked for more tasks, if no task has ended.
 CHECK_EVERY = 2.0
@@ -73,7 +73,7 @@ def readers(settings: Cluster) -> int:
 
 def is_remote(settings: Cluster) -> bool:
     """Return whether tiles are in a bucket or the like."""
-    return settings.store is not None and not isinstance(folder_at(settings.store), LocalFolder)
+    return settings.store is not None and not folder_at(settings.store).is_local
 
 
 def computing(settings: Cluster) -> AbstractContextManager[Any]:
@@ -214,6 +214,16 @@ def check_not_full(error: BaseException, place: object) -> None:
         raise RunError(
             f"{error.filename or place}: {error.strerror}: free disk space and rerun the same command: it resumes"
         ) from error
+
+
+@contextmanager
+def picklable_errors() -> Iterator[None]:
+    """Drop the causes of our errors: those of GDAL cannot be sent from a worker."""
+    try:
+        yield
+    except SatIntervalsError as error:
+        error.__cause__ = error.__context__ = None
+        raise
 
 
 def reason(error: BaseException) -> str:

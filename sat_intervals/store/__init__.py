@@ -1,1 +1,1 @@
-"""Intermediate tile products: manifest, records and arrays. Only this folder imports zarr and fsspec."""
+"""What steps of a run hand to later ones: a folder, one form of files, a manifest, and tiles. Only here is fsspec."""

@@ -1,76 +1,131 @@
-"""Folders of a store: local ones, and prefixes of fsspec file systems."""
+"""A folder of intermediate files, on a disk or as a prefix of an fsspec file system such as an S3 bucket.
 
-from collections.abc import Collection, Sequence
+Addresses and credentials of a server come from its environment variables and files (``AWS_ENDPOINT_URL``, ``~/.aws``)
+or from fsspec's.
+"""
+
+import errno
+import os
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Any
 
-from sat_intervals.store.local import MADE, LocalFolder, mark
-from sat_intervals.store.remote import RemoteFolder, object_tag
+import fsspec
 
-__all__ = ["MADE", "Folder", "LocalFolder", "RemoteFolder", "folder_at", "mark", "object_tag"]
+# Read at once from a server: the members of a file that a strip reads follow each other.
+_BLOCK = 4 << 20
 
 
-class Folder(Protocol):
-    """Interface of a store's folder; names are relative to it, with ``/`` between their parts.
+@dataclass(frozen=True)
+class Folder:
+    """A folder; names are relative to it, with ``/`` between their parts.
 
-    Invalid UTF-8 is read as U+FFFD, so that a damaged text only fails its checksum.
+    Any failure is an OSError, a missing file a FileNotFoundError.
     """
 
-    def read(self, name: str) -> str | None:
-        """Read the text of a file, None if it does not exist."""
+    place: str
 
-    def read_bytes(self, name: str) -> bytes | None:
-        """Read the content of a file, None if it does not exist."""
+    def __str__(self) -> str:
+        """Return the path or URL."""
+        return self.place
 
-    def read_parts(self, parts: Sequence[tuple[str, int, int]]) -> list[bytes | None]:
-        """Read the bytes ``[start, stop)`` of some files, fewer if one is shorter, None if it does not exist."""
+    @property
+    def is_local(self) -> bool:
+        """Return whether it is on a disk."""
+        return "://" not in self.place
 
-    def read_all(self, folder: str) -> dict[str, str]:
-        """Read the texts of all JSON files in a folder, by name without suffix."""
+    @contextmanager
+    def _reached(self) -> Iterator[Any]:
+        """Yield the file system, which fsspec keeps; errors of its libraries become OSError."""
+        try:
+            yield fsspec.url_to_fs(self.place)[0]
+        except OSError:
+            raise
+        except Exception as error:
+            raise OSError(errno.EIO, " ".join(str(error).split()) or type(error).__name__, self.place) from error
 
-    def sizes(self) -> dict[str, int]:
-        """Return the sizes in bytes of all files and links to folders, recursively, by name."""
+    def _path(self, name: str) -> str:
+        return f"{self.place}/{name}"
 
-    def write(self, name: str, text: str) -> None:
-        """Write a file atomically."""
+    @contextmanager
+    def opened(self, name: str) -> Iterator[IO[bytes]]:
+        """Open a file for reading any part of it."""
+        if self.is_local:
+            with open(self._path(name), "rb") as stream:
+                yield stream
+        else:
+            with self._reached() as system:
+                options = {"block_size": _BLOCK, "cache_type": "readahead"}
+                with system.open(system._strip_protocol(self._path(name)), "rb", **options) as stream:
+                    yield stream
 
-    def write_bytes(self, name: str, content: bytes) -> None:
+    def read(self, name: str) -> bytes:
+        """Read a file."""
+        with self._reached() as system:
+            return bytes(system.cat_file(self._path(name)))
+
+    def write(self, name: str, content: bytes | memoryview) -> None:
         """Write a file that exists only when it is complete."""
+        if not self.is_local:
+            with self._reached() as system:
+                system.pipe_file(self._path(name), bytes(content))
+            return
+        path = Path(self._path(name))
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_bytes(content)
+            os.replace(temporary, path)
+        except OSError as error:
+            temporary.unlink(missing_ok=True)
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
-    def create(self, name: str, text: str) -> bool:
-        """Write a file atomically unless it exists; return whether it was written."""
+    def sizes(self, kind: str) -> dict[str, int]:
+        """Return the sizes in bytes of the finished files in a subfolder, by name."""
+        with suppress(FileNotFoundError), self._reached() as system:
+            system.invalidate_cache()
+            found = system.ls(self._path(kind), detail=True)
+            files = {os.path.basename(file["name"]): file["size"] for file in found if file["type"] == "file"}
+            return {name: size for name, size in files.items() if not name.startswith(".")}
+        return {}
 
-    def delete(self, name: str) -> None:
-        """Delete a file if it exists."""
+    def delete(self, names: Iterable[str]) -> None:
+        """Delete files, if they exist."""
+        with self._reached() as system:
+            for name in names:
+                with suppress(FileNotFoundError):
+                    system.rm_file(self._path(name))
 
-    def delete_all(self, names: Collection[str], folders: Collection[str] = ()) -> None:
-        """Delete files, then those of the folders that contain no file."""
+    def remove(self, kind: str) -> None:
+        """Delete a subfolder with all that is in it."""
+        with suppress(FileNotFoundError), self._reached() as system:
+            system.invalidate_cache()
+            system.rm(self._path(kind), recursive=True)
 
-    def delete_if_empty(self) -> None:
-        """Delete this folder if it is empty."""
-
-    def inside(self, folder: str) -> "Folder":
-        """Return a subfolder."""
-
-    def of_run(self, run: str) -> "Folder":
-        """Return the folder, in which nothing is written or deleted once MADE has the mark of another run.
-
-        Writing and deleting then raise OSError (ESTALE).
-        """
-
-    def make(self, folder: str) -> None:
-        """Create a folder if the file system needs that."""
-
-    def place(self, name: str) -> Path | str:
-        """Return the path or URL of a name."""
-
-    def free_bytes(self) -> int | None:
-        """Return the free space in bytes, None if unknown."""
+    def remove_if_empty(self) -> None:
+        """Delete the folder, if it is on a disk and empty."""
+        if self.is_local:
+            with suppress(OSError):
+                os.rmdir(self.place)
 
 
 def folder_at(place: str | Path) -> Folder:
     """Return the folder at a path or URL."""
     protocol, _, path = str(place).rpartition("://")
-    if protocol in ("", "file", "local"):
-        return LocalFolder(Path(path).absolute())
-    return RemoteFolder(str(place).rstrip("/"))
+    is_local = protocol in ("", "file", "local")
+    return Folder(str(Path(path).absolute()) if is_local else str(place).rstrip("/"))
+
+
+def object_tag(url: str) -> dict[str, Any]:
+    """Return size in bytes and ETag of an object; empty if fsspec cannot reach it."""
+    try:
+        system, path = fsspec.url_to_fs(url)
+        system.invalidate_cache(path)
+        content = system.info(path)
+    except Exception:  # of many libraries
+        return {}
+    tag = content.get("ETag") or content.get("etag") or content.get("LastModified")
+    return {"bytes": content.get("size"), "etag": None if tag is None else str(tag)}

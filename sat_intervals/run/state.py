@@ -1,0 +1,100 @@
+"""The state of a run's folder: what its manifest and its ``run.json`` say, and what a command does then."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.raster import RUN_FILES
+from sat_intervals.store.manifest import StoreError, differences, read_manifest
+from sat_intervals.store.tiles import home_of
+
+RUN_REPORT = "run.json"
+OUTPUTS = (*(file.name for file in RUN_FILES), RUN_REPORT)
+# What every report of a run has.
+_SECTIONS = {"settings", "inputs", "tiles"}
+
+NextStep = Literal["start", "resume", "start anew", "complete"]
+
+
+def read_report(out: Path) -> dict[str, Any] | None:
+    """Read the ``run.json`` of a complete run; None if there is none, or another file of this name."""
+    try:
+        report = json.loads((out / RUN_REPORT).read_bytes())
+        return report if report.keys() >= _SECTIONS else None
+    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError, RecursionError):
+        return None
+    except OSError as error:
+        raise SatIntervalsError(f"{out / RUN_REPORT} cannot be read: {error.strerror}: move it away") from error
+
+
+def check_folder(out: Path, *, overwrite: bool) -> None:
+    """Raise if a folder cannot be that of a run, or has files of its names that no run has made."""
+    if os.path.lexists(out) and not out.is_dir():
+        raise SatIntervalsError(f"{out} is not a folder: choose another")
+    if folders := [name for name in OUTPUTS if (out / name).is_dir()]:
+        raise SatIntervalsError(f"{out / folders[0]} is a folder: move it away or choose another folder")
+    if overwrite or read_report(out) is not None:
+        return
+    is_begun = (home_of(out) / "manifest.json").exists()  # a death may have left rasters, but no report
+    if there := [name for name in OUTPUTS if (out / name).exists() and (not is_begun or name == RUN_REPORT)]:
+        raise SatIntervalsError(
+            f"{out / there[0]} exists and is of no complete run: move it away, choose another folder or --overwrite"
+        )
+
+
+def next_step(out: Path, manifest: Mapping[str, Any], run: str, *, overwrite: bool) -> NextStep:
+    """Return what to do in the folder of a run.
+
+    Parameters
+    ----------
+    out
+        The folder.
+    manifest
+        That of the run that is wanted.
+    run
+        Its name, see `Job.name`.
+    overwrite
+        Whether tiles and files of another run may be replaced.
+
+    Raises
+    ------
+    SatIntervalsError
+        The folder holds another run, or files that no run has made.
+    """
+    report, home = read_report(out), home_of(out)
+    if report is not None and report.get("run") == run and not overwrite:
+        return "complete"
+    try:
+        there = read_manifest(home)
+    except StoreError:
+        if overwrite:
+            return "start anew"
+        raise
+    changes = list(differences(there, json.loads(json.dumps(manifest)))) if there else []
+    if overwrite:
+        return "start anew" if changes else "resume" if there else "start"
+    if changes:
+        kind = ChangedInputError if all(change.startswith("inputs.") for change in changes) else StoreError
+        raise kind(
+            f"{home} holds the tiles of another run: {'; '.join(changes)} "
+            "(use the same settings and inputs to resume, or --overwrite to start again)"
+        )
+    if report is not None:
+        raise SatIntervalsError(
+            f"{out} already holds {_other_run(report, manifest)}: choose another folder or --overwrite"
+        )
+    check_folder(out, overwrite=False)
+    return "resume" if there else "start"
+
+
+def _other_run(report: Mapping[str, Any], manifest: Mapping[str, Any]) -> str:
+    """Return in what the run of a report differs from the one that is wanted."""
+    before = {"settings": report["settings"], "inputs": report["inputs"], "region": report["tiles"].get("region")}
+    now = {name: manifest[name] for name in before}
+    before["settings"] = {name: before["settings"].get(name) for name in now["settings"] if name != "interval"}
+    now["settings"] = {name: value for name, value in now["settings"].items() if name != "interval"}
+    changes = list(differences(before, json.loads(json.dumps(now))))
+    return f"another run: {'; '.join(changes)}" if changes else "a run of other settings or of another version"

@@ -1,0 +1,86 @@
+"""The one form of intermediate files: a NumPy ``.npz``, an uncompressed zip of arrays with a member ``meta`` in JSON.
+
+``zipfile`` compares each member with its CRC-32 as it is read, and ``np.load`` opens the files, too.
+"""
+
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from sat_intervals.store.folder import Folder
+
+META = "meta"
+# What a damaged file raises: its zip, a member, or the header of an array.
+_DAMAGES = zipfile.BadZipFile, ValueError, KeyError, EOFError, RuntimeError, OverflowError, struct.error, zlib.error
+
+
+class DamagedFileError(Exception):
+    """A file that is missing, damaged, or of another run."""
+
+
+class Archive:
+    """An open file."""
+
+    def __init__(self, archive: zipfile.ZipFile, of: str) -> None:
+        """Open a file; raise if it was not written for ``of``."""
+        self._archive = archive
+        self.meta: dict[str, Any] = json.loads(archive.read(META))
+        if self.meta["of"] != of:
+            raise ValueError(of)
+
+    def names(self) -> list[str]:
+        """Return the names of its arrays."""
+        return [name.removesuffix(".npy") for name in self._archive.namelist() if name != META]
+
+    def is_intact(self) -> bool:
+        """Return whether all of it agrees with its checksums."""
+        return self._archive.testzip() is None
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Read an array, which cannot be written to."""
+        content = self._archive.read(f"{name}.npy")
+        stream = BytesIO(content)
+        np.lib.format.read_magic(stream)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+        return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape)
+
+
+def packed(arrays: Iterable[tuple[str, np.ndarray]], meta: Mapping[str, Any]) -> memoryview:
+    """Return the content of a file; equal arrays and meta give equal bytes."""
+    stream = BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))
+        for name, array in arrays:
+            array = np.ascontiguousarray(array)
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
+                member.write(array.reshape(-1).view(np.uint8).data)
+    return stream.getbuffer()
+
+
+def numbered(arrays: Iterable[np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
+    """Name arrays by their numbers, for `packed`."""
+    return ((str(number), array) for number, array in enumerate(arrays))
+
+
+@contextmanager
+def unpacked(folder: Folder, name: str, of: str) -> Iterator[Archive]:
+    """Open a file of a folder for reading some of its arrays.
+
+    Raises
+    ------
+    DamagedFileError
+        It is missing, damaged, or was written for something else than ``of``.
+    """
+    try:
+        with folder.opened(name) as stream, zipfile.ZipFile(stream) as archive:
+            yield Archive(archive, of)
+    except (FileNotFoundError, *_DAMAGES) as error:
+        raise DamagedFileError(name) from error
