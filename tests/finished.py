@@ -8,7 +8,6 @@ from rasterio import Env
 from sat_intervals.config import load_config
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION, Bands
 from sat_intervals.raster import POINT_FILES, RUN_FILES, Georeferencing, gdal, north_up, surface_file, write_layer
-from sat_intervals.raster.identity import checksum_of
 from sat_intervals.run.statistics import Tally
 from sat_intervals.show.legend import PIXEL_CLASSES
 
@@ -126,4 +125,3 @@ def write_points(out, height):
     """Points of these heights in the folder of a run, as `triangulate` publishes them."""
     bands = np.stack([np.full_like(height, 1.0), np.full_like(height, 44.0), *[height] * 3, 0 * height, *[height] * 4])
     write_file(out / "points.tif", POINT_FILES[0], bands, PLACE, {"RUN": FINISHED})
-    (out / "points.json").write_text(json.dumps({"files": {"points.tif": checksum_of(out / "points.tif")}}))

@@ -1,19 +1,14 @@
 """Functions shared by test modules: write a pair, run a command, wait, compare runs."""
 
 import hashlib
-import itertools
 import json
-import os
 import sysconfig
 import time
 from collections.abc import Callable
-from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 import rasterio
 import reference
 import yaml
@@ -27,7 +22,7 @@ from sat_intervals.kernels.cost import between, census
 from sat_intervals.kernels.matching import match_costs
 from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import INVALID
-from sat_intervals.raster import OutputWriter, hidden, north_up, publishing, write_file, write_layer
+from sat_intervals.raster import north_up, write_layer
 from sat_intervals.tiling import Window
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
@@ -110,17 +105,6 @@ def flip_bit(path):
     path.write_bytes(content)
 
 
-def late_file(file: Path) -> Callable[..., Any]:
-    """Return a `write_file` before which a user puts ``file`` at the place of a file that is about to be written."""
-
-    def late(path: Path, *arguments: Any) -> Any:
-        if path == file:
-            file.write_text("mine")
-        return write_file(path, *arguments)
-
-    return late
-
-
 def refused(arguments, *parts):
     """Run a command that must end with status 2 and one line."""
     result = invoke(*arguments)
@@ -134,48 +118,5 @@ def contents(folder):
     return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def exchanged(one, other):
-    """Let two folders, or files, take each other's names."""
-    aside = one.with_name(f"{one.name}-aside")
-    one.rename(aside)
-    other.rename(one)
-    aside.rename(other)
-
-
-def exchanged_for_link(file, mine, way="symlink_to"):
-    """What a hostile process does as soon as it sees a temporary file."""
-    file.rename(mine.with_name("moved"))
-    getattr(file, way)(mine)
-
-
 def fail(*arguments, **options):
     raise OSError(5, "Input/output error")
-
-
-class Killed(BaseException):
-    """As a kill by the system: nothing is tidied up."""
-
-
-@contextmanager
-def killed_while_publishing(number):
-    """Let the n-th change of a name by a publication, and all after it, raise Killed."""
-    calls, publish = itertools.count(1), publishing.publish
-
-    def counted(function):
-        def call(*arguments, **options):
-            if next(calls) >= number:
-                raise Killed
-            return function(*arguments, **options)
-
-        return call
-
-    def killed(*arguments):
-        changing = {name: counted(getattr(os, name)) for name in ("replace", "rename", "link", "unlink")}
-        patch.setattr(publishing, "os", SimpleNamespace(**vars(os) | changing))
-        patch.setattr(publishing, "_is_renamed", counted(publishing._is_renamed))
-        publish(*arguments)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OutputWriter, "_clean", lambda writer: writer._locked.close())
-        patch.setattr(hidden, "publish", killed)
-        yield

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sat_intervals.config import Config, calibration_of
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
@@ -105,13 +105,22 @@ def assemble(
             _copy_parts(job, writer, parts, client, progress)
             made = writer.build()
         with logged_stage(seconds, "inputs"):
-            check_unchanged(job.inputs, job.left, job.right, job.config)
+            _check_inputs(job)
         report = _report(job, tables, scale, parts.values(), seconds)
         for line in report["warnings"]:
             _LOG.warning("%s", line)
         _publish(job, writer, made, report, overwrite=overwrite)
     end_tiles(job, keep_tiles=keep_tiles)
     return report
+
+
+def _check_inputs(job: Job) -> None:
+    """Compare the inputs with those of the start; if one differs, the tiles are of both and must go."""
+    try:
+        check_unchanged(job.inputs, job.left, job.right, job.config)
+    except ChangedInputError:
+        remove_tiles(job.out)
+        raise
 
 
 def _publish(

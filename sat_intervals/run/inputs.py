@@ -43,10 +43,10 @@ def check_unchanged(before: Mapping[str, Any], left: Image, right: Image, config
     try:
         now = describe_inputs(left, right, config, {})
     except OSError as error:
-        raise ChangedInputError(f"{error.filename} cannot be read any more: {error.strerror}: restore it") from error
+        raise ChangedInputError(f"an input cannot be read any more, so the tiles are deleted: {error}") from error
     if changes := list(differences(before, json.loads(json.dumps(now)))):
         path = before[changes[0].partition(".")[0]]["path"]
         raise ChangedInputError(
-            f"{path} was changed during the run ({'; '.join(changes)}): restore it and rerun the same command: it "
-            "resumes; or start again with --overwrite"
+            f"{path} was changed during the run ({'; '.join(changes)}), so its tiles are deleted: rerun the command "
+            "when the file is complete"
         )

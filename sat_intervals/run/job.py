@@ -35,7 +35,7 @@ from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
 from sat_intervals.run.workers import parse_memory, readers
 from sat_intervals.store.folder import folder_at
-from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, read_manifest, write_manifest
+from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
 from sat_intervals.store.tiles import LAYOUT, ONCE, TILES, DamagedTilesError, Store, home_of, store_bytes
 from sat_intervals.tiling import Grid, Tile, Window
 
@@ -93,7 +93,8 @@ class Job:
     def manifest(self) -> dict[str, Any]:
         """Return all that decides the bytes of a tile, and where the tiles are."""
         made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest)
-        return made | {PLACE: str(self.store.folder)}
+        is_home = self.store.folder == folder_at(home_of(self.out))
+        return made | {PLACE: None if is_home else str(self.store.folder)}
 
     @property
     def hands_states_on(self) -> bool:
@@ -115,11 +116,11 @@ class Job:
         step = next_step(self.out, self.manifest, self.name, overwrite=overwrite)
         if step == "complete":
             return False
-        home = home_of(self.out)
         if step == "start anew":
             remove_tiles(self.out)
         try:
-            write_manifest(home, self.manifest)
+            self.store.write(ONCE, "begun")  # fails at once where nothing can be written
+            write_manifest(home_of(self.out), self.manifest)
             if self.found or self.local:
                 search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
                 self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), **search)
@@ -218,17 +219,17 @@ def prepare(
     check_folder(out, overwrite=overwrite)
     before = _before(out)
     inputs = describe_inputs(left, right, config, identities(before.get("inputs", {})))
-    config, found, local = searched(config, left, lambda: _found(before, inputs, find, left, right))
+    config, found, local = searched(config, left, lambda: _found(out, before, inputs, find, left, right))
     checked_pair(left, right, config)
     config = fitted_to_jobs(config)
     check_tiles(config, region)
     read = [*identities(inputs), *(files_of(config.disparity.grid) if config.disparity.grid else ())]
-    check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
     ranges = digest(local.report()) if local else None
     run = digest(_manifest(config, inputs, region, ranges))
     store = config.cluster.store
-    place = f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out)
-    kept = Store(folder_at(place), Grid(region, config.tiles.size), run)
+    folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
+    kept = Store(folder, Grid(region, config.tiles.size), run)
+    check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
     return Job(left, right, config, kept, out, inputs, requested, found, ranges, local)
 
 
@@ -241,12 +242,14 @@ def _before(out: Path) -> dict[str, Any]:
 
 
 def _found(
-    before: Mapping[str, Any], inputs: Mapping[str, Any], find: Search | None, left: Image, right: Image
+    out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any], find: Search | None, left: Image, right: Image
 ) -> Found:
     """Return the search range that an earlier run of the same images has found, else find it."""
     kept: Mapping[str, Any] | None = None
     if PLACE in before:
-        kept = (Store(folder_at(before[PLACE]), _NO_TILES, "").meta(ONCE, _RANGE, origin_of(inputs)) or {}).get("found")
+        kept = (Store(place_of(home_of(out), before), _NO_TILES, "").meta(ONCE, _RANGE, origin_of(inputs)) or {}).get(
+            "found"
+        )
     elif before.get("search") and before.get("origin") == origin_of(inputs):
         kept = before["search"]
     if kept:
@@ -269,8 +272,9 @@ def remove_tiles(out: Path) -> None:
         manifest = read_manifest(home)
     except StoreError:
         manifest = None
-    for place in {str(folder_at(home)), *([manifest[PLACE]] if manifest else [])}:
-        Store(folder_at(place), _NO_TILES, "").remove()
+    if manifest:
+        Store(place_of(home, manifest), _NO_TILES, "").remove()
+    Store(folder_at(home), _NO_TILES, "").remove()
     (home / MANIFEST).unlink(missing_ok=True)
     folder_at(home).remove_if_empty()
 

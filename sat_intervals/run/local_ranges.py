@@ -11,7 +11,6 @@ from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.search_range import Found, with_range
 from sat_intervals.products import RANGES
 from sat_intervals.raster import (
-    MARK,
     Image,
     OutputWriter,
     open_image,
@@ -64,7 +63,8 @@ def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
 
 def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
     """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
-    shape, tags = (left.height, left.width), {_OF: left.path, **tag_of_left(identity(left.path)), **MARK}
+    shape, tags = (left.height, left.width), {_OF: left.path, **tag_of_left(identity(left.path))}
+    tags["SOFTWARE"] = "sat-intervals"
     with OutputWriter(path.parent, [ranges_file(path.name)], *shape, left.georeferencing, tags) as writer:
         for row in range(0, left.height, _STRIP):
             window = Window(row, 0, min(_STRIP, left.height - row), left.width)

@@ -30,6 +30,11 @@ def read_report(out: Path) -> dict[str, Any] | None:
         raise SatIntervalsError(f"{out / RUN_REPORT} cannot be read: {error.strerror}: move it away") from error
 
 
+def is_complete(out: Path) -> bool:
+    """Return whether a folder has all files of a complete run."""
+    return read_report(out) is not None and all((out / name).exists() for name in OUTPUTS)
+
+
 def check_folder(out: Path, *, overwrite: bool) -> None:
     """Raise if a folder cannot be that of a run, or has files of its names that no run has made."""
     if os.path.lexists(out) and not out.is_dir():

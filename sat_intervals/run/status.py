@@ -8,9 +8,8 @@ from typing import Any
 from sat_intervals.config.pairs import REPORT
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.raster import BLOCK
-from sat_intervals.store.folder import folder_at
 from sat_intervals.store.lock import is_locked
-from sat_intervals.store.manifest import PLACE, StoreError, digest, grid_of, read_manifest
+from sat_intervals.store.manifest import StoreError, digest, grid_of, place_of, read_manifest
 from sat_intervals.store.tiles import BORDERS, PARTS, TILES, Store, home_of
 
 # States of the pairs of a batch.
@@ -56,7 +55,7 @@ def read_status(out: Path) -> Status:
     if manifest is None:
         raise StoreError(f"{out} has no run: give the folder that match was given")
     grid = grid_of(manifest)
-    store = Store(folder_at(manifest[PLACE]), grid, digest(manifest))
+    store = Store(place_of(home_of(out), manifest), grid, digest(manifest))
     return Status(
         total=len(grid),
         done=len(store.names(TILES)),

@@ -3,6 +3,7 @@
 ``zipfile`` compares each member with its CRC-32 as it is read, and ``np.load`` opens the files, too.
 """
 
+import errno
 import json
 import struct
 import zipfile
@@ -84,3 +85,7 @@ def unpacked(folder: Folder, name: str, of: str) -> Iterator[Archive]:
             yield Archive(archive, of)
     except (FileNotFoundError, *_DAMAGES) as error:
         raise DamagedFileError(name) from error
+    except OSError as error:
+        if error.errno == errno.EINVAL:  # a damaged offset
+            raise DamagedFileError(name) from error
+        raise

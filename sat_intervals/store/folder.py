@@ -54,13 +54,12 @@ class Folder:
     def opened(self, name: str) -> Iterator[IO[bytes]]:
         """Open a file for reading any part of it."""
         if self.is_local:
-            with open(self._path(name), "rb") as stream:
-                yield stream
+            stream = open(self._path(name), "rb")  # noqa: SIM115
         else:
             with self._reached() as system:
-                options = {"block_size": _BLOCK, "cache_type": "readahead"}
-                with system.open(system._strip_protocol(self._path(name)), "rb", **options) as stream:
-                    yield stream
+                stream = system.open(self._path(name), "rb", block_size=_BLOCK, cache_type="readahead")
+        with stream:
+            yield stream
 
     def read(self, name: str) -> bytes:
         """Read a file."""

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.store.folder import folder_at
+from sat_intervals.store.folder import Folder, folder_at
 from sat_intervals.tiling import Grid, Window
 
 MANIFEST = "manifest.json"
-# Key of the folder of the tiles; it does not decide their bytes.
+# Key of the folder of the tiles, None where they are beside the manifest; it does not decide their bytes.
 PLACE = "place"
-# Keys that do not matter if the SHA-256 of a file agrees.
-_IGNORED = ("modified", PLACE)
+# Key of a file that does not matter if its SHA-256 agrees.
+_IGNORED = "modified"
 # Characters of a value that a message shows.
 _LONGEST = 80
 
@@ -34,7 +34,7 @@ def read_manifest(home: Path) -> dict[str, Any] | None:
     try:
         manifest = json.loads((home / MANIFEST).read_bytes())
         grid_of(manifest)
-        str(manifest[PLACE])
+        manifest[PLACE]
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (LookupError, TypeError, ValueError, RecursionError) as error:
@@ -54,11 +54,16 @@ def grid_of(manifest: Mapping[str, Any]) -> Grid:
     return Grid(Window(**manifest["region"]), int(manifest["settings"]["tiles"]["size"]))
 
 
+def place_of(home: Path, manifest: Mapping[str, Any]) -> Folder:
+    """Return the folder of the tiles of a manifest in ``home``."""
+    return folder_at(manifest[PLACE] or home)
+
+
 def digest(content: Any) -> str:
     """Return a name of 32 digits; contents without `differences` have the same."""
 
     def kept(there: dict[str, Any]) -> dict[str, Any]:
-        return {key: value for key, value in there.items() if key not in _IGNORED}
+        return {key: value for key, value in there.items() if key not in (_IGNORED, PLACE)}
 
     same = json.dumps(json.loads(json.dumps(content), object_hook=kept), sort_keys=True)
     return hashlib.sha256(same.encode()).hexdigest()[:32]
@@ -67,7 +72,7 @@ def digest(content: Any) -> str:
 def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
     """Describe each value in which two contents differ, with its path."""
     if isinstance(there, dict) and isinstance(wanted, dict):
-        for key in sorted((there.keys() | wanted.keys()) - set(_IGNORED)):
+        for key in sorted((there.keys() | wanted.keys()) - {_IGNORED}):
             yield from differences(there.get(key), wanted.get(key), f"{path}.{key}".lstrip("."))
     elif isinstance(there, list) and isinstance(wanted, list) and len(there) == len(wanted):
         for place, pair in enumerate(zip(there, wanted, strict=True)):

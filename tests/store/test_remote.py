@@ -4,7 +4,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -19,6 +18,7 @@ from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
 
 TILES = 16
+LOCK = ".sat-intervals.lock"
 
 
 def s3():
@@ -61,7 +61,7 @@ def objects(store: str) -> dict[str, datetime]:
 
 
 def records(store: str) -> dict[str, datetime]:
-    return {name: when for name, when in objects(store).items() if "/records/" in name}
+    return {name: when for name, when in objects(store).items() if "/tiles/" in name}
 
 
 def wait_for_tiles(process: subprocess.Popen, store: str, count: int) -> None:
@@ -87,12 +87,11 @@ def halted(process: subprocess.Popen) -> Iterator[list[psutil.Process]]:
 
 def assert_complete(pair: Path, out: Path, *others: str) -> None:
     assert hashes(out) == hashes(pair / "undisturbed")
-    assert sorted(path.name for path in out.iterdir()) == sorted([*OUTPUTS, *others])
+    assert sorted(path.name for path in out.iterdir()) == sorted([LOCK, *OUTPUTS, *others])
 
 
-def status_of(out: Path, store: str) -> str:
-    command = [COMMAND, "status", out, "--store", store]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+def status_of(out: Path) -> str:
+    return subprocess.run([COMMAND, "status", out], capture_output=True, text=True, check=True).stdout
 
 
 def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
@@ -100,9 +99,9 @@ def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
     with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
         wait_for_tiles(first, store, 3)
         with halted(first):
-            assert "a run is active" in status_of(out, store)
+            assert "a run is active" in status_of(out)
     done = records(store)
-    assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out, store)
+    assert f"{len(done)} of {TILES} tiles done, 0 failed, {TILES - len(done)} left; no run" in status_of(out)
     with started(pair, out, store, "--keep-tiles") as again:
         assert ended(again) == (0, "")
     after = records(store)
@@ -111,25 +110,7 @@ def test_match__in_a_bucket_goes_on_after_kill_9(bucket, pair, tmp_path):
     assert_complete(pair, out, "tiles")
 
 
-def test_match__shares_a_bucket_with_the_same_run_and_ends_when_that_removes_the_tiles(bucket, pair, tmp_path):
-    store, out, other = f"{bucket}/shared", tmp_path / "out", tmp_path / "other"
-    with started(pair, out, store, "--cluster", "processes", "--workers", "2") as first:
-        wait_for_tiles(first, store, 3)
-        with halted(first) as workers:
-            with started(pair, other, store) as second:
-                assert ended(second) == (0, "")
-            assert_complete(pair, other)
-            assert objects(store) == {}
-            for worker in workers:
-                worker.resume()
-            status, output = ended(first)
-    assert status == 1
-    assert re.search(rf"^sat-intervals: the tiles in {store}/\w{{32}} are gone: .*: rerun the same", output, re.M)
-    assert [path.name for path in out.iterdir()] == ["tiles"]
-    assert objects(store) == {}
-
-
-def test_match__never_forgets_where_tiles_lie(bucket, pair, tmp_path):
+def test_match__names_where_its_tiles_are_and_starts_anew_elsewhere(bucket, pair, tmp_path):
     first, second, out = f"{bucket}/first", tmp_path / "second", tmp_path / "out"
     with started(pair, out, first) as run:
         wait_for_tiles(run, first, 2)
@@ -138,22 +119,11 @@ def test_match__never_forgets_where_tiles_lie(bucket, pair, tmp_path):
     with started(pair, out, second) as run:
         status, output = ended(run)
     assert status == 2
-    assert re.search(
-        rf"places the tiles of the run in {first}/(\w+), not in {second}: if that is your store, give --store {first}",
-        output,
-    )
+    assert re.search(rf"holds the tiles of another run: place was \"{first}/\w+\", now \"{second}", output)
     with started(pair, out, second, "--overwrite") as run:
-        wait_until(lambda: list(second.glob("*/records/[0-9]*")) or run.poll() is not None, "tiles")
-        run.terminate()
-        assert ended(run)[0] == 143
-    assert objects(first), "a store that is not named stays as it is"
-    with started(pair, out, second) as run:
         assert ended(run) == (0, "")
+    assert objects(first) == {}
     assert not list(second.iterdir())
-    assert_complete(pair, out)
-    with started(pair, out, first, "--overwrite") as run:
-        assert ended(run) == (0, "")
-    assert objects(first) == {}, "the same run in the same store"
     assert_complete(pair, out)
 
 
@@ -164,9 +134,9 @@ def test_batch__keeps_the_tiles_of_equal_pairs_in_folders_of_their_own(bucket, p
     command += ["--store", f"{bucket}/batch/", "--keep-tiles", "--tile-size", "512"]
     subprocess.run(command, check=True)
     names = sorted(re.sub(r"-\w{32}/", "/", name) for name in records(f"{bucket}/batch"))
-    assert names == ["one/records/0_0.json", "two/records/0_0.json"]
+    assert names == ["one/tiles/0_0.npz", "two/tiles/0_0.npz"]
     for name in ("one", "two"):
-        assert sorted(path.name for path in (tmp_path / name).iterdir()) == sorted([*OUTPUTS, "tiles"])
+        assert sorted(path.name for path in (tmp_path / name).iterdir()) == sorted([LOCK, *OUTPUTS, "tiles"])
 
 
 def test_match__reads_images_in_a_bucket_and_knows_them_by_size_and_etag(bucket, pair, tmp_path, monkeypatch):
@@ -198,18 +168,4 @@ def test_match__refuses_a_store_that_cannot_be_used(bucket, pair, tmp_path, stor
     assert status == 2
     assert re.match(rf"sat-intervals: {store}/\w{{32}} cannot be used: {says}", output)
     assert len(output.splitlines()) == 1
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_create__writes_an_object_once(bucket):
-    code = """if True:
-        from concurrent.futures import ThreadPoolExecutor
-        from sat_intervals.store.folder import RemoteFolder
-        folder = RemoteFolder("s3://bucket/contested")
-        with ThreadPoolExecutor(8) as threads:
-            created = list(threads.map(lambda number: folder.create("manifest.json", str(number)), range(8)))
-        print(*created, folder.read("manifest.json"))
-    """
-    *created, first = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
-    assert created.count("True") == 1
-    assert created[int(first)] == "True"
+    assert [file.name for file in (tmp_path / "out").iterdir()] == [LOCK]
