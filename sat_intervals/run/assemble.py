@@ -19,6 +19,8 @@ import numpy as np
 from sat_intervals.config import Config, calibration_of
 from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
+from sat_intervals.match.seams import seam_report
+from sat_intervals.match.statistics import Tally
 from sat_intervals.products import FLAGS
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, Part, run_files
@@ -26,9 +28,7 @@ from sat_intervals.raster.publishing import write_file
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, origin_of, remove_tiles
 from sat_intervals.run.quality import quality_of, warnings_of
-from sat_intervals.run.seams import seam_report
 from sat_intervals.run.state import RUN_REPORT
-from sat_intervals.run.statistics import Tally
 from sat_intervals.run.strips import (
     PartKey,
     check_codecs,

@@ -17,10 +17,10 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match import postprocess
 from sat_intervals.match.memory import STRIP_PIXELS
 from sat_intervals.match.postprocess import ConfidenceScale, RawRows, halo, postprocess_strip
+from sat_intervals.match.statistics import Tally
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, run_files
 from sat_intervals.run.job import Job
-from sat_intervals.run.statistics import Tally
 from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason
 from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.manifest import digest
