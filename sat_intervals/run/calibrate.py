@@ -14,7 +14,7 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.match.calibration import choose, left_out, means, not_below, pooled
 from sat_intervals.match.measurement import Measured, ladder
 from sat_intervals.match.memory import STRIP_PIXELS
-from sat_intervals.run.job import checked_region
+from sat_intervals.run.checks import checked_region
 from sat_intervals.run.measure import Subject, check_enough
 from sat_intervals.tiling import strips
 

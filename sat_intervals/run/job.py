@@ -7,33 +7,26 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sat_intervals.config import Config, Mccnn, load_config, resolved
-from sat_intervals.config.weights import weights_file
+from sat_intervals.config import Config, load_config, resolved
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
-from sat_intervals.machine import usable_cores
 from sat_intervals.match.local_ranges import LocalRanges
-from sat_intervals.match.mccnn import load_network
-from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
 from sat_intervals.match.normalization import PairStatistics
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import (
-    BLOCK,
     Image,
-    check_pair,
     check_space,
     file_bytes,
     files_of,
-    open_image,
     part_bytes,
     run_files,
 )
 from sat_intervals.raster.identity import check_not_replaced
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs, identities
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
-from sat_intervals.run.workers import parse_memory, readers
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
 from sat_intervals.store.tiles import LAYOUT, ONCE, TILES, DamagedTilesError, Store, home_of, store_bytes
@@ -53,28 +46,9 @@ _NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 class Job:
     """All that is needed to match any tile of a pair and to assemble its files; picklable.
 
-    Attributes
-    ----------
-    left, right
-        The images.
-    config
-        Settings.
-    store
-        The tiles.
-    out
-        Folder of the run.
-    inputs
-        See `describe_inputs`.
-    requested
-        The section ``disparity`` as the user gave it.
-    found
-        What the search for the range found, None if none was made.
-    ranges_digest
-        Digest of the local search ranges, None without them.
-    local
-        The local search ranges; not on workers, which read them from the store.
-    has_files
-        Whether files are made of the tiles; `calibrate` only measures them.
+    ``inputs`` is what `describe_inputs` returns, ``requested`` the section ``disparity`` as the user gave it, ``found``
+    what the search for the range found. ``local`` are the local search ranges, which workers read from the store;
+    ``ranges_digest`` is their digest. ``has_files`` says whether files are made of the tiles: `calibrate` makes none.
     """
 
     left: Image
@@ -247,9 +221,8 @@ def _found(
     """Return the search range that an earlier run of the same images has found, else find it."""
     kept: Mapping[str, Any] | None = None
     if PLACE in before:
-        kept = (Store(place_of(home_of(out), before), _NO_TILES, "").meta(ONCE, _RANGE, origin_of(inputs)) or {}).get(
-            "found"
-        )
+        store = Store(place_of(home_of(out), before), _NO_TILES, "")
+        kept = (store.meta(ONCE, _RANGE, origin_of(inputs)) or {}).get("found")
     elif before.get("search") and before.get("origin") == origin_of(inputs):
         kept = before["search"]
     if kept:
@@ -290,10 +263,7 @@ def _unusable(store: Store, error: OSError) -> StoreError:
     return StoreError(f"{store.folder} cannot be used: {error.strerror or error}: {way_out}")
 
 
-@cache
-def _version() -> str:
-    """Return the version of this package; reading it takes 2 ms, and each tile compares manifests."""
-    return version("sat-intervals")
+_version = cache(lambda: version("sat-intervals"))  # reading it takes 2 ms, and each tile compares manifests
 
 
 def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, ranges: str | None) -> dict[str, Any]:
@@ -311,69 +281,3 @@ def _manifest(config: Config, inputs: Mapping[str, Any], region: Window, ranges:
         "inputs": inputs,
         "region": asdict(region),
     }
-
-
-def fitted_to_jobs(config: Config) -> Config:
-    """Return the settings with tiles small enough for the memory of a job of a batch system.
-
-    Raises
-    ------
-    ConfigError
-        See `fitted` and `parse_memory`.
-    """
-    memory = None if config.disparity.is_auto else _job_bytes(config)
-    return config if memory is None else fitted(config, memory, config.cluster.cores, readers(config.cluster))
-
-
-def _job_bytes(config: Config) -> int | None:
-    """Return the memory of a job of a batch system for the tiles being matched: dask kills workers at 95 %."""
-    if config.cluster.memory is None:
-        return None
-    return 9 * parse_memory(config.cluster.memory) // 10
-
-
-def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
-    """Open the images of a pair and check that they can be matched."""
-    left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
-    check_pair(left, right, 1 if config.disparity.is_auto else config.disparity.count)
-    if not config.disparity.is_auto:
-        config.disparity.check_images(left.path, left.width, right.path, right.width)
-    if isinstance(config.cost, Mccnn):
-        load_network(weights_file(config.cost.weights))
-    return left, right
-
-
-def checked_region(left: Image, window: Window | None) -> Window:
-    """Return the region of the left image to match: the given window, or all of it."""
-    whole = Window(0, 0, left.height, left.width)
-    if window is None:
-        return whole
-    if window.height < 1 or window.width < 1 or window.clipped(whole) != window:
-        raise SatIntervalsError(
-            f"window at row {window.row}, column {window.column}, {window.height} x {window.width} pixels: "
-            f"must be inside {left.path}, {left.height} x {left.width} pixels"
-        )
-    return window
-
-
-def check_tiles(config: Config, region: Window) -> None:
-    """Raise if tiles and strips do not fit in the memory of this machine or of a job; schedulers have their own."""
-    rows = min(BLOCK, region.height)
-    memory = _job_bytes(config)
-    if memory is not None:
-        check_strips(rows, region.width, config, memory, config.cluster.cores)
-    if config.cluster.kind not in ("threads", "processes"):
-        return
-    height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
-    most = config.cluster.workers or usable_cores()
-    tiles, strips = min(most, len(Grid(region, config.tiles.size))), min(most, -(-region.height // BLOCK))
-    check_memory(
-        tiles * volume_bytes(height, width, config),
-        f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {tiles} at once,",
-        "choose a smaller --tile-size or fewer --workers",
-    )
-    check_memory(
-        strips * strip_bytes(rows, region.width, config.products.compression),
-        f"strips of {rows} x {region.width} pixels, {strips} at once,",
-        "choose fewer --workers or a narrower --window",
-    )

@@ -19,7 +19,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes, run_files
 from sat_intervals.run import assemble
-from sat_intervals.run.job import check_tiles, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of

@@ -30,7 +30,8 @@ from sat_intervals.raster import stamps, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import batch
 from sat_intervals.run.batch import match_batch
-from sat_intervals.run.job import fitted_to_jobs, prepare
+from sat_intervals.run.checks import fitted_to_jobs
+from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_block

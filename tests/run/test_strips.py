@@ -25,7 +25,8 @@ from sat_intervals.products import INVALID
 from sat_intervals.raster import BLOCK, OutputError, OutputWriter, write_layer
 from sat_intervals.results import open_run
 from sat_intervals.run import copying, strips
-from sat_intervals.run.job import check_tiles, prepare
+from sat_intervals.run.checks import check_tiles
+from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.status import read_status
 from sat_intervals.store.local import LocalFolder

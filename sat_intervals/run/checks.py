@@ -1,0 +1,73 @@
+"""Check that a pair can be matched with the memory that there is, before its tiles."""
+
+from pathlib import Path
+
+from sat_intervals.config import Config, Mccnn
+from sat_intervals.config.weights import weights_file
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.machine import usable_cores
+from sat_intervals.match.mccnn import load_network
+from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
+from sat_intervals.raster import BLOCK, Image, check_pair, open_image
+from sat_intervals.run.workers import parse_memory, readers
+from sat_intervals.tiling import Grid, Window
+
+
+def fitted_to_jobs(config: Config) -> Config:
+    """Return the settings with tiles small enough for the memory of a job of a batch system."""
+    memory = None if config.disparity.is_auto else _job_bytes(config)
+    return config if memory is None else fitted(config, memory, config.cluster.cores, readers(config.cluster))
+
+
+def _job_bytes(config: Config) -> int | None:
+    """Return the memory of a job of a batch system for the tiles being matched: dask kills workers at 95 %."""
+    if config.cluster.memory is None:
+        return None
+    return 9 * parse_memory(config.cluster.memory) // 10
+
+
+def checked_pair(left: str | Path | Image, right: str | Path | Image, config: Config) -> tuple[Image, Image]:
+    """Open the images of a pair and check that they can be matched."""
+    left, right = (image if isinstance(image, Image) else open_image(image) for image in (left, right))
+    check_pair(left, right, 1 if config.disparity.is_auto else config.disparity.count)
+    if not config.disparity.is_auto:
+        config.disparity.check_images(left.path, left.width, right.path, right.width)
+    if isinstance(config.cost, Mccnn):
+        load_network(weights_file(config.cost.weights))
+    return left, right
+
+
+def checked_region(left: Image, window: Window | None) -> Window:
+    """Return the region of the left image to match: the given window, or all of it."""
+    whole = Window(0, 0, left.height, left.width)
+    if window is None:
+        return whole
+    if window.height < 1 or window.width < 1 or window.clipped(whole) != window:
+        raise SatIntervalsError(
+            f"window at row {window.row}, column {window.column}, {window.height} x {window.width} pixels: "
+            f"must be inside {left.path}, {left.height} x {left.width} pixels"
+        )
+    return window
+
+
+def check_tiles(config: Config, region: Window) -> None:
+    """Raise if tiles and strips do not fit in the memory of this machine or of a job; schedulers have their own."""
+    rows = min(BLOCK, region.height)
+    memory = _job_bytes(config)
+    if memory is not None:
+        check_strips(rows, region.width, config, memory, config.cluster.cores)
+    if config.cluster.kind not in ("threads", "processes"):
+        return
+    height, width = (min(config.tiles.size, side) for side in (region.height, region.width))
+    most = config.cluster.workers or usable_cores()
+    tiles, strips = min(most, len(Grid(region, config.tiles.size))), min(most, -(-region.height // BLOCK))
+    check_memory(
+        tiles * volume_bytes(height, width, config),
+        f"tiles of {height} x {width} pixels x {config.disparity.count} disparities, {tiles} at once,",
+        "choose a smaller --tile-size or fewer --workers",
+    )
+    check_memory(
+        strips * strip_bytes(rows, region.width, config.products.compression),
+        f"strips of {rows} x {region.width} pixels, {strips} at once,",
+        "choose fewer --workers or a narrower --window",
+    )

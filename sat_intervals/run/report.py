@@ -1,0 +1,116 @@
+"""The report of a run, ``run.json``, and the tags of its files."""
+
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+from sat_intervals.config import Config, calibration_of
+from sat_intervals.match.postprocess import ConfidenceScale
+from sat_intervals.match.seams import seam_report
+from sat_intervals.match.statistics import Tally
+from sat_intervals.products import FLAGS
+from sat_intervals.run.job import Job, origin_of
+from sat_intervals.run.quality import quality_of, warnings_of
+from sat_intervals.store.tiles import Tables
+
+# Meanings of some of the counts, for readers of run.json.
+_COUNTS_MEANING = {
+    "ambiguous": "valid pixels whose interval is the whole search range",
+    "range_ends": "valid pixels with the flag range_end and without range_incomplete, counted at the nearer end",
+    "low_confidence": "valid pixels with the flag regularized; flags.regularized also counts invalid ones",
+    "causes": "invalid pixels, each under its first flag that makes it invalid; with valid they add up to pixels",
+    "flags": "pixels with the flag, valid or not; a pixel may have several flags",
+}
+
+
+def tags_of(config: Config) -> dict[str, str]:
+    """Return the tags of the output files."""
+    tags = {
+        "SOFTWARE": f"sat-intervals {version('sat-intervals')}",
+        "SEARCH_RANGE": f"{config.disparity.minimum} {config.disparity.maximum}",
+    }
+    interval = config.interval
+    if interval and interval.coverage is not None:
+        calibration = calibration_of(config)
+        tags["COVERAGE"] = f"{interval.coverage} (mean over pixels like those of the calibration, not of each pixel)"
+        tags["CALIBRATION"] = f"{calibration.name} {calibration.sha256}"
+    elif interval:
+        tags["ALPHA"] = f"{interval.alpha} (level of possibility, not a probability)"
+    return tags
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on, read once from their files."""
+    packages = ("sat-intervals", "numpy", "numba", "dask", "distributed", "xarray", "rasterio", "pyproj")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+def _calibration(config: Config) -> dict[str, Any] | None:
+    """Return what the run took from its calibration, whose content is in the settings."""
+    levels = config.cuts
+    if levels is None or levels.coverage is None:
+        return None
+    calibration = calibration_of(config)
+    return {"name": calibration.name, "sha256": calibration.sha256, **levels.model_dump()}
+
+
+def _counts(config: Config, parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the counts of all pixels from the records of the parts."""
+    tally = Tally(config.disparity.count, config.disparity.minimum)
+    for part in parts:
+        tally.merge(part.get("counts", {}))
+    return tally.report()
+
+
+def report_of(
+    job: Job,
+    tables: Tables,
+    scale: ConfidenceScale,
+    parts: Iterable[Mapping[str, Any]],
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """Return the content of run.json."""
+    grid = job.store.grid
+    config = job.config
+    for stage in ("read", "match", "write"):
+        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in tables.records.values())
+    seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
+    statistics = job.statistics()
+    counts = _counts(config, parts)
+    quality = quality_of(job, tables.records)
+    return {
+        "run": job.name,
+        "finished": datetime.now(UTC).isoformat(timespec="microseconds"),  # distinguishes runs
+        "settings": config.model_dump(mode="json"),
+        "requested": {"disparity": job.requested},
+        "search": job.found and job.found.report(),
+        "origin": origin_of(job.inputs),
+        "local_ranges": job.local and job.local.report() | {"share": job.local.share},
+        "inputs": job.inputs,
+        "tiles": {
+            "region": asdict(grid.region),
+            "rows": grid.rows,
+            "columns": grid.columns,
+            "size": grid.size,
+            "overlap": config.tiles.overlap,
+        },
+        "cost_span": config.cost_span,
+        "calibration": _calibration(config),
+        "normalization": statistics and statistics.report(),
+        "ambiguity_percentiles": None if config.ambiguity is None else {"p1": scale.p1, "p99": scale.p99},
+        "counts": counts,
+        "counts_meaning": _COUNTS_MEANING,
+        "validity_bits": {
+            flag.name: {"bit": flag.bit, "meaning": flag.meaning, "invalid": flag.invalid} for flag in FLAGS
+        },
+        "overlap_left": None if tables.seams is None else seam_report(tables.seams, grid),
+        "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
+        "versions": dict(_versions()),
+        "quality": quality,
+        "warnings": warnings_of(job, counts, quality),
+    }
