@@ -1,36 +1,44 @@
-"""A run.json that was edited by hand, and files that appear beside a run: one line that names them."""
+"""Folders of finished runs: what is read of them, and one line about what is missing or does not fit."""
 
 import json
 
+import numpy as np
 import pytest
 from finished import random_bands, write_run
-from helpers import exchanged, invoke
+from helpers import PLACE, invoke
 
-from sat_intervals import results
-from sat_intervals.errors import ChangedInputError
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import write_layer
+from sat_intervals.results import open_results, open_run
+from sat_intervals.tiling import Window
+
+
+def test_open_results__reads_bands_image_and_truth(tmp_path):
+    bands, validity, truth = random_bands(20, 30)
+    out = write_run(tmp_path, bands, validity, truth)
+    results = open_results(out)
+    read = results.read(Window(3, 4, 5, 6))
+    np.testing.assert_array_equal(read[:4], bands[:, 3:8, 4:10])
+    np.testing.assert_array_equal(read.validity, validity[3:8, 4:10])
+    np.testing.assert_array_equal(read.truth, truth[3:8, 4:10])
+    assert (read.image > 0).all()
+    assert [row for row, _ in results.strips()] == [0]
+    assert results.read_pixel(3, 4).validity == validity[3, 4]
+
 
 EDITS = {
     "finished": 7,
-    "inputs.left.path": "\ud800.tif",
-    "inputs.left.mask": {"path": ""},
-    "inputs.right.path": "",
-    "inputs.right.width": True,
-    "inputs.left.height": 10**400,
-    "tiles.region.row": 10**400,
+    "settings": None,
+    "inputs.left": "left.tif",
+    "inputs": {},
+    "tiles.region": {"row": 0},
+    "tiles.region.height": "many",
     "counts": [1],
-    "counts.pixels": "abc",
-    "counts.causes": {"occlusion": "many"},
-    "counts.median_interval_width": float("nan"),
-    "versions": "0.1",
-    "versions.python": float("inf"),
-    "local_ranges": {"rows": "abc"},
-    "search": {"matched": 0.5, "levels": [], "histogram": {"edges": ["a"], "counts": []}},
-    "normalization": {"left": 5},
 }
 
 
 @pytest.mark.parametrize("place", EDITS)
-def test_commands__name_a_report_that_was_edited(tmp_path, place):
+def test_open_run__names_a_report_that_is_none(tmp_path, place):
     out = write_run(tmp_path, *random_bands(20, 30))
     report = json.loads((out / "run.json").read_text())
     *sections, name = place.split(".")
@@ -39,12 +47,67 @@ def test_commands__name_a_report_that_was_edited(tmp_path, place):
         section = section[key]
     section[name] = EDITS[place]
     (out / "run.json").write_text(json.dumps(report))
-    commands = ["report", out], ["stac", out], ["export", out, tmp_path / "to", "--to", "otb"]
-    for command in commands[:1] if place == "local_ranges" else commands:
-        done = invoke(*command)
-        assert done.exit_code == 2
-        assert done.stderr.count("\n") == 1
-        assert "run.json is not the report of a run" in done.stderr or "local ranges of the run are dam" in done.stderr
+    with pytest.raises(SatIntervalsError, match=rf"run\.json is not the report of a run, see {place}.*: match again"):
+        open_run(out)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"[]", b"[" * 10_000])
+def test_open_run__names_a_report_that_is_not_json(tmp_path, content):
+    (tmp_path / "run.json").write_bytes(content)
+    with pytest.raises(SatIntervalsError, match=r"run\.json is not the report of a run"):
+        open_run(tmp_path)
+
+
+def test_open_run__ignores_what_earlier_versions_wrote(tmp_path):
+    out = write_run(tmp_path, *random_bands(20, 30))
+    report = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(report | {"crc32": 7, "files": {"intervals.tif": {"crc32": 8}}}))
+    assert open_run(out).shape == (20, 30)
+
+
+def test_open_run__names_a_folder_without_a_report_or_a_raster(tmp_path):
+    with pytest.raises(SatIntervalsError, match=r"run\.json: No such file or directory: give the folder of a finished"):
+        open_run(tmp_path)
+    out = write_run(tmp_path, *random_bands(20, 30))
+    (out / "validity.tif").unlink()
+    with pytest.raises(SatIntervalsError, match=r"validity\.tif: no such file: give the folder of a finished run, or"):
+        open_run(out)
+
+
+def test_open_run__names_a_raster_of_another_size(tmp_path):
+    out = write_run(tmp_path, *random_bands(20, 30))
+    write_layer(out / "intervals.tif", np.zeros((20, 31), np.float32), 0, PLACE)
+    with pytest.raises(SatIntervalsError, match=r"1 bands of 20 x 31 pixels, run\.json says 4 bands of 20 x 30: match"):
+        open_run(out)
+
+
+def test_open_results__names_an_image_of_another_size(tmp_path):
+    out = write_run(tmp_path, *random_bands(20, 30))
+    write_layer(tmp_path / "right.tif", np.zeros((20, 31), np.uint16), 0, PLACE)
+    with pytest.raises(SatIntervalsError, match=r"right\.tif has 20 x 31 pixels, but had 20 x 30 when it was matched"):
+        open_results(out)
+
+
+def test_layer__names_a_raster_that_is_not_of_the_run(tmp_path, caplog):
+    run = open_run(write_run(tmp_path, *random_bands(20, 30)))
+    write_layer(tmp_path / "small.tif", np.zeros((9, 9), np.float32), np.nan, PLACE)
+    with pytest.raises(SatIntervalsError, match=r"small\.tif has 9 x 9 pixels, .*: give a file of such a size"):
+        run.layer(tmp_path / "small.tif")
+    write_layer(tmp_path / "a.tif", np.zeros((20, 30), np.float32), np.nan, PLACE, {"REGION": "rows 7 to 26"})
+    with pytest.raises(SatIntervalsError, match=r"a\.tif is of rows 7 to 26, .*: give one of this run"):
+        run.layer(tmp_path / "a.tif")
+    write_layer(tmp_path / "b.tif", np.zeros((20, 30), np.float32), np.nan, PLACE, {"LEFT_SHA256": "00"})
+    run.report["inputs"]["left"]["sha256"] = "11"
+    run.layer(tmp_path / "b.tif")
+    assert "b.tif was made for another left image than" in caplog.text
+
+
+def test_check_kept__keeps_the_run_and_its_inputs(tmp_path):
+    run = open_run(write_run(tmp_path, *random_bands(20, 30)))
+    for file in (tmp_path / "left.tif", run.out / "run.json", run.out / "validity.tif"):
+        with pytest.raises(SatIntervalsError, match=f"{file.name} is an input"):
+            run.check_kept([file])
+    run.check_kept([run.out / "report.html"])
 
 
 @pytest.mark.parametrize("command", ["report", "plot"])
@@ -58,67 +121,3 @@ def test_commands__name_an_image_of_the_run_that_is_missing(tmp_path, command):
     )
     (tmp_path / "left.tif").symlink_to("moved.tif")
     assert invoke(command, out).exit_code == 0
-
-
-FOREIGN = "<PAMDataset><SRS>EPSG:32640</SRS><GeoTransform>10, 1, 0, 20, 0, -1</GeoTransform></PAMDataset>"
-
-
-@pytest.mark.parametrize("command", [["stac"], ["project"], ["export", "--to", "otb"]])
-def test_commands__end_where_a_file_with_another_place_appears_beside_the_run(tmp_path, monkeypatch, command):
-    out, checked = write_run(tmp_path, *random_bands(20, 30)), results._checked_place
-
-    def and_appears(file, *arguments):
-        found = checked(file, *arguments)
-        if file.name == "validity.tif":  # the last that is checked
-            (out / "validity.tif.aux.xml").write_text(FOREIGN)
-        return found
-
-    monkeypatch.setattr(results, "_checked_place", and_appears)
-    arguments = [out, tmp_path / "to"] if command[0] == "export" else [out]
-    done = invoke(command[0], *arguments, *command[1:])
-    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
-    assert "validity.tif.aux.xml changes what is read from" in done.stderr
-    assert not [*out.glob("*.qgz"), *out.glob("stac*"), *tmp_path.glob("to/*.tif")]
-
-
-def test_open_run__does_not_call_the_rasters_of_another_run_damaged(tmp_path, monkeypatch):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-    out, other = (write_run(tmp_path / name, *random_bands(20, size)) for name, size in (("a", 30), ("b", 31)))
-    which = results._which
-
-    def and_leaves(out):
-        found = which(out)
-        exchanged(out, other)
-        return found
-
-    monkeypatch.setattr(results, "_which", and_leaves)
-    with pytest.raises(ChangedInputError, match=r"was replaced or changed while it was read: rerun the command"):
-        results.open_run(out)
-
-
-@pytest.mark.parametrize("command", [["stac"], ["report"], ["export", "--to", "otb"]])
-def test_commands__end_where_the_run_is_another_for_a_moment(tmp_path, monkeypatch, command):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-    out, other = (write_run(tmp_path / name, *random_bands(20, 30)) for name in "ab")
-    which, checked = results._which, results._checked_place
-
-    def and_leaves(out):
-        found = which(out)
-        exchanged(out, other)
-        return found
-
-    def and_is_back(file, *arguments):
-        found = checked(file, *arguments)
-        if file.name == "validity.tif":  # the last that is checked
-            exchanged(out, other)
-        return found
-
-    monkeypatch.setattr(results, "_which", and_leaves)
-    monkeypatch.setattr(results, "_checked_place", and_is_back)
-    arguments = [out, tmp_path / "to"] if command[0] == "export" else [out]
-    done = invoke(command[0], *arguments, *command[1:])
-    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
-    assert "was replaced or changed while it was read: rerun the command" in done.stderr
-    assert not [*out.glob("stac*"), *out.glob("report*"), *tmp_path.glob("to/*.tif")]

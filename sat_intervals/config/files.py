@@ -9,7 +9,7 @@ import yaml
 
 from sat_intervals.config.sealing import is_as_made
 from sat_intervals.config.sections import ConfigError
-from sat_intervals.errors import SatIntervalsError, open_regular
+from sat_intervals.errors import SatIntervalsError
 
 # Largest size in bytes of a file of settings or pairs, and of a CSV file of pairs; YAML nodes of a file of settings,
 # aliases expanded.
@@ -72,9 +72,9 @@ def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:
     OSError
         The file cannot be read.
     SatIntervalsError
-        The file is larger, or not a regular file.
+        The file is larger.
     """
-    with open_regular(file) as stream:
+    with file.open("rb") as stream:
         content = stream.read(most + 1)
     if len(content) > most:
         raise SatIntervalsError(f"{file} has more than {most // 10**6} MB: is it the right file?")

@@ -3,7 +3,7 @@
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError, check_regular
+from sat_intervals.errors import SatIntervalsError
 
 # The distribution of the official weights, and the file in it that Pandora uses.
 _DISTRIBUTION, _OFFICIAL = "MCCNN", "mc_cnn_fast_int8_excl_01.onnx"
@@ -21,7 +21,6 @@ def weights_file(weights: str | None) -> Path:
         If there is no such file, or it is too large.
     """
     if weights is not None:
-        check_regular(weights)
         if not Path(weights).is_file():
             raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or null")
         size = Path(weights).stat().st_size

@@ -5,12 +5,8 @@ computes the offsets of the blocks. The layout is that of GDAL's COG driver: dir
 first, each block between its size and a copy of its last four bytes.
 """
 
-import errno
-import os
 import struct
-import zlib
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +20,6 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.blocks import AROUND, BLOCK, factors, tiled
 from sat_intervals.raster.files import File
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.seal import sealed, with_room
 
 # Side of a block of the template, the smallest of GDAL's COG driver: larger ones take time and hold nothing.
 _SMALL = 128
@@ -34,17 +29,15 @@ _CLASSIC = 1 << 32
 _WIDTH, _HEIGHT, _BLOCK_WIDTH, _BLOCK_HEIGHT, _OFFSETS, _SIZES = 256, 257, 322, 323, 324, 325
 _SHORT, _LONG, _LONG8 = 3, 4, 16
 _BYTES = {1: 1, 2: 1, _SHORT: 2, _LONG: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, _LONG8: 8}
-_CRC = 0xEDB88320  # polynomial of CRC-32, its highest power in the lowest bit
 
 Directory = dict[int, tuple[int, int, bytes]]
 """Type, count and values of each tag."""
 
 
 class Part(NamedTuple):
-    """A compressed row of blocks: sizes of the blocks, CRC-32 of its bytes, and where they are, for `CopyParts`."""
+    """A compressed row of blocks: sizes of the blocks, and where they are, for `CopyParts`."""
 
     sizes: Sequence[int]
-    checksum: int
     source: Any
 
     @property
@@ -80,55 +73,21 @@ def assemble(
     shape: tuple[int, int],
     levels: Sequence[Sequence[Part]],
     copy_parts: CopyParts,
-) -> dict[str, int]:
-    """Write a file from the rows of blocks of each level, see `factors`; return its size and CRC-32, which is in it.
-
-    Parameters
-    ----------
-    path
-        The file.
-    made
-        Its `template`.
-    shape
-        Rows and columns.
-    levels
-        Rows of blocks of each level, from the top.
-    copy_parts
-        Writes them into the file.
-    """
+) -> None:
+    """Write a file in place from its `template` and the rows of blocks of each level, from the top; see `factors`."""
     sizes = [[size for part in level for size in part.sizes] for level in levels]
     head = header(made, shape, sizes)
     parts = [part for level in reversed(levels) for part in level]
-    body = length = 0
-    for part in parts:
-        body, length = combined(body, part.checksum, part.length), length + part.length
-    head = sealed(head, combined(zlib.crc32(head), body, length))
     *offsets, size = accumulate((part.length for part in parts), initial=len(head))
-    with open(path, "xb") as stream:
+    with open(path, "wb") as stream:
         stream.write(head)
         stream.truncate(size)
-        stream.flush()
-        copy_parts(path, list(zip(offsets, parts, strict=True)))
-        os.fsync(stream.fileno())
-    if (found := path.stat().st_size) != size:
-        raise OSError(errno.EIO, f"{found} of {size} bytes were written")
-    return {"bytes": size, "crc32": combined(zlib.crc32(head), body, length)}
+    copy_parts(path, list(zip(offsets, parts, strict=True)))
 
 
 def header(made: bytes, shape: tuple[int, int], sizes: Sequence[Sequence[int]]) -> bytes:
-    """Return all that comes before the first block of a file.
-
-    Parameters
-    ----------
-    made
-        Its `template`.
-    shape
-        Rows and columns.
-    sizes
-        Bytes of the blocks of each level, row by row.
-    """
+    """Return all that comes before the first block: `template`, rows and columns, bytes of the blocks of each level."""
     ghost, (whole, overview) = _parsed(made)
-    ghost = with_room(ghost)
     directories = []
     for factor, of_level in zip(factors(*shape), sizes, strict=True):
         height, width = (-(-side // factor) for side in shape)
@@ -191,29 +150,3 @@ def _parsed(made: bytes) -> tuple[bytes, list[Directory]]:
         directories.append(directory)
         (place,) = struct.unpack_from("<I", made, place + 2 + 12 * count)
     return ghost, directories
-
-
-def combined(first: int, second: int, length: int) -> int:
-    """Return the CRC-32 of two strings of bytes from theirs and the length of the second."""
-    return _product(first, _power(8 * length)) ^ second
-
-
-@cache
-def _power(exponent: int) -> int:
-    """Return x to a power, modulo the polynomial of CRC-32."""
-    result, square = 1 << 31, 1 << 30
-    while exponent:
-        if exponent & 1:
-            result = _product(result, square)
-        square, exponent = _product(square, square), exponent >> 1
-    return result
-
-
-def _product(a: int, b: int) -> int:
-    """Return the product of two polynomials modulo that of CRC-32; the highest bit is the coefficient of 1."""
-    result = 0
-    for bit in range(31, -1, -1):
-        if a >> bit & 1:
-            result ^= b
-        b = b >> 1 ^ (_CRC if b & 1 else 0)
-    return result

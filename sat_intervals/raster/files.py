@@ -10,10 +10,7 @@ from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, RANGES, SURFAC
 
 @dataclass(frozen=True)
 class File:
-    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression.
-
-    All have their CRC-32 in them, see `seal`; those of a run's files are also in its report.
-    """
+    """Properties of a file: name, type, bands, further tags of its first band, predictor, GDAL driver, compression."""
 
     name: str
     dtype: str

@@ -36,11 +36,6 @@ class Frame:
         What its heights refer to.
     level
         Tag HEIGHTS of a surface model of this tool.
-
-    Raises
-    ------
-    SatIntervalsError
-        There is no CRS or no vertical reference, or both disagree.
     """
 
     def __init__(self, name: str, crs: str | None, vertical: Vertical, level: str = "") -> None:

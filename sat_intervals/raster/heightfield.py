@@ -35,11 +35,6 @@ class HeightRaster:
         Replaces the CRS of the file.
     vertical
         What its heights refer to.
-
-    Raises
-    ------
-    SatIntervalsError
-        The file cannot be read, or lacks a CRS, a transform or a vertical reference.
     """
 
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:

@@ -2,22 +2,21 @@
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.io import DatasetReader
 
-from sat_intervals.errors import ChangedInputError, InputError, RunError, check_regular
+from sat_intervals.errors import InputError
 from sat_intervals.raster import gdal
-from sat_intervals.raster.beside import is_read
-from sat_intervals.raster.dependencies import check_pipes_beside, pixel_files, stamps_of, watched_image, watched_rasters
+from sat_intervals.raster.files_of import check_listed, files_of
 from sat_intervals.raster.georeferencing import Georeferencing
-from sat_intervals.raster.identity import stamp_of
-from sat_intervals.raster.seal import check_seal
+from sat_intervals.raster.identity import identity
 from sat_intervals.tiling import Window
 
 # Mask flags of bands without a mask of their own: GDAL derives one from nothing, the no-data value or the alpha band.
@@ -52,10 +51,6 @@ class Image:
         The user's mask: a file of the same size, not 0 where the image must not be used; None without one.
     georeferencing
         Georeferencing of the file.
-    beside
-        Files with its mask or no-data value that have names of their own: ``.msk`` and ``.aux.xml``.
-    stamps
-        `stamps_of` its files and those of the mask before they were opened.
     """
 
     path: str
@@ -68,23 +63,6 @@ class Image:
     alpha: int | None
     mask: str | None
     georeferencing: Georeferencing
-    beside: tuple[str, ...]
-    stamps: Mapping[str, str | None] = field(hash=False)
-
-    def check_complete(self, dataset: DatasetReader) -> None:
-        """Raise if GDAL did not find a file beside the image now: to GDAL, a busy server has no masks.
-
-        Raises
-        ------
-        RunError
-            Names the first one.
-        """
-        files = dataset.files if self.beside else ()
-        if missing := [file for file in self.beside if file not in files]:
-            raise RunError(
-                f"{missing[0]} was there when {self.path} was opened, but cannot be found now: restore it, or wait for "
-                "its server, and rerun the command"
-            )
 
 
 def open_image(
@@ -115,14 +93,10 @@ def open_image(
     """
     name = _absolute(path)
     mask = None if mask is None else _absolute(mask)
-    check_steady = watched_image(name, mask)  # another folder may be there for a moment
-    stamps = stamps_of(name, mask)
     with opened(name) as dataset:
-        check_seal(name, dataset.files)
+        check_listed(name, dataset)
         bands, alphas = _kinds(dataset)
         band = _chosen(name, bands, band)
-        for file in dataset.files:
-            check_regular(file)
         image = Image(
             path=name,
             band=band,
@@ -134,8 +108,6 @@ def open_image(
             alpha=alphas[0] if alphas else None,
             mask=mask,
             georeferencing=Georeferencing.of(dataset),
-            beside=_beside(dataset.files),
-            stamps=stamps,
         )
         if dataset.colorinterp[band - 1] == ColorInterp.palette:
             raise InputError(
@@ -149,19 +121,35 @@ def open_image(
         raise InputError(f"{name}: band {band} is {image.dtype}, matching needs real values: give its amplitude")
     if image.mask is not None:
         _check_mask(image, image.mask)
-    check_steady()
     return image
+
+
+def describe(image: Image, known: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, Any]:
+    """Return what decides the pixels of an image, for run.json and the manifest; ``known``: see `identity`."""
+    crs = image.georeferencing.crs
+    return {
+        **_identities(image.path, known),
+        "height": image.height,
+        "width": image.width,
+        "band": image.band,
+        "dtype": image.dtype,
+        "nodata": None if image.nodata is None else repr(image.nodata),
+        "crs": crs.to_string() if crs else None,
+        "use_mask": image.use_mask,
+        "alpha": image.alpha,
+        "mask": _identities(image.mask, known) if image.mask else None,
+    }
+
+
+def _identities(name: str, known: Mapping[str, Mapping[str, Any]] | None) -> dict[str, Any]:
+    """Return the identity of a raster and of the other files that decide its pixels."""
+    return {**identity(name, known), "files": [identity(file, known) for file in files_of(name)[1:]]}
 
 
 def check_pair(left: Image, right: Image, count: int) -> None:
     """Raise if the rows of two images do not correspond, or ``count`` disparities cannot be searched.
 
     Widths and origins may differ: a disparity is measured in columns.
-
-    Raises
-    ------
-    InputError
-        The images are not an epipolar pair, or have fewer columns than disparities.
     """
     pair = f"{left.path} and {right.path}"
     if left.height != right.height:
@@ -184,8 +172,6 @@ def check_pair(left: Image, right: Image, count: int) -> None:
 @contextmanager
 def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
     """Open a raster for reading and turn GDAL's errors into `InputError`; ``window`` is for the message."""
-    check_pipes_beside(path)
-    check_regular(path)
     try:
         with gdal.reading(path) as dataset:
             yield dataset
@@ -198,22 +184,6 @@ def opened(path: str, window: Window | None = None) -> Iterator[DatasetReader]:
         raise InputError(
             f"{path} cannot be read at {window.in_words}: {reason}: the file may be truncated, give a complete copy"
         ) from error
-
-
-def check_holds(dataset: DatasetReader, path: str, window: Window, band: int = 1) -> None:
-    """Raise if a raster lacks a window or a band that it had when it was opened before.
-
-    Raises
-    ------
-    RunError
-        Gives its size now.
-    """
-    bottom, right = window.row + window.height, window.column + window.width
-    if bottom > dataset.height or right > dataset.width or band > dataset.count:
-        raise RunError(
-            f"{path} has {dataset.count} x {dataset.height} x {dataset.width} pixels now, and others when it was "
-            "opened: another file took its place: rerun the command"
-        )
 
 
 def _absolute(path: str | os.PathLike[str]) -> str:
@@ -231,11 +201,6 @@ def _kinds(dataset: DatasetReader) -> tuple[list[int], list[int]]:
     return [band for band in dataset.indexes if band not in alphas], alphas
 
 
-def _beside(files: Iterable[str]) -> tuple[str, ...]:
-    """Return those of a raster's files with its mask or no-data value that have names of their own."""
-    return tuple(file for file in files if file.lower().endswith((".msk", ".aux.xml")) and is_read(file))
-
-
 def _chosen(path: str, bands: list[int], band: int | None) -> int:
     """Return the number of the band to match."""
     if not bands:
@@ -250,41 +215,9 @@ def _chosen(path: str, bands: list[int], band: int | None) -> int:
 
 def _check_mask(image: Image, mask: str) -> None:
     with opened(mask) as dataset:
+        check_listed(mask, dataset)
         if dataset.shape != (image.height, image.width):
             raise InputError(
                 f"{mask} has {dataset.height} x {dataset.width} pixels, {image.path} {image.height} x {image.width}: "
                 "give a mask of the image's size"
             )
-
-
-def watched_images(images: Iterable[Image], *others: str | Path | None) -> Callable[[], None]:
-    """Return what `watched_rasters` returns, for pixels of images as they were opened, their masks, and others.
-
-    Raises
-    ------
-    ChangedInputError
-        See `check_as_opened`.
-    """
-    images = list(images)
-    names = [*others, *(file for image in images for file in (image.path, image.mask))]
-    check = watched_rasters(names, pixel_files)
-    for image in images:
-        check_as_opened(image)
-    return check
-
-
-def check_as_opened(image: Image) -> None:
-    """Raise if a file of an image or its mask was made, replaced or changed since the image was opened.
-
-    Its band, no-data value or size may be wrong. A server that does not answer does not change a file.
-
-    Raises
-    ------
-    ChangedInputError
-        Names the first such file.
-    """
-    now = stamps_of(image.path, image.mask)
-    for file in sorted(now.keys() | image.stamps.keys()):
-        before, after = image.stamps.get(file, "missing"), now[file] if file in now else stamp_of(file)
-        if None not in (before, after) and before != after:
-            raise ChangedInputError(f"{file} was replaced or changed since {image.path} was opened: rerun the command")

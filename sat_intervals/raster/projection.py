@@ -51,11 +51,6 @@ class Projection:
         A projected CRS in metres, such as ``EPSG:32637``.
     geoid
         A grid of geoid heights that PROJ reads (GTX, GeoTIFF); None for heights above the ellipsoid.
-
-    Raises
-    ------
-    SatIntervalsError
-        The CRS is not a map in metres, or the grid cannot be read.
     """
 
     def __init__(self, crs: str, geoid: Path | None = None) -> None:

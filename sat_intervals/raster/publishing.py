@@ -2,14 +2,24 @@
 
 import fcntl
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from io import BufferedWriter
 from pathlib import Path
 
-from sat_intervals.errors import SatIntervalsError
+import numpy as np
 
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.raster import gdal
+from sat_intervals.raster.files import File
+
+_WAY_OUT = "free disk space or choose another folder"
 # Errors of the path: more space does not help.
-_OF_PATH = FileExistsError, NotADirectoryError, PermissionError
+_OF_PATH = FileExistsError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError
+# Bytes of compressed pixels in those of the pixels, at most: noisy bands take a quarter, see `blocks`.
+_SHARE = 0.5
 
 
 class OutputError(SatIntervalsError):
@@ -29,26 +39,12 @@ def new_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary name beside a path, for the block to write the file; rename it at the end, or delete it.
 
     The temporary file exists, is empty, and must be written in place. The next call replaces what a killed process
-    left of it.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written, or another process is writing it.
+    left of it. Raise OutputError if the file cannot be written, or another process is writing it.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    with _failing(path, temporary), open(temporary, "ab") as stream:
-        _lock(stream.fileno(), temporary, path)
-        try:
-            stream.truncate(0)
-            yield temporary
-            os.fsync(stream.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-        _flush_folder(path.parent)
+    with failing(Path(path)), unfinished(Path(path)) as file:
+        yield file.temporary
+        file.flush()
+        file.commit()
 
 
 def write_file(path: str | os.PathLike[str], content: bytes) -> None:
@@ -57,22 +53,66 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+@dataclass
+class Unfinished:
+    """A file that is written in place under a temporary name."""
+
+    path: Path
+    temporary: Path
+    stream: BufferedWriter
+    is_committed: bool = False
+
+    def flush(self) -> None:
+        """Flush the content to the disk."""
+        os.fsync(self.stream.fileno())
+
+    def commit(self) -> None:
+        """Give the file its name."""
+        os.replace(self.temporary, self.path)
+        self.is_committed = True
+        _flush_folder(self.path.parent)
+
+
 @contextmanager
-def _failing(path: Path, temporary: Path) -> Iterator[None]:
-    """Turn errors of writing a file into an OutputError with its final name."""
+def unfinished(path: Path) -> Iterator[Unfinished]:
+    """Lock a temporary file beside a path for the block; delete it at the end unless it was committed."""
+    temporary = _temporary(path)
+    with ExitStack() as stack:
+        with failing(path):
+            stream = stack.enter_context(open(temporary, "ab"))
+            _lock(stream.fileno(), temporary, path)
+            stream.truncate(0)
+        file = Unfinished(path, temporary, stream)
+        try:
+            yield file
+        finally:
+            if not file.is_committed:
+                temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def failing(path: Path) -> Iterator[None]:
+    """Turn errors of writing a file into an OutputError with its final name; errors of other folders pass."""
     try:
         yield
-    except OSError as error:
-        if error.filename not in (None, str(temporary), str(path)):
+    except (*gdal.GDAL_ERRORS, OSError) as error:
+        name = getattr(error, "filename", None)
+        if name is not None and Path(name) not in (path, _temporary(path), *path.parents):
             raise
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}: {way_out(error)}") from error
+        reason = getattr(error, "strerror", None) or gdal.reason(error)
+        what = f"{reason}: {way_out(error)}"
+        if gdal.is_out_of_memory(error):
+            what = f"not enough memory ({gdal.reason(error)}): give the process more memory"
+        raise OutputError(f"{path} cannot be written: {what}") from error
 
 
-def way_out(error: OSError) -> str:
+def way_out(error: BaseException) -> str:
     """Return what to do about an error of writing."""
-    if isinstance(error, (FileNotFoundError, IsADirectoryError, *_OF_PATH)):
-        return "choose another name or folder"
-    return "free disk space or choose another folder"
+    return "choose another name or folder" if isinstance(error, _OF_PATH) else _WAY_OUT
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.part")
 
 
 def _lock(descriptor: int, temporary: Path, path: Path) -> None:
@@ -94,3 +134,30 @@ def _flush_folder(folder: Path) -> None:
     with suppress(OSError):
         os.fsync(descriptor)
     os.close(descriptor)
+
+
+def pixel_bytes(files: Sequence[File]) -> int:
+    """Return the bytes of a pixel of all files, not compressed."""
+    return sum(len(file.bands) * np.dtype(file.dtype).itemsize for file in files)
+
+
+def file_bytes(files: Sequence[File], height: int, width: int) -> int:
+    """Return the size of files with their overviews, at most."""
+    share = sum(pixel_bytes([file]) * (1 if file.compression == "none" else _SHARE) for file in files)
+    return round(height * width * share * 4 / 3)
+
+
+def part_bytes(files: Sequence[File], height: int, width: int) -> int:
+    """Return the size of the parts of files, at most; pixels of overviews are not compressed there."""
+    return file_bytes(files, height, width) + height * width * pixel_bytes(files) // 3
+
+
+def check_space(folder: Path, needed: int, what: str) -> None:
+    """Raise OutputError if a folder has not enough free space for ``what``, which may need so many bytes."""
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise OutputError(f"{folder} has {_size(free)} free, {what} may need {_size(needed)}: {_WAY_OUT}")
+
+
+def _size(count: int) -> str:
+    return f"{count / 1e6:,.1f} MB"

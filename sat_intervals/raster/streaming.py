@@ -2,7 +2,6 @@
 
 import errno
 import os
-import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -16,7 +15,6 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.raster.blocks import BLOCK, COLUMNS, compressed, factors
 from sat_intervals.raster.cog import Part
 from sat_intervals.raster.files import File
-from sat_intervals.raster.old_publishing import open_own
 
 # Bytes of a pixel of which COLUMNS are compressed at a time, fewer of larger ones: each thread has some copies.
 _PIXEL = 16
@@ -29,7 +27,7 @@ class Stream:
     """
 
     def __init__(self, file: File, folder: Path, shape: tuple[int, int], threads: int | None) -> None:
-        """``folder``: where temporary files are made. They have no names, so that nobody can exchange them."""
+        """``folder``: where temporary files without names are made."""
         self._file, self._folder, self._threads = file, folder, threads
         self._shapes = [(-(-shape[0] // factor), -(-shape[1] // factor)) for factor in factors(*shape)]
         self._rows = [0 for _ in self._shapes]
@@ -67,28 +65,24 @@ class Stream:
         step = max(BLOCK, COLUMNS * _PIXEL // (rows.shape[0] * rows.itemsize) // BLOCK * BLOCK)
         columns = (rows[:, :, first : first + step] for first in range(0, rows.shape[2], step))
         out = self._strips[level]
-        start, sizes, checksum = out.tell(), list[int](), 0
+        start, sizes = out.tell(), list[int]()
         with ThreadPoolExecutor(self._threads or usable_cores()) as pool:
             for blocks in pool.map(partial(compressed, file=self._file), columns):
                 out.write(blocks.content)
-                checksum = zlib.crc32(blocks.content, checksum)
                 sizes += blocks.sizes
         out.flush()
-        self.parts[level].append(Part(sizes, checksum, (level, start)))
+        self.parts[level].append(Part(sizes, (level, start)))
         if level + 1 < len(self._shapes):
             self._add(level + 1, rows[:, ::2, ::2])
 
     def copy_parts(self, path: Path, parts: Sequence[tuple[int, Part]]) -> None:
         """Write the parts into a file; see `CopyParts`."""
-        with open(open_own(path, os.O_RDWR), "r+b") as out:
+        with open(path, "r+b") as out:
             for offset, part in parts:
                 level, start = part.source
                 self._strips[level].seek(start)
-                content = self._strips[level].read(part.length)
-                if zlib.crc32(content) != part.checksum:
-                    raise OSError(errno.EIO, "the content read back differs from that written")
                 out.seek(offset)
-                out.write(content)
+                out.write(self._strips[level].read(part.length))
 
     def check_complete(self) -> None:
         """Raise if rows are missing."""

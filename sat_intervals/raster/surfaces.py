@@ -17,7 +17,6 @@ from sat_intervals.raster import gdal
 from sat_intervals.raster.georeferencing import Georeferencing
 from sat_intervals.raster.heightfield import other_unit
 from sat_intervals.raster.images import opened
-from sat_intervals.raster.seal import check_seal
 from sat_intervals.tiling import Window
 
 
@@ -31,15 +30,8 @@ def is_surface(path: Path) -> bool:
 
 
 def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
-    """Return rows and columns of a surface model, and its georeferencing.
-
-    Raises
-    ------
-    SatIntervalsError
-        It has no CRS, is not north up, or is damaged.
-    """
+    """Return rows and columns of a surface model, and its georeferencing, which must be north up."""
     with opened(str(path)) as dataset:
-        check_seal(path, dataset.files)
         place = Georeferencing.of(dataset)
         if place.crs is None or place.transform is None or place.transform.b or place.transform.d:
             raise SatIntervalsError(f"{path} has no CRS or is not north up: give a north-up raster with a CRS")
@@ -47,13 +39,7 @@ def read_place(path: Path) -> tuple[tuple[int, int], Georeferencing]:
 
 
 def check_reference(path: Path, surface: Path) -> None:
-    """Raise if reference heights cannot be resampled to a surface model, or have another unit or vertical datum.
-
-    Raises
-    ------
-    SatIntervalsError
-        The CRS is local, heights are not in metres, or above a geoid while the surface has heights above the ellipsoid.
-    """
+    """Raise if reference heights have a local CRS, another unit, or another vertical datum than a surface model."""
     with opened(str(path)) as dataset:
         crs, unit = pyproj.CRS.from_wkt(dataset.crs.to_wkt()), other_unit(dataset)
     with opened(str(surface)) as dataset:

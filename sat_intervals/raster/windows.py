@@ -1,15 +1,17 @@
 """Read any window of an image, with the states of its pixels."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from rasterio.enums import Resampling
 from rasterio.windows import Window as RasterioWindow
 
 from sat_intervals.errors import InputError
 from sat_intervals.products import MASKED, NO_DATA
-from sat_intervals.raster.images import Image, check_holds, opened
+from sat_intervals.raster.images import Image, opened
 from sat_intervals.tiling import View, Views, Window
 
 # Types whose values are all exact in float32.
@@ -36,11 +38,6 @@ def read_window(image: Image, window: Window) -> tuple[np.ndarray, np.ndarray]:
     state
         ``(height, width)`` uint8: 0 = usable; bit NO_DATA = outside the image, no-data value, the file's mask or alpha,
         NaN or infinity; bit MASKED = the user's mask.
-
-    Raises
-    ------
-    InputError
-        Pixels cannot be read, as in a truncated file; names the file, rows and columns.
     """
     inside = window.clipped(Window(0, 0, image.height, image.width))
     pixels = np.zeros((window.height, window.width), _pixel_type(image))
@@ -101,8 +98,6 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
     """Read values, in the file's type, and states of a window inside the image, sampled to ``shape`` if given."""
     area = RasterioWindow(window.column, window.row, window.width, window.height)
     with opened(image.path, window) as dataset:
-        image.check_complete(dataset)
-        check_holds(dataset, image.path, window, max(image.band, image.alpha or 1))
         values = dataset.read(image.band, window=area, out_shape=shape)
         usable = np.isfinite(values) & _differs(values, image.nodata)
         # GDAL's mask of a band uses only the first of mask, no-data value and alpha: combine them here.
@@ -113,7 +108,6 @@ def read_inside(image: Image, window: Window, shape: tuple[int, int] | None = No
     state = ~usable * np.uint8(NO_DATA)
     if image.mask is not None:
         with opened(image.mask, window) as dataset:
-            check_holds(dataset, image.mask, window)
             state[dataset.read(1, window=area, out_shape=shape) != 0] |= MASKED
     return values, state
 
@@ -126,3 +120,21 @@ def _differs(values: np.ndarray, nodata: float | None) -> np.ndarray:
         stored = np.asarray(nodata).astype(values.dtype)
     held = values.dtype.kind == "f" or stored == nodata
     return np.asarray(values != stored) if held else np.ones(values.shape, bool)
+
+
+def read_small_layers(path: str | os.PathLike[str], shape: tuple[int, int]) -> np.ndarray:
+    """Read all bands of a file as ``(bands, *shape)`` in the file's type, by nearest neighbour, through overviews."""
+    with opened(str(path)) as dataset:
+        return np.asarray(dataset.read(out_shape=(dataset.count, *shape)))
+
+
+def read_small_image(image: Image, window: Window, shape: tuple[int, int]) -> np.ndarray:
+    """Read a window inside an image as ``shape`` pixels, averaged, through overviews; NaN where not usable."""
+    picked, state = read_inside(image, window, shape)
+    if shape == (window.height, window.width):
+        means = picked
+    else:
+        area = RasterioWindow(window.column, window.row, window.width, window.height)
+        with opened(image.path, window) as dataset:
+            means = dataset.read(image.band, window=area, out_shape=shape, resampling=Resampling.average)
+    return np.where(state == 0, means, np.nan)

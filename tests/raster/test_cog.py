@@ -2,7 +2,6 @@
 
 import random
 import warnings
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,15 +9,13 @@ import numpy as np
 import pytest
 import rasterio
 from helpers import PLACE
-from hypothesis import given
-from hypothesis import strategies as st
 from rasterio.errors import NotGeoreferencedWarning
 from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals.products import Band
 from sat_intervals.raster import POINT_FILES, RUN_FILES, File, Georeferencing, blocks, cog, north_up, run_files
 from sat_intervals.raster.blocks import BLOCK, codec_versions, compressed, factors
-from sat_intervals.raster.cog import Part, assemble, combined, template
+from sat_intervals.raster.cog import Part, assemble, template
 from sat_intervals.raster.streaming import Stream
 
 INTERVALS, VALIDITY = RUN_FILES
@@ -40,13 +37,13 @@ def parts_of(bands: np.ndarray, file: File, order: random.Random | None = None) 
     made = {}
     for k, row in places:
         rows = compressed(bands[:, :: levels[k], :: levels[k]][:, row : row + BLOCK], file)
-        made[k, row] = Part(rows.sizes, zlib.crc32(rows.content), rows.content)
+        made[k, row] = Part(rows.sizes, rows.content)
     return [[made[place] for place in sorted(made) if place[0] == k] for k in range(len(levels))]
 
 
-def write(path: Path, bands: np.ndarray, file: File, place: Georeferencing = PLACE, **options) -> dict[str, int]:
+def write(path: Path, bands: np.ndarray, file: File, place: Georeferencing = PLACE, **options) -> None:
     made = template(file, place, {"ALPHA": "0.9"})
-    return assemble(path, made, bands.shape[1:], parts_of(bands, file, **options), copy_parts)
+    assemble(path, made, bands.shape[1:], parts_of(bands, file, **options), copy_parts)
 
 
 def copy_parts(path: Path, parts: Sequence[tuple[int, Part]]) -> None:
@@ -77,10 +74,8 @@ def assert_valid(path: Path) -> None:
 def test_assemble__is_a_valid_file_with_every_level(tmp_path, monkeypatch, file, shape, is_big):
     monkeypatch.setattr(cog, "_CLASSIC", 0 if is_big else 1 << 32)
     bands, path = noise(file, *shape), tmp_path / file.name
-    made = write(path, bands, file)
-    content = path.read_bytes()
-    assert made == {"bytes": len(content), "crc32": zlib.crc32(content)}
-    assert content[2] == (43 if is_big else 42)
+    write(path, bands, file)
+    assert path.read_bytes()[2] == (43 if is_big else 42)
     assert_valid(path)
     for level, factor in enumerate(factors(*shape)):
         options = {"overview_level": level - 1} if level else {}
@@ -107,8 +102,8 @@ def test_assemble__with_other_compressions(tmp_path, compression):
 
 def test_assemble__gives_the_same_bytes_whatever_the_order(tmp_path):
     bands = noise(INTERVALS, 1100, 300)
-    whole = write(tmp_path / "a.tif", bands, INTERVALS)
-    assert whole == write(tmp_path / "b.tif", bands, INTERVALS, order=random.Random(1))
+    write(tmp_path / "a.tif", bands, INTERVALS)
+    write(tmp_path / "b.tif", bands, INTERVALS, order=random.Random(1))
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
 
 
@@ -138,23 +133,13 @@ def test_stream__makes_the_parts_of_any_strips(tmp_path, rows):
     for row in range(0, 1100, rows):
         stream.write(row, bands[:, row : row + rows])
     for found, expected in zip(stream.parts, parts_of(bands, INTERVALS), strict=True):
-        assert [part[:2] for part in found] == [part[:2] for part in expected]
+        assert [part.sizes for part in found] == [part.sizes for part in expected]
     made = template(INTERVALS, PLACE, {"ALPHA": "0.9"})
     assemble(tmp_path / "a.tif", made, bands.shape[1:], stream.parts, stream.copy_parts)
     write(tmp_path / "b.tif", bands, INTERVALS)
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
     stream.close()
     assert {path.name for path in tmp_path.iterdir()} == {"a.tif", "b.tif"}
-
-
-def test_compressed__refuses_blocks_that_decode_to_something_else(monkeypatch):
-    class Losing(blocks.gdal.DatasetWriter):
-        def write(self, bands):
-            super().write(bands * (bands > 0))
-
-    monkeypatch.setattr(blocks.gdal, "DatasetWriter", Losing)
-    with pytest.raises(OSError, match="differs from that written"):
-        compressed(noise(INTERVALS, 20, 30), INTERVALS)
 
 
 def test_codec_versions__follow_the_bytes_of_blocks(monkeypatch):
@@ -164,8 +149,3 @@ def test_codec_versions__follow_the_bytes_of_blocks(monkeypatch):
     codec_versions.cache_clear()
     assert codec_versions("deflate")["codecs"] != before["codecs"]
     codec_versions.cache_clear()
-
-
-@given(first=st.binary(), second=st.binary())
-def test_combined__equals_the_checksum_of_both(first, second):
-    assert combined(zlib.crc32(first), zlib.crc32(second), len(second)) == zlib.crc32(first + second)

@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-import tarfile
 import time
 import zipfile
 from http.server import ThreadingHTTPServer
@@ -17,14 +16,13 @@ import boto3
 import numpy as np
 import pytest
 import rasterio
-from helpers import COMMAND, OUTPUTS, hashes
+from helpers import COMMAND, OUTPUTS, PLACE, hashes
 
 from sat_intervals import match_pair
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
-from sat_intervals.raster import identity as identities
-from sat_intervals.raster.identity import check_unchanged, identity, is_changed
-from sat_intervals.raster.watching import read_unchanged
+from sat_intervals.errors import ChangedInputError, SatIntervalsError
+from sat_intervals.raster import describe, open_image, write_layer
+from sat_intervals.raster.identity import check_not_replaced, identity
 from sat_intervals.tiling import Window
 
 SIDE = 1024
@@ -91,7 +89,7 @@ def test_match__never_goes_on_with_an_image_of_another_etag(web_server, images, 
     put(images, web_server.folder)
     out, tiles = tmp_path / "out", ("--tile-size", "128")
     first = match(web_server, out, *tiles)
-    while first.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
+    while first.poll() is None and len(list((out / "tiles").glob("[!.]*/[0-9]*_[0-9]*"))) < 3:
         time.sleep(0.02)
     first.terminate()
     assert ended(first)[0] == 143
@@ -108,63 +106,90 @@ def test_match__never_goes_on_with_an_image_of_another_etag(web_server, images, 
     assert sorted(path.name for path in out.iterdir()) == OUTPUTS
 
 
-def test_identity__sees_a_change_at_equal_size_and_time_and_hashes_only_then(tmp_path, monkeypatch):
+def test_identity__hashes_a_local_file_unless_size_and_time_are_known(tmp_path, monkeypatch):
     file = tmp_path / "image.tif"
     file.write_bytes(b"one")
-    before = identity(str(file))
-    assert before["sha256"] == hashlib.sha256(b"one").hexdigest()
-    times = file.stat().st_atime_ns, file.stat().st_mtime_ns
+    os.utime(file, ns=(0, 1_700_000_000_123_456_789))
+    (tmp_path / "link.tif").symlink_to(file)
+    before = identity(str(tmp_path / "link.tif"))
+    assert before == {
+        "path": str(file),
+        "bytes": 3,
+        "modified": "2023-11-14T22:13:20.123456789+00:00",
+        "sha256": hashlib.sha256(b"one").hexdigest(),
+    }
     with monkeypatch.context() as patch:
         patch.setattr(hashlib, "file_digest", None)
         assert identity(str(file), {str(file): before}) == before
-    time.sleep(0.02)  # more than a tick of the clock of files
     file.write_bytes(b"two")
-    os.utime(file, ns=times)
+    os.utime(file, ns=(0, 1_700_000_000_123_456_790))
     after = identity(str(file), {str(file): before})
-    assert {name for name in before if after[name] != before[name]} == {"sha256", "stamp"}
-    assert after["sha256"] == hashlib.sha256(b"two").hexdigest()
-    assert is_changed(str(file), before)
-    time.sleep(0.02)
-    file.write_bytes(b"one")
-    assert not is_changed(str(file), before)
+    assert {name for name in before if after[name] != before[name]} == {"sha256", "modified"}
 
 
-def test_read_unchanged__reads_again_until_nothing_was_touched(tmp_path):
-    real, link = tmp_path / "real", tmp_path / "link.tif"
-    real.mkdir()
-    (real / "image.tif").write_bytes(b"one")
-    (tmp_path / "folder").symlink_to("real")
-    link.symlink_to("folder/image.tif")
-    files = {str(link): identity(str(link))}
-    touched = iter([True, True, False])
+def test_identity__of_a_file_in_an_archive_is_that_of_the_archive(tmp_path):
+    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+        archive.writestr("left.tif", "content")
+    name = f"/vsizip/{tmp_path}/all.zip/left.tif"
+    assert identity(name) == identity(str(tmp_path / "all.zip")) | {"path": name}
 
-    def read():
-        if next(touched, True):  # a link on the way to the file
-            (tmp_path / "new").symlink_to("real")
-            (tmp_path / "new").replace(tmp_path / "folder")
-        return link.read_bytes()
 
-    assert read_unchanged(files, read) == b"one"
-    assert next(touched, None) is None
-    with pytest.raises(RunError, match=r"link.tif keeps changing while it is read"):
-        read_unchanged(files, read)
-    (real / "image.tif").write_bytes(b"two")
-    with pytest.raises(ChangedInputError, match=r"link.tif was replaced or changed during the run"):
-        read_unchanged(files, link.read_bytes)
+def test_describe__says_what_decides_the_pixels(tmp_path):
+    write_layer(tmp_path / "left.tif", np.ones((4, 5), np.uint16), 0, PLACE)
+    write_layer(tmp_path / "mask.tif", np.zeros((4, 5), np.uint8), 0, PLACE)
+    (tmp_path / "left.tif.msk").write_bytes(mask_of(4))
+    image = open_image(tmp_path / "left.tif", mask=tmp_path / "mask.tif", nodata=7)
+    described = describe(image)
+    mask = identity(str(tmp_path / "mask.tif")) | {"files": []}
+    assert described == identity(str(tmp_path / "left.tif")) | {
+        **{"height": 4, "width": 5, "band": 1, "dtype": "uint16", "nodata": "7.0", "crs": "EPSG:32631", "alpha": None},
+        **{"files": [identity(str(tmp_path / "left.tif.msk"))], "use_mask": True, "mask": mask},
+    }
+    known = {file["path"]: file | {"sha256": "known"} for file in (described, *described["files"], mask)}
+    again = describe(image, known)
+    assert {file["sha256"] for file in (again, again["mask"], *again["files"])} == {"known"}
+
+
+@pytest.mark.parametrize("damage", ["missing", "damaged"])
+def test_describe__names_an_image_that_cannot_be_read_any_more(tmp_path, damage):
+    write_layer(tmp_path / "left.tif", np.ones((4, 5), np.uint16), 0, PLACE)
+    image = open_image(tmp_path / "left.tif")
+    (tmp_path / "left.tif").unlink()
+    if damage == "damaged":
+        (tmp_path / "left.tif").write_text("no image")
+    with pytest.raises(ChangedInputError, match=r"left\.tif cannot be read: .*: restore"):
+        describe(image)
+
+
+@pytest.mark.parametrize("way", ["itself", "hard link", "symbolic link", "folder", "archive"])
+def test_check_not_replaced__refuses_an_output_that_is_an_input(tmp_path, way):
+    (tmp_path / "in").mkdir()
+    file, output = tmp_path / "in" / "left.tif", tmp_path / "out.tif"
+    file.write_text("content")
+    if way == "hard link":
+        output.hardlink_to(file)
+    elif way == "symbolic link":
+        output.symlink_to(file)
+    name = f"/vsizip/{file}/left.tif" if way == "archive" else file
+    outputs, folders = [file if way in ("itself", "archive") else output], [tmp_path / "in"] if way == "folder" else []
+    with pytest.raises(SatIntervalsError, match=r"left\.tif is an input"):
+        check_not_replaced([None, "https://host/left.tif", name], outputs, folders)
+    check_not_replaced([None, "https://host/left.tif", name], [tmp_path / "other.tif"], [tmp_path / "other"])
 
 
 def test_match__ends_where_an_image_on_a_server_changes_and_publishes_nothing(web_server, images, tmp_path):
     put(images, web_server.folder)
     out = tmp_path / "out"
     run = match(web_server, out, "--tile-size", "128", "--workers", "1")
-    while run.poll() is None and len(list((out / "tiles" / "records").glob("[0-9]*"))) < 3:
+    while run.poll() is None and len(list((out / "tiles").glob("[!.]*/[0-9]*_[0-9]*"))) < 3:
         time.sleep(0.02)
     changed = bytearray(images["right.tif"])
     changed[-1] ^= 1
     put({"right.tif": bytes(changed)}, web_server.folder)
     status, output = ended(run)
     assert (status, output.count("\n")) == (1, 1)
-    assert "right.tif was replaced or changed during the run" in output
+    assert "right.tif" in output
+    assert "changed during the run" in output
     assert [path.name for path in out.iterdir()] == ["tiles"]
 
 
@@ -183,55 +208,14 @@ def test_identity__of_a_missing_file_is_refused(tmp_path):
         identity(str(tmp_path / "left.tif"))
 
 
-def test_check_unchanged__refuses_an_archive_of_which_gdal_may_have_an_old_index(tmp_path, monkeypatch):
-    """Of an older one of the same size, GDAL reads files at their old places."""
-    archive = tmp_path / "images.tar"
-    for name in ("one", "other"):
-        (tmp_path / name).write_text(name)
-        with tarfile.open(tmp_path / f"{name}.tar", "w") as file:
-            file.add(tmp_path / name, "left.tif")
-    path = f"/vsitar/{archive}/left.tif"
-    (tmp_path / "one.tar").rename(archive)
-    check_unchanged({path: identity(path)})
-    (tmp_path / "other.tar").rename(archive)
-    known = {path: {"sha256": hashlib.sha256(archive.read_bytes()).hexdigest()}}
-    with pytest.raises(ChangedInputError, match=r"images\.tar was replaced since this process read it first"):
-        check_unchanged(known)
-    monkeypatch.setattr(identities, "_ARCHIVES", {})  # as in a new process
-    check_unchanged(known)
-
-
-OPEN_AND_DESCRIBE = """import sys
-from sat_intervals import load_config, open_image
-from sat_intervals.run.inputs import describe_inputs
-images = [open_image(name) for name in sys.argv[1:]]
-print("opened", flush=True)
-sys.stdin.readline()
-describe_inputs(*images, load_config({}), {})"""
-
-
-@pytest.mark.parametrize("is_replaced", [False, True])
-def test_describe_inputs__of_an_image_on_a_server_that_is_replaced_when_it_is_open(web_server, images, is_replaced):
-    put(images, web_server.folder)
-    names = [f"http://127.0.0.1:{web_server.server_address[1]}/{side}.tif" for side in ("left", "right")]
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    with subprocess.Popen([sys.executable, "-c", OPEN_AND_DESCRIBE, *names], text=True, **pipes) as process:
-        assert process.stdout.readline() == "opened\n"
-        if is_replaced:
-            put({"right.tif": images["left.tif"]}, web_server.folder)
-        _, errors = process.communicate("\n", timeout=60)
-    expected = "right.tif was replaced or changed since "
-    assert (process.returncode != 0, expected in errors) == (is_replaced, is_replaced)
-
-
 OPENED = """import json, sys
-from sat_intervals import open_image
-image = open_image(sys.argv[1])
-print(json.dumps([image.use_mask, *image.stamps]))"""
+from sat_intervals.raster import describe, open_image
+described = describe(open_image(sys.argv[1]))
+print(json.dumps([described["use_mask"], described, *described["files"]]))"""
 
 
 def opened(name):
-    """Whether an image has a mask, and its files; in a process of its own, since GDAL holds Python's lock."""
+    """Whether an image has a mask, and the identities of its files; in a process, since GDAL holds Python's lock."""
     done = subprocess.run([sys.executable, "-c", OPENED, name], capture_output=True, text=True, timeout=60, check=True)
     return json.loads(done.stdout)
 
@@ -239,42 +223,13 @@ def opened(name):
 def test_open_image__counts_each_file_on_a_server_once(web_server, images):
     put({**images, "left.tif.msk": mask_of(SIDE), "left.tif.ovr": images["right.tif"]}, web_server.folder)
     name = f"http://127.0.0.1:{web_server.server_address[1]}/left.tif"
-    assert opened(name) == [True, name, f"/vsicurl/{name}.msk"]  # overviews are no input
-
-
-def test_open_image__of_a_virtual_raster_on_a_server_asks_as_much_with_either_name(web_server, images):
-    band = '<VRTRasterBand dataType="UInt16" band="1">{}</VRTRasterBand>'
-    source = '<SimpleSource><SourceFilename relativeToVRT="1">left{}.tif</SourceFilename></SimpleSource>'
-    sources = "".join(source.format(number) for number in range(5))
-    text = f'<VRTDataset rasterXSize="{SIDE}" rasterYSize="{SIDE}">{band.format(sources)}</VRTDataset>'
-    put({f"left{number}.tif": images["left.tif"] for number in range(5)}, web_server.folder)
-    put({"left.vrt": text.encode()}, web_server.folder)
-    name, sent = f"http://127.0.0.1:{web_server.server_address[1]}/left.vrt", []
-    for prefix in ("/vsicurl/", ""):
-        web_server.sent.clear()
-        opened(prefix + name)
-        sent.append(len(web_server.sent))
-    assert sent[1] <= 1.2 * sent[0], sent
-
-
-def test_watched_rasters__sees_a_source_on_a_server_that_changes(web_server, images, tmp_path):
-    put(images, web_server.folder)
-    source = f"/vsicurl/http://127.0.0.1:{web_server.server_address[1]}/left.tif"
-    band = f"<SimpleSource><SourceFilename>{source}</SourceFilename></SimpleSource>"
-    (tmp_path / "truth.vrt").write_text(
-        f"<VRTDataset rasterXSize='{SIDE}' rasterYSize='{SIDE}'><VRTRasterBand dataType='UInt16' band='1'>{band}"
-        "</VRTRasterBand></VRTDataset>"
-    )
-    script = (
-        "import sys\nfrom sat_intervals.raster import watched_rasters\ncheck = watched_rasters(sys.argv[1:])\ncheck()\n"
-        "print(flush=True)\nsys.stdin.readline()\ncheck()"
-    )
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    with subprocess.Popen([sys.executable, "-c", script, tmp_path / "truth.vrt"], text=True, **pipes) as process:
-        process.stdout.readline()
-        put({"left.tif": images["right.tif"]}, web_server.folder)
-        _, errors = process.communicate("\n", timeout=60)
-    assert f"{source} was replaced or changed while it was read: rerun the command" in errors
+    has_mask, *files = opened(name)
+    assert (has_mask, [file["path"] for file in files]) == (
+        True,
+        [name, f"/vsicurl/{name}.msk"],
+    )  # overviews are no input
+    assert [file["bytes"] for file in files] == [len(images["left.tif"]), len(mask_of(SIDE))]
+    assert all(file["etag"] for file in files)
 
 
 @pytest.mark.parametrize(
@@ -295,14 +250,14 @@ def test_open_image__refuses_archives_on_servers(web_server, images, way):
     name = way.format(f"http://127.0.0.1:{web_server.server_address[1]}/all.zip")
     with pytest.raises(subprocess.CalledProcessError) as failure:
         opened(name)
-    assert "is in an archive on a server, of which a change would not be noticed: download it" in failure.value.stderr
+    assert "is read from files whose changes would not be noticed: download or extract it" in failure.value.stderr
 
 
 def test_open_image__refuses_a_stream(web_server, images):
     put(images, web_server.folder)
     with pytest.raises(subprocess.CalledProcessError) as failure:
         opened(f"/vsicurl_streaming/http://127.0.0.1:{web_server.server_address[1]}/left.tif")
-    assert "is read from files that GDAL does not list" in failure.value.stderr
+    assert "is read from files whose changes would not be noticed" in failure.value.stderr
 
 
 def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, monkeypatch):
@@ -313,7 +268,11 @@ def test_open_image__finds_a_mask_among_many_files_of_a_bucket(bucket, images, m
     objects = dict.fromkeys([f"many/a{number}" for number in range(1100)], b"")
     for key, content in (objects | {"many/left.tif": images["left.tif"], "many/left.tif.msk": mask_of(SIDE)}).items():
         boto3.client("s3").put_object(Bucket="bucket", Key=key, Body=content)
-    assert opened(f"{bucket}/many/left.tif") == [True, f"{bucket}/many/left.tif", "/vsis3/bucket/many/left.tif.msk"]
+    has_mask, *files = opened(f"{bucket}/many/left.tif")
+    assert (has_mask, [file["path"] for file in files]) == (
+        True, [f"{bucket}/many/left.tif", "/vsis3/bucket/many/left.tif.msk"]
+    )  # fmt: skip
+    assert all(file["etag"] for file in files)
 
 
 def test_identity__of_a_server_that_does_not_say_which_file_it_sends(web_server, images):
@@ -380,22 +339,3 @@ def test_read_window__sees_the_mask_of_a_server_that_is_busy_every_other_time(we
     # GDAL waits 30 seconds if it is not told otherwise
     done = subprocess.run([sys.executable, "-c", STATE, name], capture_output=True, text=True, timeout=100)
     assert (done.stdout, next(asked) > 2) == ("True\n", True)
-
-
-def test_identity__hashes_the_file_that_it_names(tmp_path, monkeypatch):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "left.tif").write_text(name)
-    link, resolve = tmp_path / "link", Path.resolve
-    link.symlink_to("b")
-
-    def and_leads_elsewhere(path):
-        found = resolve(path)
-        link.unlink(missing_ok=True)
-        link.symlink_to("a")
-        return found
-
-    monkeypatch.setattr(Path, "resolve", and_leads_elsewhere)
-    found = identity(str(link / "left.tif"))
-    assert found["path"] == str(tmp_path / "b" / "left.tif")
-    assert found["sha256"] == hashlib.sha256(b"b").hexdigest()

@@ -1,25 +1,20 @@
 """Reading and writing of rasters, on real files: refusals, pixels, metadata, temporary files."""
 
-import ctypes
 import itertools
 import json
 import os
 import pickle
-import shutil
 import subprocess
 import sys
 import time
 import warnings
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import OUTPUTS, contents, exchanged
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rasterio.control import GroundControlPoint
@@ -30,31 +25,24 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
 
-from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
     POINT_FILES,
     RUN_FILES,
+    File,
     Georeferencing,
     Image,
     InputError,
     OutputError,
     OutputWriter,
     check_pair,
+    files_of,
     gdal,
-    images,
     open_image,
-    other_files,
-    publishing,
-    read_layers,
     read_window,
-    stamps,
     surface_file,
-    write_file,
-    write_layer,
 )
 from sat_intervals.raster.identity import local_file
-from sat_intervals.raster.layers import whole_file
 from sat_intervals.raster.windows import kept_view, restored_view
 from sat_intervals.tiling import View, Window
 
@@ -146,40 +134,6 @@ def test_open_image__tells_what_the_file_has(tmp_path):
     assert image.georeferencing == Georeferencing(CRS.from_epsg(32631), UTM["transform"])
 
 
-def test_open_image__raises_if_its_folder_is_another_for_a_moment(tmp_path, monkeypatch):
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        make(tmp_path / name / "left.tif", RAMP, nodata=ord(name))
-
-    @contextmanager
-    def of_the_other(path, *arguments):
-        exchanged(tmp_path / "a", tmp_path / "b")
-        with opened(path, *arguments) as dataset:
-            exchanged(tmp_path / "a", tmp_path / "b")
-            yield dataset
-
-    opened = images.opened
-    monkeypatch.setattr(images, "opened", of_the_other)
-    with pytest.raises(ChangedInputError, match=r"left\.tif was replaced or changed while it was read"):
-        open_image(tmp_path / "a" / "left.tif")
-
-
-def test_open_image__raises_if_a_file_beside_it_comes_and_goes(tmp_path, monkeypatch):
-    make(tmp_path / "left.tif", RAMP)
-
-    @contextmanager
-    def with_world_file(path, *arguments):
-        (tmp_path / "left.tfw").write_text("1\n0\n0\n-1\n0\n0\n")
-        with opened(path, *arguments) as dataset:
-            (tmp_path / "left.tfw").unlink()
-            yield dataset
-
-    opened = images.opened
-    monkeypatch.setattr(images, "opened", with_world_file)
-    with pytest.raises(ChangedInputError, match=r"left\.tfw came while an image was opened: rerun the command"):
-        open_image(tmp_path / "left.tif")
-
-
 def test_open_image__finds_a_relative_path_from_anywhere(tmp_path, monkeypatch):
     make(tmp_path / "left.tif", RAMP)
     monkeypatch.chdir(tmp_path)
@@ -198,14 +152,14 @@ def test_open_image__opens_the_file_that_the_system_finds_above_the_target_of_a_
 
 
 @pytest.mark.parametrize("name", ["file://{}", "zip://{}!left.tif", "zip+file://{}!left.tif"])
-def test_other_files__of_a_name_of_rasterio_are_the_local_file(tmp_path, name):
+def test_files_of__a_name_of_rasterio_has_the_local_file(tmp_path, name):
     file = make(tmp_path / "left.tif", RAMP)
     if name.startswith("zip"):
         with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
             archive.write(file, "left.tif")
         file = tmp_path / "all.zip"
     image = open_image(name.format(file))
-    assert str(local_file(*other_files(image.path))) == str(file)
+    assert str(local_file(files_of(image.path)[1])) == str(file)
 
 
 def test_open_image__reads_through_the_virtual_file_systems_of_gdal(tmp_path):
@@ -663,22 +617,21 @@ def products() -> tuple[np.ndarray, np.ndarray]:
     return intervals, validity
 
 
-def produce(folder: Path, products, *, where=None, rows=256, tags=None, publish=True, report=None) -> None:
+def produce(folder: Path, products, *, where=None, rows=256, tags=None, publish=True) -> None:
     intervals, validity = products
     with OutputWriter(folder, RUN_FILES, *validity.shape, where or Georeferencing(), tags or {}, threads=2) as output:
         for row in range(0, len(validity), rows):
             output.write(row, intervals[:, row : row + rows], validity[row : row + rows])
         if publish:
-            output.publish(report, replaceable=stamps(folder, OUTPUTS))
+            output.publish()
 
 
 @pytest.mark.parametrize("rows", [37, 256, HEIGHT])
 def test_output_writer__writes_what_it_is_given(tmp_path, products, rows):
-    produce(tmp_path / "out", products, rows=rows, report=("run.json", "{}\n"))
+    produce(tmp_path / "out", products, rows=rows)
     np.testing.assert_array_equal(look(tmp_path / "out" / "intervals.tif"), products[0])
     np.testing.assert_array_equal(look(tmp_path / "out" / "validity.tif")[0], products[1])
-    assert (tmp_path / "out" / "run.json").read_text() == "{}\n"
-    assert sorted(os.listdir(tmp_path / "out")) == OUTPUTS
+    assert sorted(os.listdir(tmp_path / "out")) == ["intervals.tif", "validity.tif"]
 
 
 def test_output_writer__writes_large_numbers_of_many_bands(tmp_path):
@@ -782,77 +735,13 @@ def test_output_writer__keeps_what_was_there_until_publish(tmp_path, products):
     np.testing.assert_array_equal(look(tmp_path / "intervals.tif"), products[0])
 
 
-@pytest.mark.parametrize("mark", [".sat-intervals.files", ".sat-intervals.lock"])
-def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products, mark):
-    (tmp_path / ".unpublished-intervals.tif" / "files" / "replaced").mkdir(parents=True)
-    for name in ("strips-intervals.tif", "validity.tif", "run.json", "replaced/intervals.tif"):
-        (tmp_path / ".unpublished-intervals.tif" / "files" / name).write_text("half")
-    (tmp_path / ".unpublished-intervals.tif" / mark).touch()
-    produce(tmp_path, products)
-    assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
-
-
-def publish_where_the_last_fails(folder: Path, products, report=None) -> None:
-    intervals, validity = products
-    with OutputWriter(folder, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
-        output.write(0, intervals, validity)
-        there = stamps(folder, OUTPUTS)
-        (folder / "validity.tif").mkdir()
-        with pytest.raises(OutputError) as failure:
-            output.publish(report, replaceable=there)
-    message(failure, folder / "validity.tif", "Is a directory")
-
-
-@pytest.mark.parametrize("before", [["intervals.tif"], []])
-def test_output_writer__publishes_all_or_nothing(tmp_path, products, before):
-    for name in before:
-        (tmp_path / name).write_text("of another")
-    publish_where_the_last_fails(tmp_path, products)
-    assert left_behind(tmp_path) == [*before, "validity.tif"]
-    assert [(tmp_path / name).read_text() for name in before] == ["of another"] * len(before)
-
-
-def test_output_writer__publishes_no_report_of_files_that_failed(tmp_path, products):
-    (tmp_path / "run.json").write_text("of the run before")
-    publish_where_the_last_fails(tmp_path, products, ("run.json", "{}"))
-    assert left_behind(tmp_path) == ["run.json", "validity.tif"]
-    assert (tmp_path / "run.json").read_text() == "of the run before"
-    (tmp_path / "validity.tif").rmdir()
-    produce(tmp_path, products, report=("run.json", "{}"))
-    assert (tmp_path / "run.json").read_text() == "{}"
-    np.testing.assert_array_equal(look(tmp_path / "validity.tif")[0], products[1])
-
-
-def test_output_writer__deletes_no_other_file_where_its_temporary_folder_is_deleted(tmp_path, products, monkeypatch):
-    for name in OUTPUTS:
-        (tmp_path / name).write_text("of the run before")
-    put_aside = publishing._put_aside
-
-    def late(new, *arguments):
-        shutil.rmtree(new.parent.resolve())
-        put_aside(new, *arguments)
-
-    monkeypatch.setattr(publishing, "_put_aside", late)
-    with pytest.raises(OutputError, match="cannot be written: No such file or directory"):
-        produce(tmp_path, products, report=("run.json", "{}"))
-    assert left_behind(tmp_path) == OUTPUTS
-    assert [(tmp_path / name).read_text() for name in OUTPUTS] == ["of the run before"] * 3
-
-
-def test_output_writer__refuses_a_name_that_is_no_files_before_the_work(tmp_path, products):
-    (tmp_path / "validity.tif").mkdir()
-    with pytest.raises(OutputError) as failure:
-        produce(tmp_path, products, publish=False)
-    message(failure, tmp_path / "validity.tif", "it is not a regular file: choose another name")
-
-
 def test_output_writer__of_others_in_a_folder_disturbs_none_and_of_the_same_is_refused(tmp_path):
     def writer(name: str) -> OutputWriter:
         return OutputWriter(tmp_path, [surface_file(name)], 20, 30, Georeferencing(), {})
 
     bands = np.zeros((6, 20, 30), np.float32)
     with writer("a.tif") as one, writer("b.tif") as other:
-        with pytest.raises(SatIntervalsError, match="another run is active in"), writer("a.tif"):
+        with pytest.raises(OutputError, match=r"a\.tif is being written by another command"), writer("a.tif"):
             pass
         one.write(0, bands)
         one.publish()
@@ -868,45 +757,6 @@ def test_output_writer__names_a_folder_that_cannot_be_made(tmp_path, products):
     message(failure, tmp_path / "file" / "out", "Not a directory")
 
 
-@pytest.mark.parametrize("damage", ["cut short", "zeroed"])
-def test_output_writer__publishes_no_file_that_differs_from_what_was_written(tmp_path, products, damage):
-    # As when the disk loses what it has taken.
-    def lose() -> None:
-        intervals, validity = products
-        with OutputWriter(tmp_path, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
-            output.write(0, intervals, validity)
-            strips = output._streams["intervals.tif"]._strips[0]
-            size = strips.tell()
-            strips.truncate(size - 1000)
-            if damage == "zeroed":
-                strips.truncate(size)
-            output.publish()
-
-    with pytest.raises(OutputError) as failure:
-        lose()
-    message(failure, tmp_path / "intervals.tif", "cannot be written", "differs from that written")
-    assert left_behind(tmp_path) == []
-
-
-@pytest.mark.parametrize("damage", ["cut short", "zeroed"])
-def test_output_writer__publishes_no_file_that_was_damaged_since_it_was_made(tmp_path, products, monkeypatch, damage):
-    build = OutputWriter.build
-
-    def damaging(writer):
-        made = build(writer)
-        file = writer._hidden.files / "intervals.tif"
-        length = file.stat().st_size
-        os.truncate(file, length // 2)
-        if damage == "zeroed":
-            os.truncate(file, length)
-        return made
-
-    monkeypatch.setattr(OutputWriter, "build", damaging)
-    with pytest.raises(OutputError, match=r"intervals\.tif cannot be written: the content read back differs"):
-        produce(tmp_path, products)
-    assert left_behind(tmp_path) == []
-
-
 def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_path, products):
     intervals, validity = products
     with OutputWriter(tmp_path, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
@@ -914,6 +764,44 @@ def test_output_writer__publishes_no_file_with_rows_that_were_not_written(tmp_pa
         with pytest.raises(OutputError, match="300 of 560 rows were written"):
             output.publish()
     assert left_behind(tmp_path) == []
+
+
+def test_output_writer__replaces_what_a_killed_run_left(tmp_path, products):
+    code = (
+        "import os, sys\nimport numpy as np\nfrom sat_intervals.raster import RUN_FILES, Georeferencing, OutputWriter\n"
+        "with OutputWriter(sys.argv[1], RUN_FILES, 600, 20, Georeferencing(), {}) as output:\n"
+        "    output.write(0, np.zeros((4, 600, 20), np.float32), np.zeros((600, 20), np.uint16))\n"
+        "    output.build()\n    os._exit(9)"
+    )
+    assert subprocess.run([sys.executable, "-c", code, tmp_path]).returncode == 9
+    assert left_behind(tmp_path) == [".intervals.tif.part", ".validity.tif.part"]
+    produce(tmp_path, products)
+    assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
+    np.testing.assert_array_equal(look(tmp_path / "validity.tif")[0], products[1])
+
+
+def test_output_writer__builds_whole_files_under_temporary_names(tmp_path, products):
+    intervals, validity = products
+    with OutputWriter(tmp_path, RUN_FILES, HEIGHT, WIDTH, Georeferencing(), {}) as output:
+        output.write(0, intervals, validity)
+        made = output.build()
+        assert {name: path.parent for name, path in made.items()} == {file.name: tmp_path for file in RUN_FILES}
+        np.testing.assert_array_equal(look(made["validity.tif"])[0], validity)
+        assert not list(tmp_path.glob("[!.]*"))
+        output.publish()
+    assert left_behind(tmp_path) == ["intervals.tif", "validity.tif"]
+
+
+def test_output_writer__draws_pictures_with_their_tags_in_them(tmp_path):
+    pixels = np.arange(60, dtype=np.uint8).reshape(6, 10)
+    file = File("disparity.png", "uint8", None, BANDS[:1], driver="PNG")
+    with OutputWriter(tmp_path, [file], 6, 10, Georeferencing(), {"SOFTWARE": "sat-intervals"}) as output:
+        output.write(0, pixels[:4])
+        output.write(4, pixels[4:])
+        output.publish()
+    assert left_behind(tmp_path) == ["disparity.png"]
+    np.testing.assert_array_equal(look(tmp_path / "disparity.png")[0], pixels)
+    assert look(tmp_path / "disparity.png", lambda dataset: dataset.tags())["Software"] == "sat-intervals"
 
 
 # The bands have 18 bytes a pixel, 5.2 MB, and their files at most 3.5 MB with overviews if they were no noise, which
@@ -945,179 +833,3 @@ def test_output_writer__leaves_nothing_on_a_full_disk(disk, products, size, othe
 
 
 # The file has 527 kB. GDAL keeps its end until it is closed, and closes without an error what does not fit.
-@pytest.mark.parametrize("size", [8 << 10, 492 << 10, 512 << 10])
-def test_write_layer__leaves_no_damaged_file_on_a_full_disk(disk, size):
-    noise = np.random.default_rng(0).integers(0, 60000, (512, 512)).astype(np.uint16)
-    place = disk(size)
-    with pytest.raises(OutputError, match=r"noise.tif cannot be written: .*: make room or check its rights"):
-        write_layer(place / "noise.tif", noise, 0, Georeferencing())
-    assert list(place.iterdir()) == []
-    disk(600 << 10)
-    write_layer(place / "noise.tif", noise, 0, Georeferencing())
-    assert (read_layers(place / "noise.tif")[0] == noise).all()
-
-
-def test_whole_file__names_the_file_that_cannot_be_written(tmp_path):
-    """Not the temporary one."""
-    missing = tmp_path / "missing" / "a.txt"
-    for path, says in ((missing, "cannot be written: .*: make room or"), (tmp_path, "is a folder: move it away")):
-        with pytest.raises(OutputError, match=rf"{path} {says}"), whole_file(path) as new:
-            new.write_text("a")
-
-
-def test_write_file__gives_no_name_to_a_file_that_was_damaged_since_it_was_written(tmp_path, monkeypatch):
-    fsync = os.fsync
-
-    def zeroed(descriptor):
-        fsync(descriptor)
-        Path(os.readlink(f"/proc/self/fd/{descriptor}")).write_bytes(bytes(7))
-
-    monkeypatch.setattr(os, "fsync", zeroed)
-    with pytest.raises(OutputError, match=r"page\.html cannot be written: the content read back differs"):
-        write_file(tmp_path / "page.html", b"content")
-    assert list(tmp_path.iterdir()) == []
-    monkeypatch.undo()
-    assert write_file(tmp_path / "page.html", b"content") == stamps(tmp_path, ["page.html"])["page.html"]
-    assert (tmp_path / "page.html").read_bytes() == b"content"
-
-
-@pytest.mark.parametrize("was_there", [False, True])
-def test_whole_file__keeps_a_file_that_appears_meanwhile(tmp_path, was_there):
-    path = tmp_path / "new.yaml"
-    if was_there:
-        path.write_text("before")
-
-    def write():
-        with whole_file(path) as new:
-            new.write_text("new")
-            path.write_text("of the user")
-
-    with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile"):
-        write()
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
-
-
-def test_whole_file__keeps_a_file_that_comes_where_its_own_is_away(tmp_path, monkeypatch):
-    path, library = tmp_path / "new.yaml", ctypes.CDLL(None, use_errno=True)
-    path.write_text("before")
-
-    def away(*arguments):
-        path.rename(tmp_path / "away")
-        failed = library.renameat2(*arguments)
-        path.write_text("of the user")
-        return failed
-
-    monkeypatch.setattr(publishing.ctypes, "CDLL", lambda *_, **named: SimpleNamespace(renameat2=away))
-    with pytest.raises(OutputError, match=r"new\.yaml was written by another process"), whole_file(path) as new:
-        new.write_text("new")
-    assert (path.read_text(), (tmp_path / "away").read_text()) == ("of the user", "before")
-
-
-@pytest.mark.parametrize("how", ["late", "late and interrupted", "no exchange"])
-def test_whole_file__keeps_a_file_that_appears_at_the_last_moment(tmp_path, monkeypatch, how):
-    path = tmp_path / "new.yaml"
-    path.write_text("before")
-    exchange = publishing._exchange
-
-    def late(new, place):
-        if place.read_text() != "before":
-            return exchange(new, place)
-        (tmp_path / "other").write_text("of the user")
-        os.replace(tmp_path / "other", place)
-        exchange(new, place)
-        if "interrupted" in how:
-            raise KeyboardInterrupt
-
-    def write():
-        with whole_file(path) as new:
-            new.write_text("new")
-
-    if how == "no exchange":
-        monkeypatch.setattr(publishing.ctypes, "CDLL", lambda name, **_: None)
-        write()
-        assert path.read_text() == "new"
-        return
-    monkeypatch.setattr(publishing, "_exchange", late)
-    if "interrupted" in how:
-        with pytest.raises(KeyboardInterrupt):
-            write()
-    else:
-        with pytest.raises(OutputError, match=r"new\.yaml was written by another process meanwhile: move it away"):
-            write()
-    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("new.yaml", "of the user")]
-
-
-@pytest.mark.parametrize("name", ["new.yaml", f"{'0f' * 16}.yaml"])
-def test_whole_file__deletes_nothing_that_a_process_had_exchanged_when_it_was_killed(tmp_path, monkeypatch, name):
-    path, killed = tmp_path / "out" / name, tmp_path / "killed"
-    path.parent.mkdir()
-    path.write_text("before")
-    (tmp_path / "mine").write_text("mine")
-    exchange = publishing._exchange
-
-    def late(new, place):
-        if not killed.exists():
-            os.replace(tmp_path / "mine", place)
-            exchange(new, place)
-            shutil.copytree(path.parent, killed)
-        else:
-            exchange(new, place)
-
-    monkeypatch.setattr(publishing, "_exchange", late)
-    with pytest.raises(OutputError), whole_file(path) as new:
-        new.write_text("new")
-    monkeypatch.undo()
-    with whole_file(killed / name) as new:
-        new.write_text("new")
-    assert b"mine" in contents(killed).values()
-
-
-def test_whole_file__keeps_two_files_that_appear_one_after_the_other(tmp_path, monkeypatch, caplog):
-    path = tmp_path / "new.yaml"
-    path.write_text("before")
-    for name in ("one", "two"):
-        (tmp_path / name).write_text(name)
-    exchange, others = publishing._exchange, iter([tmp_path / "one", tmp_path / "two"])
-
-    def late(new, place):
-        exchange(next(others), place)
-        exchange(new, place)
-
-    monkeypatch.setattr(publishing, "_exchange", late)
-    with pytest.raises(OutputError, match=r"new\.yaml was written by another process"), whole_file(path) as new:
-        new.write_text("new")
-    assert {"one", "two"} <= {file.read_text() for file in tmp_path.iterdir()}
-    assert path.read_text() == "one"
-    (kept,) = tmp_path.glob("kept-*-new.yaml")
-    assert f"{path} for a moment: it is kept as {kept}" in caplog.text
-
-
-def test_whole_file__deletes_what_a_killed_process_left_and_nothing_else(tmp_path):
-    path, foreign = tmp_path / "a[1].txt", tmp_path / ".a[1].txt-mine"
-    foreign.write_text("mine")
-    code = "import os, sys\nfrom sat_intervals.raster.layers import whole_file\n"
-    code += "with whole_file(sys.argv[1]) as new:\n    new.write_text('half')\n    os._exit(9)"
-    assert subprocess.run([sys.executable, "-c", code, path]).returncode == 9
-    assert len(list(tmp_path.iterdir())) == 2
-    with whole_file(path) as new:
-        new.write_text("whole")
-    assert sorted(tmp_path.iterdir()) == [foreign, path]
-    assert (path.read_text(), foreign.read_text()) == ("whole", "mine")
-
-
-@pytest.mark.parametrize("shape", [(2, 9, 20), (2, 10, 19), (1, 10, 20)])
-def test_reading__names_a_raster_that_one_of_another_size_replaced(tmp_path, shape):
-    """Else it gives fewer pixels than were asked for, which fails somewhere else."""
-
-    def write(count, height, width):
-        kind = {"transform": rasterio.Affine.scale(0.5, -0.5), "dtype": "uint8"}
-        with rasterio.open(tmp_path / "a.tif", "w", "GTiff", width, height, count, **kind) as dataset:
-            dataset.write(np.ones((count, height, width), np.uint8))
-
-    write(2, 10, 20)
-    image, window = open_image(tmp_path / "a.tif", band=2), Window(4, 5, 6, 15)
-    write(*shape)
-    said = rf"a.tif has {shape[0]} x {shape[1]} x {shape[2]} pixels now, .*: another file took its place: rerun"
-    for read in (lambda: read_window(image, window), lambda: read_layers(image.path, window, 2)):
-        with pytest.raises(RunError, match=said):
-            read()

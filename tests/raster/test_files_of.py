@@ -1,0 +1,149 @@
+"""The files that a raster is read from, as GDAL lists them, recursively through virtual rasters."""
+
+import gzip
+import os
+import re
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+import rasterio
+
+from sat_intervals.raster import InputError, files_of, open_image
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+SIZE = 16
+SOURCE = '<SourceFilename relativeToVRT="{}">{}</SourceFilename>'
+WARPED = (
+    f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}" subClass="VRTWarpedDataset"><SRS>EPSG:4326</SRS>'
+    '<GeoTransform>5.4, 0.0125, 0, 43.6, 0, -0.0125</GeoTransform><VRTRasterBand dataType="UInt16" band="1" '
+    'subClass="VRTWarpedRasterBand"/><BlockXSize>16</BlockXSize><BlockYSize>16</BlockYSize><GDALWarpOptions>'
+    '<SourceDataset relativeToVRT="1">image.tif</SourceDataset><Transformer><GenImgProjTransformer>'
+    "<SrcGeoTransform>5.4,0.0125,0,43.6,0,-0.0125</SrcGeoTransform>"
+    "<DstGeoTransform>5.4,0.0125,0,43.6,0,-0.0125</DstGeoTransform>"
+    "<DstInvGeoTransform>-432,80,0,3488,0,-80</DstInvGeoTransform></GenImgProjTransformer></Transformer>"
+    '<BandList><BandMapping src="1" dst="1"/></BandList></GDALWarpOptions></VRTDataset>'
+)
+
+
+def virtual(is_relative, name):
+    """The text of a virtual raster of an image."""
+    source = f"<SimpleSource>{SOURCE.format(is_relative, name)}<SourceBand>1</SourceBand></SimpleSource>"
+    band = f'<VRTRasterBand dataType="UInt16" band="1">{source}</VRTRasterBand>'
+    return f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}">{band}</VRTDataset>'
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name, dtype in (("image.tif", "uint16"), ("mask.tif", "uint8")):
+        with rasterio.open(tmp_path / name, "w", "GTiff", SIZE, SIZE, 1, dtype=dtype) as file:
+            file.write(np.ones((1, SIZE, SIZE), dtype))
+    return tmp_path
+
+
+def zipped(folder, name, *files):
+    with zipfile.ZipFile(folder / f"{name}.zip", "w") as archive:
+        for file in files:
+            archive.write(folder / file, file)
+    return f"/vsizip/{folder}/{name}.zip/{files[0]}"
+
+
+def compressed(folder, file):
+    (folder / f"{file}.gz").write_bytes(gzip.compress((folder / file).read_bytes()))
+    return f"/vsigzip/{folder}/{file}.gz"
+
+
+SOURCES = {
+    "relative": lambda folder: (1, "image.tif"),
+    "absolute": lambda folder: (0, folder / "image.tif"),
+    "lines": lambda folder: (1, "\n  image.tif"),
+    "entity": lambda folder: (1, "image&#46;tif"),
+    "in an archive": lambda folder: (0, zipped(folder, "image", "image.tif")),
+    "compressed": lambda folder: (0, compressed(folder, "image.tif")),
+    "part of a file": lambda folder: (
+        0,
+        f"/vsisubfile/0_{(folder / 'image.tif').stat().st_size},{folder}/image.tif",
+    ),
+}
+FILES = {"in an archive": "image.zip", "compressed": "image.tif.gz"}
+
+
+def local_files(name):
+    """The local files behind the names of a raster's other files."""
+    return {re.sub(r"^/vsi\w+/(\d+_\d+,)?(.*\.(zip|gz)|.*).*", r"\2", file) for file in files_of(name)[1:]}
+
+
+@pytest.mark.parametrize("spelling", SOURCES)
+def test_files_of__a_virtual_raster_have_its_source_in_any_spelling(folder, spelling):
+    (folder / "image.vrt").write_text(virtual(*SOURCES[spelling](folder)))
+    name = str(folder / "image.vrt")
+    assert files_of(name)[0] == name
+    assert local_files(name) == {str(folder / FILES.get(spelling, "image.tif"))}
+
+
+def test_files_of__virtual_rasters_of_virtual_rasters_have_all_sources_and_their_masks(folder):
+    shutil.copy(folder / "mask.tif", folder / "image.tif.msk")
+    (folder / "inner.vrt").write_text(virtual(1, "image.tif"))
+    (folder / "outer.vrt").write_text(virtual(0, folder / "inner.vrt"))
+    names = ["outer.vrt", "image.tif", "image.tif.msk", "inner.vrt"]
+    assert files_of(str(folder / "outer.vrt")) == [str(folder / name) for name in names]
+
+
+def test_files_of__a_virtual_raster_in_an_archive_are_beside_it(folder):
+    (folder / "image.vrt").write_text(virtual(1, "image.tif"))
+    name = zipped(folder, "all", "image.vrt", "image.tif")
+    assert files_of(name) == [name, f"/vsizip/{folder}/all.zip/image.tif"]
+
+
+def test_files_of__a_virtual_raster_behind_a_link_are_beside_its_target(folder):
+    (folder / "below").mkdir()
+    (folder / "below" / "image.vrt").symlink_to("../image.vrt")
+    (folder / "image.vrt").write_text(virtual(1, "image.tif"))
+    _, found = files_of(str(folder / "below" / "image.vrt"))
+    assert os.path.realpath(found) == str(folder / "image.tif")
+
+
+def test_files_of__a_warped_raster_have_its_source(folder):
+    (folder / "warped.vrt").write_text(WARPED)
+    assert files_of(str(folder / "warped.vrt"))[1:] == [str(folder / "image.tif")]
+
+
+def test_files_of__names_with_a_query_and_texts_have_their_source(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    for name in ("vrt://image.tif?bands=1", virtual(1, "image.tif")):
+        assert files_of(name) == [name, "image.tif"]
+
+
+def test_files_of__have_no_overviews_and_statistics(folder):
+    for name in ("image.tif.msk", "image.tif.msk.ovr", "image.tif.ovr"):
+        shutil.copy(folder / "mask.tif", folder / name)
+    (folder / "image.tif.aux.xml").write_text("<PAMDataset/>")
+    assert files_of(str(folder / "image.tif")) == [str(folder / name) for name in ("image.tif", "image.tif.msk")]
+
+
+REFUSED = {
+    "raw": f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}"><VRTRasterBand dataType="Byte" band="1" '
+    'subclass="vrtrawrasterband"><SourceFilename relativeToVRT="1">mask.tif</SourceFilename></VRTRasterBand>'
+    "</VRTDataset>",
+    "processed": '<VRTDataset subClass="VRTProcessedDataset"><Input><SourceFilename relativeToVRT="1">mask.tif'
+    "</SourceFilename></Input><ProcessingSteps><Step><Algorithm>BandAffineCombination</Algorithm><Argument "
+    'name="coefficients_1">0,1</Argument></Step></ProcessingSteps></VRTDataset>',
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_files_of__refuse_a_virtual_raster_that_hides_missing_data(folder, kind):
+    (folder / "inner.vrt").write_text(REFUSED[kind])
+    (folder / "outer.vrt").write_text(virtual(1, "inner.vrt"))
+    for read, name in ((files_of, "inner.vrt"), (files_of, "outer.vrt"), (open_image, "inner.vrt")):
+        with pytest.raises(InputError, match=r"inner\.vrt has a format \(VRT\) in which GDAL does not report missing"):
+            read(str(folder / name))
+
+
+def test_files_of__refuse_a_format_that_hides_missing_data(folder):
+    with rasterio.open(folder / "a.bil", "w", "ENVI", SIZE, SIZE, 1, dtype="uint8") as file:
+        file.write(np.ones((1, SIZE, SIZE), "uint8"))
+    with pytest.raises(InputError, match=r"a\.bil has a format \(ENVI\) in which GDAL .*: convert it with gdal_trans"):
+        open_image(folder / "a.bil")
