@@ -99,65 +99,6 @@ if __name__ == "__main__":
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("kind", ["nbi", "nbc"])
-@pytest.mark.parametrize("how", ["empty", "zeros", "short", "flipped"])
-def test_cached__a_damaged_kernel_is_compiled_again(tmp_path, kind, how):
-    use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(tmp_path))
-    for file in tmp_path.rglob(f"*.{kind}"):
-        content = file.read_bytes()
-        middle = len(content) // 2
-        flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-        damaged = {"empty": b"", "zeros": bytes(len(content)), "short": content[:middle], "flipped": flipped}
-        file.write_bytes(damaged[how])
-    again, after = (use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
-    assert again[:2] == ["0", "1"]
-    assert after[:2] == ["1", "0"]
-
-
-# Another signature of the same kernel.
-OF_SINGLE = """
-import numpy as np
-from sat_intervals.kernels.lattice import interpolate
-interpolate(np.zeros((2, 2, 2, 1), np.float32), np.ones(3), np.zeros(3), np.zeros((2, 2), np.float32))
-"""
-
-
-@pytest.mark.process
-def test_cached__machine_code_of_another_signature_is_not_executed(tmp_path):
-    """Two processes that save at once may leave the index of one with the code of the other."""
-    caches = {name: tmp_path / name for name in ("double", "single")}
-    use_a_kernel("use()", NUMBA_CACHE_DIR=str(caches["double"]))
-    use_a_kernel(OF_SINGLE, NUMBA_CACHE_DIR=str(caches["single"]))
-    (other,) = caches["single"].rglob("*interpolate*.nbc")
-    (own,) = caches["double"].rglob("*interpolate*.nbc")
-    assert own.name == other.name
-    own.write_bytes(other.read_bytes())
-    again, after = (use_a_kernel("print(*use())", NUMBA_CACHE_DIR=str(caches["double"])) for _ in range(2))
-    assert again[:2] == ["0", "1"]
-    assert after[:2] == ["1", "0"]
-
-
-@pytest.mark.process
-def test_kernels_of_others__damaged_ones_of_the_sensor_models_are_compiled_again(tmp_path):
-    pytest.importorskip("shareloc")
-
-    def used():
-        script = "import sat_intervals.heights.sensors\nfrom shareloc.geomodels import rpc\n"
-        script += "stats = rpc.polynomial_equation.stats\nprint(sum(stats.cache_hits.values()), stats.cache_path)"
-        return use_a_kernel(script, NUMBA_CACHE_DIR=str(tmp_path))
-
-    (_, place), files = used(), sorted(tmp_path.rglob("rpc.*.nb?"))
-    assert Path(place).parent == tmp_path / "sat-intervals" / FINGERPRINT
-    assert len(files) > 4
-    for file in files:
-        content = bytearray(file.read_bytes())
-        content[len(content) // 2] ^= 1
-        file.write_bytes(content)
-    assert used() == ["0", place]
-    assert used() == ["1", place]
-
-
-@pytest.mark.process
 def test_kernels_of_others__give_the_same_bytes_when_compiled_and_when_read(tmp_path):
     pytest.importorskip("shareloc")
     script = "import sat_intervals.heights.sensors\nimport numpy as np\nfrom shareloc.geomodels import rpc\n"
@@ -167,14 +108,6 @@ def test_kernels_of_others__give_the_same_bytes_when_compiled_and_when_read(tmp_
     (compiled, before), (read, after) = (use_a_kernel(script, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
     assert (compiled, read) == ("0", "1")
     assert after == before
-
-
-@pytest.mark.process
-def test_cached__goes_on_without_room_for_machine_code(tmp_path):
-    script = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\nprint(*use())"
-    used = use_a_kernel(script, NUMBA_CACHE_DIR=str(tmp_path))
-    assert used[:2] == ["0", "1"]
-    assert not [*tmp_path.rglob("*.tmp*")]
 
 
 @pytest.mark.process
