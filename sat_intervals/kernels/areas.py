@@ -13,18 +13,10 @@ from sat_intervals.kernels.intervals import find_segments, find_touching
 def area_maximum(values, low, depth):
     """Maximum over the low-confidence area around each low-confidence pixel (paper eq. 16).
 
-    Parameters
-    ----------
-    values
-        ``(rows, columns)`` float64; NaN is ignored.
-    low
-        bool of the same shape: low-confidence pixels.
-    depth
-        Largest number of steps between touching segments of an area, as in `regularize`.
-
-    Returns
-    -------
-    ``(rows, columns)`` float64, NaN outside low-confidence pixels and where the area has no value.
+    values: ``(rows, columns)`` float64; NaN is ignored.
+    low: bool of the same shape: low-confidence pixels.
+    depth: largest number of steps between touching segments of an area, as in `regularize`.
+    Returns ``(rows, columns)`` float64, NaN outside low-confidence pixels and where the area has no value.
     """
     start, stop, row_start = find_segments(low)
     above, below = np.zeros((start.size, 2), np.int64), np.zeros((start.size, 2), np.int64)

@@ -12,16 +12,8 @@ from sat_intervals.kernels.compiled import cached
 def component_sizes(disparity, known):
     """Size of the component of each pixel: neighbours along rows and columns that differ by at most one pixel.
 
-    Parameters
-    ----------
-    disparity
-        ``(rows, columns)`` float32.
-    known
-        bool of the same shape: pixels with a disparity.
-
-    Returns
-    -------
-    ``(rows, columns)`` int32, 0 where nothing is known.
+    disparity, known: ``(rows, columns)`` float32, and bool: pixels with a disparity.
+    Returns ``(rows, columns)`` int32, 0 where nothing is known.
     """
     rows, columns = disparity.shape
     sizes = np.zeros((rows, columns), np.int32)

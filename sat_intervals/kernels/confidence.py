@@ -33,14 +33,8 @@ def ambiguity_histogram(ambiguity: np.ndarray, searched: np.ndarray, largest: in
 def percentiles(histogram: np.ndarray) -> tuple[float, float]:
     """1st and 99th percentile of the values ``0 .. n - 1`` of a histogram.
 
-    Parameters
-    ----------
-    histogram
-        ``(n,)`` integers; ``histogram[a]`` pixels have the value ``a``.
-
-    Returns
-    -------
-    ``(p1, p99)``, interpolated as by ``numpy.percentile`` on the values; NaN for an empty histogram.
+    ``histogram[a]`` pixels have the value ``a``.
+    Returns ``(p1, p99)``, interpolated as by ``numpy.percentile`` on the values; NaN for an empty histogram.
     """
     cumulative = np.cumsum(histogram)
     if cumulative.size == 0 or cumulative[-1] == 0:
@@ -63,18 +57,9 @@ def percentiles(histogram: np.ndarray) -> tuple[float, float]:
 def normalize(ambiguity, searched, p1, p99):
     """Confidence in [0, 1] from ambiguity: ``1 - clip((A - p1) / (p99 - p1), 0, 1)``.
 
-    Parameters
-    ----------
-    ambiguity
-        ``(rows, columns)`` uint32.
-    searched
-        bool of the same shape: pixels with a possible candidate.
-    p1, p99
-        Ambiguities that become confidence 1 and 0. Where they are equal, the confidence is 1 for ``A <= p1``, else 0.
-
-    Returns
-    -------
-    ``(rows, columns)`` float32, NaN outside ``searched``.
+    ambiguity, searched: ``(rows, columns)`` uint32, and bool: pixels with a possible candidate.
+    p1, p99: ambiguities of confidence 1 and 0; if they are equal, the confidence is 1 for ``A <= p1``, else 0.
+    Returns ``(rows, columns)`` float32, NaN outside ``searched``.
     """
     rows, columns = ambiguity.shape
     confidence = np.full((rows, columns), np.float32(np.nan))
@@ -96,18 +81,10 @@ def normalize(ambiguity, searched, p1, p99):
 def low_confidence(confidence, threshold, kernel):
     """Pixels whose smallest confidence over ``1 x kernel`` is at most the threshold (paper eq. 12 and 13).
 
-    Parameters
-    ----------
-    confidence
-        ``(rows, columns)`` float32; NaN counts as 1 and is never low.
-    threshold
-        Compared as float32.
-    kernel
-        Length of the minimum filter along the row, in pixels, odd.
-
-    Returns
-    -------
-    ``(rows, columns)`` bool.
+    confidence: ``(rows, columns)`` float32; NaN counts as 1 and is never low.
+    threshold: compared as float32.
+    kernel: length of the minimum filter along the row, in pixels, odd.
+    Returns ``(rows, columns)`` bool.
     """
     rows, columns = confidence.shape
     limit = np.float32(threshold)

@@ -11,14 +11,9 @@ def least_number(coverage: float) -> int:
 def margins(scores: np.ndarray, classes: np.ndarray, count: int, coverage: float) -> np.ndarray:
     """Return the margin of each class: ``(count,)``. Each class has at least `least_number` values.
 
-    Parameters
-    ----------
-    scores
-        ``(n,)``: how far a truth is outside its interval, negative inside: ``max(lower - truth, truth - upper)``.
-    classes
-        ``(n,)`` from 0 to ``count - 1``.
-    coverage
-        Share of the truths to be inside, once both bounds are moved outwards by the margin of their class.
+    scores: ``(n,)``: how far a truth is outside its interval, negative inside: ``max(lower - truth, truth - upper)``.
+    classes: ``(n,)`` from 0 to ``count - 1``.
+    coverage: share of the truths to be inside, once both bounds are moved outwards by the margin of their class.
     """
     found = np.empty(count)
     for kind in range(count):
@@ -33,12 +28,8 @@ def widened(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move both bounds outwards by the margin of their class, or inwards by a negative one, never past the height.
 
-    Parameters
-    ----------
-    height, lower, upper
-        Of any shape, NaN bounds without an interval.
-    limits, margin
-        ``(classes - 1,)`` widths between the classes, ``(classes,)`` margins.
+    height, lower, upper: of any shape, NaN bounds without an interval.
+    limits, margin: ``(classes - 1,)`` widths between the classes, ``(classes,)`` margins.
     """
     own = margin[np.searchsorted(limits, upper - lower, side="right")]
     return np.minimum(lower - own, height), np.maximum(upper + own, height)

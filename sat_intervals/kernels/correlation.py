@@ -59,14 +59,9 @@ def _correlate(left, right, steps, costs, here, there, curves):
 def correlate(left: np.ndarray, right: np.ndarray, costs: np.ndarray) -> None:
     """Fill ``costs`` with ``round(COSINE_STEPS * (1 - cosine))``.
 
-    Parameters
-    ----------
-    left
-        ``(features, rows, columns)`` float32 unit vectors.
-    right
-        ``(features, rows, columns + count - 1)``: ``right[:, r, c + k]`` faces ``left[:, r, c]``.
-    costs
-        ``(rows, columns, size)`` uint8, 0 to 2 COSINE_STEPS; ``size`` is ``count`` padded to whole vectors.
+    left: ``(features, rows, columns)`` float32 unit vectors.
+    right: ``(features, rows, columns + count - 1)``: ``right[:, r, c + k]`` faces ``left[:, r, c]``.
+    costs: ``(rows, columns, size)`` uint8, 0 to 2 COSINE_STEPS; ``size`` is ``count`` padded to whole vectors.
     """
     features, _, columns = left.shape
     size = costs.shape[2] + LANES

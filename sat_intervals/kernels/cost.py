@@ -15,12 +15,8 @@ from sat_intervals.tiling import Window
 class Codes(NamedTuple):
     """Census codes of a patch.
 
-    Attributes
-    ----------
-    words
-        ``(words, rows, columns)``, uint32 (windows 3 and 5) or uint64 (one word up to window 7, two above).
-    state
-        ``(rows, columns)`` uint8: the union of the states of the window's pixels, 0 = usable.
+    words: ``(words, rows, columns)``, uint32 (windows 3 and 5) or uint64 (one word up to window 7, two above).
+    state: ``(rows, columns)`` uint8: the union of the states of the window's pixels, 0 = usable.
     """
 
     words: np.ndarray
@@ -30,17 +26,12 @@ class Codes(NamedTuple):
 class Costs(NamedTuple):
     """Matching costs of a patch: Census codes to compare, or precomputed costs.
 
-    Attributes
-    ----------
-    left, right
-        Words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)``, padded after the last column
-        by whole vectors; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None. ``size``
-        is the count padded to a multiple of 32 lanes, `padded_to_lanes`; lanes beyond the count may hold anything.
-        Kernels are compiled for either form.
-    left_state
-        ``(rows, columns)`` uint8, 0 = usable window.
-    right_state
-        ``(rows, columns + count - 1)`` uint8: ``right_state[r, c + k]`` faces left ``(r, c)`` at index k.
+    left, right: words of Census codes, ``(words, rows, columns)`` and ``(words, rows, width)``, padded after the last
+        column by whole vectors; or ``left`` holds the costs, ``(rows, columns, size)`` uint8, and ``right`` is None.
+        ``size`` is the count padded to a multiple of 32 lanes, `padded_to_lanes`; lanes beyond the count may hold
+        anything. Kernels are compiled for either form.
+    left_state: ``(rows, columns)`` uint8, 0 = usable window.
+    right_state: ``(rows, columns + count - 1)`` uint8: ``right_state[r, c + k]`` faces left ``(r, c)`` at index k.
     """
 
     left: np.ndarray
@@ -129,19 +120,10 @@ def window_state(state: np.ndarray, radius: int) -> np.ndarray:
 def census(pixels: np.ndarray, state: np.ndarray, window: int) -> Codes:
     """Census codes: one bit per neighbour, set where the neighbour is greater than the centre.
 
-    Parameters
-    ----------
-    pixels
-        ``(rows + 2 R, columns + 2 R)`` float32 or float64 with ``R = window // 2``, finite everywhere.
-    state
-        uint8 of the same shape; 0 = usable.
-    window
-        Side of the square window in pixels, odd, 3 to 11.
-
-    Returns
-    -------
-    Codes
-        of ``(rows, columns)`` pixels.
+    pixels: ``(rows + 2 R, columns + 2 R)`` float32 or float64 with ``R = window // 2``, finite everywhere.
+    state: uint8 of the same shape; 0 = usable.
+    window: side of the square window in pixels, odd, 3 to 11.
+    Returns the codes of ``(rows, columns)`` pixels.
     """
     radius = window // 2
     shape = pixels.shape[0] - 2 * radius, pixels.shape[1] - 2 * radius
@@ -168,16 +150,10 @@ def _matching_costs(left, right, r, c, k):
 class Candidates(NamedTuple):
     """Candidates of a row of pixels.
 
-    Attributes
-    ----------
-    costs
-        Costs of all candidates, as if all were possible.
-    barrier
-        ``(columns + size,)`` uint16: ``barrier[c + k]`` is the cost of an impossible candidate, or 0.
-    beyond
-        ``(cells, size)`` uint16: 0 in the search range of a cell, above every cost before and after it.
-    walls
-        ``(columns,)`` int64: where the row of ``beyond`` that applies to each pixel begins in ``beyond.ravel()``.
+    costs: those of all candidates, as if all were possible.
+    barrier: ``(columns + size,)`` uint16: ``barrier[c + k]`` is the cost of an impossible candidate, or 0.
+    beyond: ``(cells, size)`` uint16: 0 in the search range of a cell, above every cost before and after it.
+    walls: ``(columns,)`` int64: where the row of ``beyond`` that applies to each pixel begins in ``beyond.ravel()``.
     """
 
     costs: Costs
@@ -189,14 +165,9 @@ class Candidates(NamedTuple):
 class Cells(NamedTuple):
     """Search ranges of the cells of a patch.
 
-    Attributes
-    ----------
-    first, last
-        ``(rows, columns)`` int64: first and last candidate k of each cell.
-    height, width
-        Pixels of a cell.
-    row, column
-        First pixel of the patch, counted from the first pixel of the first cell.
+    first, last: ``(rows, columns)`` int64: first and last candidate k of each cell.
+    height, width: pixels of a cell.
+    row, column: first pixel of the patch, counted from the first pixel of the first cell.
     """
 
     first: np.ndarray
@@ -215,12 +186,8 @@ def one_cell(rows: int, columns: int, count: int) -> Cells:
 class Ranges(NamedTuple):
     """Search range of each pixel of a row, all ``(columns,)`` int64.
 
-    Attributes
-    ----------
-    first, last
-        First and last candidate.
-    start, stop
-        The whole vectors ``[start, stop)`` that contain them; others are walls and never computed.
+    first, last: first and last candidate.
+    start, stop: the whole vectors ``[start, stop)`` that contain them; others are walls and never computed.
     """
 
     first: np.ndarray

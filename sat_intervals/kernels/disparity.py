@@ -31,19 +31,11 @@ def vfit(curve, k, count):
 def cross_check(winner, right_winner, minimum, tolerance):
     """Reject left winners that the winner of the right pixel they point to does not confirm.
 
-    Parameters
-    ----------
-    winner
-        ``(rows, columns)`` int16 disparities, NO_DISPARITY where there is none.
-    right_winner
-        ``(rows, columns + count - 1)`` int16: ``right_winner[r, c + k]`` is the winner, as a left disparity, of
-        the right pixel that faces ``(r, c)`` at index ``k``; NO_DISPARITY where there is none.
-    minimum, tolerance
-        First disparity of the search range; largest accepted difference in pixels.
-
-    Returns
-    -------
-    ``(rows, columns)`` uint16: 0, OCCLUSION, or MISMATCH where some right pixel of the range points back.
+    winner: ``(rows, columns)`` int16 disparities, NO_DISPARITY where there is none.
+    right_winner: ``(rows, columns + count - 1)`` int16: ``right_winner[r, c + k]`` is the winner, as a left disparity,
+        of the right pixel that faces ``(r, c)`` at index ``k``; NO_DISPARITY where there is none.
+    minimum, tolerance: first disparity of the search range; largest accepted difference in pixels.
+    Returns ``(rows, columns)`` uint16: 0, OCCLUSION, or MISMATCH where some right pixel of the range points back.
     """
     rows, columns = winner.shape
     flags = np.zeros((rows, columns), np.uint16)
@@ -170,18 +162,10 @@ def median(values, kept, size):
 
     Applied separately to disparity and bounds, it keeps their order (paper eq. 10 and 11).
 
-    Parameters
-    ----------
-    values
-        ``(rows, columns)``, float32, or integers that float32 represents exactly; not NaN where kept.
-    kept
-        bool of the same shape.
-    size
-        Side of the square window in pixels, odd. Outside the array nothing is kept.
-
-    Returns
-    -------
-    ``(rows, columns)`` float32; for an even number of pixels the mean of the middle two.
+    values: ``(rows, columns)``, float32, or integers that float32 represents exactly; not NaN where kept.
+    kept: bool of the same shape.
+    size: side of the square window in pixels, odd. Outside the array nothing is kept.
+    Returns ``(rows, columns)`` float32; for an even number of pixels the mean of the middle two.
     """
     if size == 3:
         return _median_3(values, kept)

@@ -237,28 +237,16 @@ def regularize(lower, upper, low, minimum, depth, quantile, rows, per_pixel):
     A segment's area is made of the segments reached in at most ``depth`` steps between segments of adjacent rows
     that share a column.
 
-    Parameters
-    ----------
-    lower, upper
-        ``(rows, columns)`` float32 bounds in pixels.
-    low
-        bool of the same shape: low-confidence pixels.
-    minimum
-        First disparity of the search range. Steps are counted from it, not from the smallest bound of these rows, so
-        that the rounding of a quantile does not depend on the other rows.
-    depth
-        Largest number of steps, and so of rows that an area reaches above and below.
-    quantile
-        Of the upper bounds; the lower bounds take ``1 - quantile``.
-    rows
-        ``(first, last)``: the rows ``[first, last)`` are returned; areas may reach the others.
-    per_pixel
-        Steps per pixel of the histograms that quantiles come from; bounds are rounded outwards to them. Bounds in
-        whole pixels, and medians of them, are multiples of a half. All bounds are within ``65535 / per_pixel`` pixels.
-
-    Returns
-    -------
-    ``(lower, upper)``, float32 of shape ``(last - first, columns)``; pixels that are not low keep their bounds.
+    lower, upper: ``(rows, columns)`` float32 bounds in pixels.
+    low: bool of the same shape: low-confidence pixels.
+    minimum: first disparity of the search range. Steps are counted from it, not from the smallest bound of these rows,
+        so that the rounding of a quantile does not depend on the other rows.
+    depth: largest number of steps, and so of rows that an area reaches above and below.
+    quantile: of the upper bounds; the lower bounds take ``1 - quantile``.
+    rows: ``(first, last)``: the rows ``[first, last)`` are returned; areas may reach the others.
+    per_pixel: steps per pixel of the histograms of bounds, which are rounded outwards to them; 2 if bounds are whole
+        pixels, whose medians are multiples of a half. All bounds are within ``65535 / per_pixel`` pixels.
+    Returns ``(lower, upper)``, float32 of shape ``(last - first, columns)``; pixels that are not low keep their bounds.
     """
     first, last = rows
     start, stop, row_start = find_segments(low)

@@ -12,20 +12,11 @@ from sat_intervals.kernels.compiled import cached
 def interpolate(lattice, spacing, first, disparity):
     """Interpolate the values of a lattice at the disparities of pixels.
 
-    Parameters
-    ----------
-    lattice
-        ``(rows, columns, disparities, values)`` float64 at the nodes, at least two along every axis.
-    spacing
-        Pixels between nodes along rows, columns and disparities.
-    first
-        Row, column and disparity of the first node; the first pixel is ``0, 0``.
-    disparity
-        ``(rows, columns)`` in pixels, NaN where there is none.
-
-    Returns
-    -------
-    ``(values, rows, columns)`` float64, NaN where there is no disparity.
+    lattice: ``(rows, columns, disparities, values)`` float64 at the nodes, at least two along every axis.
+    spacing: pixels between nodes along rows, columns and disparities.
+    first: row, column and disparity of the first node; the first pixel is ``0, 0``.
+    disparity: ``(rows, columns)`` in pixels, NaN where there is none.
+    Returns ``(values, rows, columns)`` float64, NaN where there is no disparity.
     """
     rows, columns = disparity.shape
     values = lattice.shape[3]

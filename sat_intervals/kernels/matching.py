@@ -19,22 +19,14 @@ from sat_intervals.tiling import Window
 class Raw(NamedTuple):
     """Products read from single curves, all ``(rows, columns)``.
 
-    Attributes
-    ----------
-    winner, lower, upper
-        int16 disparities in pixels, NO_DISPARITY for none. Sub-pixel bounds are uint16, in steps above the first
-        disparity of the whole search range, without meaning where there is no winner.
-    disparity
-        float32 refined disparity in pixels, NaN for none.
-    cost
-        uint16 aggregated cost of the winner, IMPOSSIBLE_COST for none.
-    ambiguity
-        uint32, 0 where there is no candidate.
-    validity
-        uint16 flags, without those of the left image's mask, cross-checking and regularisation.
-    lower_low, upper_low
-        Sub-pixel bounds at the level of low-confidence pixels; those at the other level are ``lower`` and ``upper``.
-        ``(0, 0)`` without a second level.
+    winner, lower, upper: int16 disparities in pixels, NO_DISPARITY for none. Sub-pixel bounds are uint16, in steps
+        above the first disparity of the whole search range, without meaning where there is no winner.
+    disparity: float32 refined disparity in pixels, NaN for none.
+    cost: uint16 aggregated cost of the winner, IMPOSSIBLE_COST for none.
+    ambiguity: uint32, 0 where there is no candidate.
+    validity: uint16 flags, without those of the left image's mask, cross-checking and regularisation.
+    lower_low, upper_low: sub-pixel bounds at the level of low-confidence pixels; those at the other level are ``lower``
+        and ``upper``. ``(0, 0)`` without a second level.
     """
 
     winner: np.ndarray
@@ -55,12 +47,8 @@ BOUNDS = ("lower", "upper", "lower_low", "upper_low")
 class RightView(NamedTuple):
     """Winners of right pixels among the left pixels of a core; ``[r, c + k]`` faces left ``(r, c)`` at k.
 
-    Attributes
-    ----------
-    cost
-        ``(rows, columns + count - 1)`` uint16: the smallest aggregated cost, IMPOSSIBLE_COST for none.
-    winner
-        int16 of the same shape: its left disparity in pixels, the largest at ties; NO_DISPARITY for none.
+    cost: ``(rows, columns + count - 1)`` uint16: the smallest aggregated cost, IMPOSSIBLE_COST for none.
+    winner: int16 of the same shape: its left disparity in pixels, the largest at ties; NO_DISPARITY for none.
     """
 
     cost: np.ndarray
@@ -70,14 +58,8 @@ class RightView(NamedTuple):
 class Matched(NamedTuple):
     """What `match_costs` returns.
 
-    Attributes
-    ----------
-    raw
-        Products of the wanted pixels.
-    right
-        Winners of the right pixels that face the core.
-    leaving
-        States of the last of WAVEFRONTS where it leaves the patch, as `trace` returns them; empty without borders.
+    raw, right: products of the wanted pixels, winners of the right pixels that face the core.
+    leaving: states of the last of WAVEFRONTS where it leaves the patch, as `trace` returns them; empty without borders.
     """
 
     raw: Raw
@@ -149,26 +131,13 @@ def match_costs(
 ) -> Matched:
     """Match a patch: matching costs in, raw products and the right view's winners out.
 
-    Parameters
-    ----------
-    costs
-        Matching costs of ``(rows, columns)`` pixels.
-    settings
-        See `Settings`; 8 times the sum of the largest cost and the largest P2 is below IMPOSSIBLE_COST.
-    output
-        Pixels of the patch whose products are returned; the others only support them.
-    core
-        Left pixels that make the right view; by default those of ``output``.
-    gradients
-        Gradients that P1 and P2 follow; by default P1 and P2 are those of ``settings``.
-    borders
-        Path states around the patch; by default every path starts at the edge of the patch.
-    cells
-        Search ranges of the pixels within that of ``settings``; by default all search all of it.
-
-    Returns
-    -------
-    ``raw`` of the shape of ``output``, ``right`` of ``core.height`` rows and ``core.width + count - 1`` columns.
+    settings: 8 times the sum of the largest cost and the largest P2 is below IMPOSSIBLE_COST.
+    output: pixels of the patch whose products are returned; the others only support them.
+    core: left pixels that make the right view; by default those of ``output``.
+    gradients: those that P1 and P2 follow; by default P1 and P2 are those of ``settings``.
+    borders: path states around the patch; by default every path starts at the edge of the patch.
+    cells: search ranges of the pixels within that of ``settings``; by default all search all of it.
+    Returns ``raw`` of the shape of ``output``, ``right`` of ``(core.height, core.width + count - 1)``.
     """
     return _sweep(costs, gradients, settings, output, core or output, False, borders, cells)[0]
 

@@ -21,21 +21,13 @@ EDGES, NEGATIVE, INVERSE = range(3)
 class Rule(NamedTuple):
     """How penalties follow gradients; penalties are integers in units of the matching cost.
 
-    Attributes
-    ----------
-    kind
-        EDGES, NEGATIVE or INVERSE.
-    p1, p2
-        ``(4, 3)`` uint16, by path and by the number of images with an edge. NEGATIVE and INVERSE use only the first
+    kind: EDGES, NEGATIVE or INVERSE.
+    p1, p2: ``(4, 3)`` uint16, by path and by the number of images with an edge. NEGATIVE and INVERSE use only the first
         column, p2 as the minimum of P2.
-    left_edge, right_edge
-        EDGES: gradients above these are edges, in grey values.
-    facing
-        EDGES: whether the right gradient is taken at the facing pixel, or at the left pixel's own column.
-    own_column
-        ``x - c`` of the right pixel in the left pixel's own column.
-    alpha, beta, gamma
-        P2 is ``gamma - alpha * gradient``, or ``gamma + alpha / (gradient + beta)``, and at least p2.
+    left_edge, right_edge: EDGES: gradients above these are edges, in grey values.
+    facing: EDGES: whether the right gradient is taken at the facing pixel, or at the left pixel's own column.
+    own_column: ``x - c`` of the right pixel in the left pixel's own column.
+    alpha, beta, gamma: P2 is ``gamma - alpha * gradient``, or ``gamma + alpha / (gradient + beta)``, and at least p2.
     """
 
     kind: int
@@ -53,14 +45,8 @@ class Rule(NamedTuple):
 class Gradients(NamedTuple):
     """A rule and the images of a patch that it applies to.
 
-    Attributes
-    ----------
-    left
-        ``(rows, columns)`` float32 grey values.
-    right
-        ``(rows, columns + count - 1)`` float32: ``right[r, c + k]`` faces ``left[r, c]``.
-    rule
-        How penalties follow the gradients of both.
+    left: ``(rows, columns)`` float32 grey values.
+    right: ``(rows, columns + count - 1)`` float32: ``right[r, c + k]`` faces ``left[r, c]``.
     """
 
     left: np.ndarray
@@ -71,12 +57,8 @@ class Gradients(NamedTuple):
 class RowPenalties(NamedTuple):
     """Gradient-dependent penalties of a row of pixels.
 
-    Attributes
-    ----------
-    p1, p2
-        ``(2, 4, columns)`` uint16, by path: without and with an edge in the right image.
-    edges
-        ``(4, columns + size)`` uint16, by path: 65535 where the right pixel ``x`` has an edge.
+    p1, p2: ``(2, 4, columns)`` uint16, by path: without and with an edge in the right image.
+    edges: ``(4, columns + size)`` uint16, by path: 65535 where the right pixel ``x`` has an edge.
     """
 
     p1: np.ndarray

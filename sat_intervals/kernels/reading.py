@@ -114,12 +114,8 @@ def _interval(curve, span, lowest, cut_level, refine):
 class RightPixels(NamedTuple):
     """Best candidates so far of the right pixels that face the left pixels of ``core``.
 
-    Attributes
-    ----------
-    indices
-        ``(size,)`` uint16: 0, 1, ...
-    cost, best
-        ``(rows, columns + size)`` uint16: the smallest cost so far, and its index k.
+    indices: ``(size,)`` uint16: 0, 1, ...
+    cost, best: ``(rows, columns + size)`` uint16: the smallest cost so far, and its index k.
     """
 
     core: Rectangle

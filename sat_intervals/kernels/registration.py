@@ -38,18 +38,11 @@ _DIRECTIONS = np.array([[1.0, 0.0], [0.0, 1.0], [0.7071, 0.7071], [0.7071, -0.70
 class Blocks(NamedTuple):
     """Heights at points, and surfaces of blocks of the ground.
 
-    Attributes
-    ----------
-    surface
-        ``(blocks, rows, columns)`` heights, NaN where unknown; north up.
-    cell
-        Side of a cell in metres.
-    block, x, y
-        ``(n,)``: the block of each point, and its column and row there; cell centres are integers.
-    height
-        ``(n,)`` metres.
-    moves
-        +1 if the surface is to be moved, -1 if the points are.
+    surface: ``(blocks, rows, columns)`` heights, NaN where unknown; north up.
+    cell: side of a cell in metres.
+    block, x, y: ``(n,)``: the block of each point, and its column and row there; cell centres are integers.
+    height: ``(n,)`` metres.
+    moves: +1 if the surface is to be moved, -1 if the points are.
     """
 
     surface: np.ndarray
@@ -64,16 +57,9 @@ class Blocks(NamedTuple):
 class Registration(NamedTuple):
     """A shift in metres, easting, northing and height, to be added to what moves.
 
-    Attributes
-    ----------
-    shift, deviation
-        ``(3,)``: the shift and its standard deviation; without a horizontal part, it is 0 with deviation NaN.
-    is_horizontal
-        Whether there is a horizontal part.
-    used
-        Points used.
-    before, after
-        Differences of what stands still - what moves, of all points, without and with the shift.
+    shift, deviation: ``(3,)``, with the standard deviation; without a horizontal part, 0 with deviation NaN.
+    used: number of points used.
+    before, after: differences of what stands still - what moves, of all points, without and with the shift.
     """
 
     shift: np.ndarray

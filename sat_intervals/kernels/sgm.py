@@ -37,14 +37,9 @@ WALL = 32768
 class Paths(NamedTuple):
     """State of the paths. A path that starts at its next pixel has zeros in both arrays, which makes ``L = C``.
 
-    Attributes
-    ----------
-    curves
-        ``(slots, size)`` uint16: L at the last pixel of each path.
-    lowest
-        ``(slots,)`` uint16: its minimum.
-    spans
-        ``(slots, 2)`` int64: the whole vectors ``[start, stop)`` of the curve that are not all walls; None if every
+    curves: ``(slots, size)`` uint16: L at the last pixel of each path.
+    lowest: ``(slots,)`` uint16: its minimum.
+    spans: ``(slots, 2)`` int64: the whole vectors ``[start, stop)`` of the curve that are not all walls; None if every
         pixel searches all of them.
     """
 
@@ -232,12 +227,8 @@ LAST, LAST_WAVE = 3, WAVEFRONTS[3][1]
 class Ring(NamedTuple):
     """Path states of one wavefront on the pixels around a tile. Empty arrays: no neighbour, so paths start.
 
-    Attributes
-    ----------
-    column
-        ``(rows, 2, size)`` uint16: states beside each row of the tile, in the column that the wavefront comes from.
-    row
-        ``(columns, 2, size)`` uint16: states in the row that the wavefront comes from, for each column of the patch.
+    column: ``(rows, 2, size)`` uint16: states beside each row of the tile, in the column that the wavefront comes from.
+    row: ``(columns, 2, size)`` uint16: states in the row that the wavefront comes from, for each column of the patch.
     """
 
     column: np.ndarray
@@ -247,12 +238,8 @@ class Ring(NamedTuple):
 class Edge(NamedTuple):
     """Path states of one wavefront on the last pixels of a tile, which it hands on; empty if nobody takes them over.
 
-    Attributes
-    ----------
-    column
-        ``(rows, 2, size)`` uint16: states in the column that the wavefront goes to, for each row of the tile.
-    row
-        ``(columns, 2, size)`` uint16: states in the row that it goes to, for each column of the tile.
+    column: ``(rows, 2, size)`` uint16: states in the column that the wavefront goes to, for each row of the tile.
+    row: ``(columns, 2, size)`` uint16: states in the row that it goes to, for each column of the tile.
     """
 
     column: np.ndarray
@@ -262,12 +249,8 @@ class Edge(NamedTuple):
 class Borders(NamedTuple):
     """Path states around the pixels of a patch that are computed.
 
-    Attributes
-    ----------
-    inside
-        These pixels. The patch has one pixel more on each side that has a neighbour.
-    rings
-        By wavefront.
+    inside: these pixels. The patch has one pixel more on each side that has a neighbour.
+    rings: by wavefront.
     """
 
     inside: Window

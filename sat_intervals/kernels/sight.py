@@ -67,28 +67,15 @@ def tops(surface):
 def seen_disparities(surface, top, lattice, spacing, first, shape, steepest):
     """Return the disparity at which the line of sight of each pixel meets a surface first, coming from the sensor.
 
-    Parameters
-    ----------
-    surface
-        ``(rows, columns)`` heights, at least 2 x 2, NaN where unknown; bilinear between cells.
-    top
-        Its `tops`.
-    lattice
-        ``(rows, columns, disparities, 3)`` float64: x, y (cells; centres are integers) and height of the points of
+    surface: ``(rows, columns)`` heights, at least 2 x 2, NaN where unknown; bilinear between cells.
+    top: its `tops`.
+    lattice: ``(rows, columns, disparities, 3)`` float64: x, y (cells; centres are integers) and height of the points of
         pixels at disparities, in order of falling height.
-    spacing
-        Pixels between nodes along rows and columns, and the signed step of the disparities.
-    first
-        Row and column of the first node, of the first pixel ``0, 0``, and the disparity of the first node.
-    shape
-        Rows and columns of the pixels.
-    steepest
-        Four neighbouring heights that differ by more than this are a wall, whose place is known to a cell only. Lines
-        of sight that meet it, or pass between its heights, have no disparity.
-
-    Returns
-    -------
-    ``shape`` float64. NaN where the line of sight meets nothing, a wall, or disappears under unknown heights.
+    spacing: pixels between nodes along rows and columns, and the signed step of the disparities.
+    first: row and column of the first node, of the first pixel ``0, 0``, and the disparity of the first node.
+    steepest: four neighbouring heights that differ by more than this are a wall, whose place is known to a cell only.
+        Lines of sight that meet it, or pass between its heights, have no disparity.
+    Returns ``shape`` float64, NaN where the line of sight meets nothing, a wall, or disappears under unknown heights.
     """
     rows, columns = shape
     nodes = lattice.shape[2]

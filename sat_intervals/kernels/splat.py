@@ -20,20 +20,13 @@ def empty_cells(rows: int, columns: int) -> np.ndarray:
 
 @cached
 def splat(column, row, height, lower, upper, confidence, radius, cells):
-    """Add points to the cells they fall in and to all cells whose centre is within a radius.
+    """Add points to the cells they fall in and to all cells whose centre is within ``radius``, in cells.
 
     The weight of a point at a distance of ``d`` cells is ``exp(-d^2 / 2)``, constant from 30 cells on.
 
-    Parameters
-    ----------
-    column, row
-        ``(n,)`` positions in cells from the upper left corner of the first cell, whose centre is at 0.5, 0.5.
-    height, lower, upper, confidence
-        ``(n,)``; points of NaN height and NaN bounds are ignored.
-    radius
-        Radius in cells.
-    cells
-        ``(9, rows, columns)`` float64, updated: sums of weights and of weighted height, confidence, lower and upper
+    column, row: ``(n,)`` positions in cells from the upper left corner of the first cell, whose centre is at 0.5, 0.5.
+    height, lower, upper, confidence: ``(n,)``; points of NaN height and NaN bounds are ignored.
+    cells: ``(9, rows, columns)`` float64, updated: sums of weights and of weighted height, confidence, lower and upper
         bound; the smallest lower and the largest upper bound; the number of points; the sum of the weights of points
         with bounds.
     """
@@ -70,17 +63,8 @@ MEDIAN, NEAREST, AGREEING = range(3)
 def reaching(column, row, radius, rows, columns):
     """Return which points reach each cell, by the rule of `splat`.
 
-    Parameters
-    ----------
-    column, row, radius
-        As in `splat`.
-    rows, columns
-        Size of the grid.
-
-    Returns
-    -------
-    ``starts (rows * columns + 1,)`` and ``points``: those of cell ``i * columns + j`` are ``points[starts[cell] :
-    starts[cell + 1]]``, in their order.
+    ``rows`` and ``columns`` are the size of the grid. Returns ``starts (rows * columns + 1,)`` and ``points``: those of
+    cell ``i * columns + j`` are ``points[starts[cell] : starts[cell + 1]]``, in their order.
     """
     starts = np.zeros(rows * columns + 1, np.int64)
     points = np.empty(0, np.int32)
@@ -112,14 +96,9 @@ def reaching(column, row, radius, rows, columns):
 def cell_bounds(starts, points, height, lower, upper, middle, how):
     """Return bounds of each cell from those of its points, see `reaching`: ``(2, cells)``, NaN without any.
 
-    Parameters
-    ----------
-    height, lower, upper
-        ``(n,)`` of the points, without NaN.
-    middle
-        ``(cells,)``, the height of each cell.
-    how
-        MEDIAN of the bounds; bounds of the point NEAREST to the cell's height, the first of several; AGREEING: the
+    height, lower, upper: ``(n,)`` of the points, without NaN.
+    middle: ``(cells,)``, the height of each cell.
+    how: MEDIAN of the bounds; bounds of the point NEAREST to the cell's height, the first of several; AGREEING: the
         intersection of the largest number of intervals that meet, the lowest of several.
     """
     bounds = np.full((2, middle.size), np.nan)

@@ -62,26 +62,16 @@ from sat_intervals.tiling import Window
 class Settings(NamedTuple):
     """Settings in the form that the kernels take.
 
-    Attributes
-    ----------
-    minimum, count
-        First disparity of the search range and number of disparities.
-    impossible
-        Matching cost of an impossible candidate inside SGM, above all possible ones.
-    p1, p2, regularized
-        Constant SGM penalties, and whether SGM runs; without it the aggregated cost is the matching cost.
-    cut_level
-        ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
-    high, low, steps
-        Levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1: one level.
-        ``steps`` 0: bounds in whole pixels.
-    weights
-        uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
-    refine
-        Whether winners are refined, and bounds extended by one for it.
-    offset, total
-        First disparity, and number of disparities, of the whole search range that this one is a part of: ``minimum -
-        offset`` is the first. 0: this is the whole range.
+    minimum, count: first disparity of the search range and number of disparities.
+    impossible: matching cost of an impossible candidate inside SGM, above all possible ones.
+    p1, p2, regularized: constant SGM penalties, and whether SGM runs; else the aggregated cost is the matching cost.
+    cut_level: ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
+    high, low, steps: levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1:
+        one level. ``steps`` 0: bounds in whole pixels.
+    weights: uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
+    refine: whether winners are refined, and bounds extended by one for it.
+    offset, total: first disparity, and number of disparities, of the whole search range that this one is a part of:
+        ``minimum - offset`` is the first. 0: this is the whole range.
     """
 
     minimum: int
@@ -103,14 +93,9 @@ class Settings(NamedTuple):
 class Volume(NamedTuple):
     """Sums of L of the wanted pixels, each with the vectors that it searches.
 
-    Attributes
-    ----------
-    sums
-        uint16, one after another by row, column and candidate.
-    rows
-        ``(rows + 1,)`` int64: where each row begins.
-    places
-        ``(columns,)`` int64: where the candidate 0 of each pixel of the row is, or would be if it were searched.
+    sums: uint16, one after another by row, column and candidate.
+    rows: ``(rows + 1,)`` int64: where each row begins.
+    places: ``(columns,)`` int64: where the candidate 0 of each pixel of the row is, or would be if it were searched.
     """
 
     sums: np.ndarray
@@ -121,24 +106,14 @@ class Volume(NamedTuple):
 class Buffers(NamedTuple):
     """Inputs of both sweeps, and buffers for the current row, paths and curve.
 
-    Attributes
-    ----------
-    ranges
-        Those of the pixels of the row; None if all pixels search all candidates: kernels are compiled for either form.
-    usable
-        ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
-    possible
-        ``(columns,)`` int64: number of possible candidates of each pixel of the row.
-    curve, opened
-        ``(size,)`` uint16: buffer of one curve; ``(2,)`` int64: its vectors that are in use, None if all are.
-    inside
-        Pixels whose paths are computed; those of the pixels around them come from ``rings``.
-    rings
-        Rings of the two waves of the sweep.
-    leaving
-        States that leave the pixels ``inside``, to fill; empty if nobody takes them over.
-    down
-        Direction of the sweep. As a constant argument of `_enter_row` it would be compiled for each direction.
+    ranges: of the pixels of the row; None if all search all candidates: kernels are compiled for either form.
+    usable: ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
+    possible: ``(columns,)`` int64: number of possible candidates of each pixel of the row.
+    curve, opened: ``(size,)`` uint16: one curve; ``(2,)`` int64: its vectors that are in use, None if all are.
+    inside: pixels whose paths are computed; those of the pixels around them come from ``rings``.
+    rings: those of the two waves of the sweep.
+    leaving: states that leave the pixels ``inside``, to fill; empty if nobody takes them over.
+    down: direction of the sweep. As a constant argument of `_enter_row` it would be compiled for each direction.
     """
 
     candidates: Candidates

@@ -92,22 +92,9 @@ def trace_area(
     config: Config,
     ranges: LocalRanges | None = None,
 ) -> Edge:
-    """Path states that a tile hands on in a wavefront.
+    """Path states that a tile hands on in a wavefront, an index of WAVEFRONTS.
 
-    Parameters
-    ----------
-    cost
-        Of the `frame_area`.
-    frame
-        Of the tile in its view.
-    borders
-        States that it takes over, see `borders_of`.
-    wavefront
-        Index of WAVEFRONTS.
-    config
-        Settings.
-    ranges
-        Local search ranges; by default all pixels search the whole range.
+    ``cost`` is that of the `frame_area`, ``borders`` are the states that the tile takes over, see `borders_of`.
     """
     settings, cells = patch_settings(frame_area(frame, config).base, config, ranges)
     settings = mirrored_settings(settings) if frame.mirrored else settings

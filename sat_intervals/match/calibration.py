@@ -21,12 +21,8 @@ _SAME_SCORE = 1.02
 class Pool(NamedTuple):
     """Several measurements together.
 
-    Attributes
-    ----------
-    table
-        Weighted sums ``(rungs, schemes, fields)``.
-    pixels
-        Number of pixels of high and of low confidence.
+    table: weighted sums ``(rungs, schemes, fields)``.
+    pixels: number of pixels of high and of low confidence.
     """
 
     table: np.ndarray
@@ -48,9 +44,7 @@ def choose(pool: Pool, levels: np.ndarray, coverage: float) -> tuple[Levels, lis
     confidence that of low confidence without regularisation, low confidence that of high with the usual quantile. If
     both have few, each keeps its own.
 
-    Returns
-    -------
-    The levels, and what a reader must know: a class with few pixels, or a coverage that no level reaches.
+    Returns the levels, and what a reader must know: a class with few pixels, or a coverage that no level reaches.
     """
     (table, pixels), notes = pool, []
     needed = ceil(max(200, 10 / (1 - coverage)) - 1e-9)

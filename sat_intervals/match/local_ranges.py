@@ -3,13 +3,11 @@
 import base64
 import zlib
 from dataclasses import dataclass
-from operator import index
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.config import Config, MccnnSgm
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.tiling import Window
 
@@ -18,12 +16,8 @@ from sat_intervals.tiling import Window
 class LocalRanges:
     """Search ranges of square cells, counted from the first pixel of the left image.
 
-    Attributes
-    ----------
-    minimum, maximum
-        ``(rows, columns)`` int16: first and last disparity of each cell in pixels; the cells cover the image.
-    height, width
-        Pixels of a cell.
+    minimum, maximum: ``(rows, columns)`` int16: first and last disparity of each cell in pixels; they cover the image.
+    height, width: pixels of a cell.
     """
 
     minimum: np.ndarray
@@ -74,20 +68,11 @@ class LocalRanges:
 
     @classmethod
     def of_report(cls, report: dict[str, Any]) -> "LocalRanges":
-        """Read the mapping that `report` makes.
-
-        Raises
-        ------
-        SatIntervalsError
-            It is damaged.
-        """
-        try:
-            rows, columns, *sides = (index(report[name]) for name in ("rows", "columns", "height", "width"))
-            bounds = (zlib.decompress(base64.b64decode(report[name])) for name in ("minimum", "maximum"))
-            minimum, maximum = (np.frombuffer(bound, "<i2").astype(np.int16).reshape(rows, columns) for bound in bounds)
-        except (ValueError, LookupError, TypeError, zlib.error) as error:
-            raise SatIntervalsError("the local ranges of the run are damaged: rerun match with --overwrite") from error
-        return cls(minimum, maximum, *sides)
+        """Read the mapping that `report` makes."""
+        rows, columns = report["rows"], report["columns"]
+        packed = (zlib.decompress(base64.b64decode(report[name])) for name in ("minimum", "maximum"))
+        minimum, maximum = (np.frombuffer(bound, "<i2").astype(np.int16).reshape(rows, columns) for bound in packed)
+        return cls(minimum, maximum, report["height"], report["width"])
 
     @property
     def share(self) -> float:

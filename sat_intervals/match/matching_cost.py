@@ -22,14 +22,9 @@ STRIP = 64
 class Area(NamedTuple):
     """Pixels of one view to match, and the pixels of the other view that face them.
 
-    Attributes
-    ----------
-    base, facing
-        Windows of the two images, in the same rows.
-    minimum
-        Disparity at which the first pixel of ``base`` faces the first of ``facing``.
-    mirrored
-        Whether ``base`` is in the right image.
+    base, facing: windows of the two images, in the same rows.
+    minimum: disparity at which the first pixel of ``base`` faces the first of ``facing``.
+    mirrored: whether ``base`` is in the right image.
     """
 
     base: Window
@@ -90,20 +85,10 @@ def cost_areas(
 ) -> list[MatchingCost]:
     """Costs and gradients of areas of two views.
 
-    Parameters
-    ----------
-    views
-        Both images in the `view_windows` of the areas.
-    areas
-        Areas to match.
-    config
-        Settings.
-    statistics
-        Mean and standard deviation of the whole images; None if the matching cost needs none.
-    network
-        Of MC-CNN; by default that of the settings.
-    made
-        Precomputed costs of the areas from an earlier call, ``Costs.left``, so that they are not computed again.
+    views: both images in the `view_windows` of the areas.
+    statistics: of the whole images; None if the matching cost needs none.
+    network: of MC-CNN; by default that of the settings.
+    made: precomputed costs of the areas from an earlier call, ``Costs.left``, so that they are not computed again.
     """
     if isinstance(config.cost, Mccnn):
         assert statistics is not None  # MC-CNN always comes with statistics

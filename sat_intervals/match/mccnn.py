@@ -29,13 +29,7 @@ class Network:
     """A network that was checked to have the form above. Any number of threads may call it at once."""
 
     def __init__(self, file: Path, content: bytes) -> None:
-        """Make a network of the content of a file, and check it; ``file`` is for messages.
-
-        Raises
-        ------
-        SatIntervalsError
-            If onnxruntime is not installed, or the network has another form.
-        """
+        """Make a network of the content of a file, and check it; ``file`` is for messages."""
         self._session = _session(file, content)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         form = f"{[i.shape for i in inputs]} to {[o.shape for o in outputs]}"
@@ -95,20 +89,12 @@ def _wrong(file: Path, what: str) -> SatIntervalsError:
 
 
 def load_network(file: Path) -> Network:
-    """Load the network of a file; raises as `Network` does."""
+    """Load the network of a file."""
     return _loaded(_Weights.of(file))
 
 
 def network_of(cost: Census | Mccnn, inputs: Mapping[str, Any]) -> Network | None:
-    """Return the network of a run with these inputs; None if its cost needs none.
-
-    The content that is loaded is compared, not the file, which may be another one for a moment.
-
-    Raises
-    ------
-    ChangedInputError
-        The weights have another SHA-256 than those of the run.
-    """
+    """Return the network of a run with these inputs, on any worker; None if its cost needs none."""
     if not isinstance(cost, Mccnn):
         return None
     weights = _Weights.of(weights_file(cost.weights))

@@ -36,16 +36,10 @@ FIELDS = COUNTS + WIDTHS.size
 class Measured(NamedTuple):
     """Measurements of a pair, or of a block of one.
 
-    Attributes
-    ----------
-    group
-        Parts of one group are left out together.
-    weight
-        Of a pixel: one over the pixels of the pair, so that every pair weighs the same.
-    table
-        ``(rungs, schemes, fields)`` float64 sums over kept pixels with truth.
-    known, good
-        Pixels with truth, and those of them that are kept and within 1 px of it.
+    group: parts of one group are left out together.
+    weight: of a pixel: one over the pixels of the pair, so that every pair weighs the same.
+    table: ``(rungs, schemes, fields)`` float64 sums over kept pixels with truth.
+    known, good: pixels with truth, and those of them that are kept and within 1 px of it.
     """
 
     group: str
@@ -71,14 +65,9 @@ def measure(
 ) -> np.ndarray:
     """Measure some intervals: ``(parts, fields)``.
 
-    Parameters
-    ----------
-    lower, upper, truth
-        ``(pixels,)`` finite numbers of pixels.
-    tolerance
-        Distance up to which a truth outside an interval counts as inside.
-    part, parts
-        Part of each pixel, and number of parts.
+    lower, upper, truth: ``(pixels,)`` finite numbers of pixels.
+    tolerance: distance up to which a truth outside an interval counts as inside.
+    part, parts: part of each pixel, and number of parts.
     """
     width = upper.astype(np.float64) - lower
     missed = np.maximum(np.maximum(lower - truth, truth - upper) - tolerance, 0)

@@ -78,13 +78,7 @@ def strip_bytes(rows: int, width: int, compression: str) -> int:
 
 
 def fitted(config: Config, memory: int, tiles_at_once: int = 1, waiting: int = 0) -> Config:
-    """Reduce the tile size until ``tiles_at_once`` tiles, and ``waiting`` ones, fit in a process of ``memory`` bytes.
-
-    Raises
-    ------
-    ConfigError
-        If the smallest tile does not fit; the search range is never reduced.
-    """
+    """Reduce the tile size until ``tiles_at_once`` tiles and ``waiting`` ones fit in a process of ``memory`` bytes."""
     for size in range(config.tiles.size, 0, -64):
         tiles = tiles_at_once * tile_bytes(config, size) + waiting * waiting_bytes(config, size)
         if PROCESS_BYTES + tiles <= memory:
@@ -97,13 +91,7 @@ def fitted(config: Config, memory: int, tiles_at_once: int = 1, waiting: int = 0
 
 
 def check_strips(rows: int, width: int, config: Config, memory: int, strips_at_once: int = 1) -> None:
-    """Raise if ``strips_at_once`` strips of final rows do not fit in a process of ``memory`` bytes.
-
-    Raises
-    ------
-    ConfigError
-        Smaller tiles do not help.
-    """
+    """Raise if ``strips_at_once`` strips of final rows do not fit in a process of ``memory`` bytes."""
     needed = PROCESS_BYTES + strips_at_once * strip_bytes(rows, width, config.products.compression)
     if needed > memory:
         raise ConfigError(
@@ -113,15 +101,7 @@ def check_strips(rows: int, width: int, config: Config, memory: int, strips_at_o
 
 
 def check_memory(needed: int, what: str, way_out: str) -> None:
-    """Raise if ``needed`` bytes exceed the memory that this process may use.
-
-    ``what`` and ``way_out`` begin and end the message.
-
-    Raises
-    ------
-    SatIntervalsError
-        With both figures.
-    """
+    """Raise if ``needed`` bytes exceed the memory of this process; ``what`` and ``way_out`` are for the message."""
     usable = usable_memory()
     if needed > usable:
         raise SatIntervalsError(

@@ -23,16 +23,10 @@ _SHORT = 8
 class Frame(NamedTuple):
     """A core and what surrounds it in its view.
 
-    Attributes
-    ----------
-    core
-        Pixels whose products are kept.
-    region
-        Pixels of the whole run.
-    whole
-        All pixels of the left image; in the right view, all pixels that face them.
-    mirrored
-        Whether this is the right view.
+    core: pixels whose products are kept.
+    region: pixels of the whole run.
+    whole: all pixels of the left image; in the right view, all pixels that face them.
+    mirrored: whether this is the right view.
     """
 
     core: Window
@@ -49,17 +43,11 @@ class Frame(NamedTuple):
 class Patch(NamedTuple):
     """Raw products of a core.
 
-    Attributes
-    ----------
-    raw
-        Products of the pixels of ``output``.
-    output
-        The core and, inside the region, a ring of one pixel around it, which neighbours compute too.
-    right
-        The right view among the core's left pixels; with exact seams and accurate cross-checking that of the right
+    raw: products of the pixels of ``output``.
+    output: the core and, inside the region, a ring of one pixel around it, which neighbours compute too.
+    right: the right view among the core's left pixels; with exact seams and accurate cross-checking that of the right
         pixels of `mirrored_frame`.
-    leaving
-        Path states of the last wavefront that leave the left and, if it is matched, the right view.
+    leaving: path states of the last wavefront that leave the left and, if it is matched, the right view.
     """
 
     raw: Raw
@@ -181,20 +169,9 @@ def match_patch(
     statistics: PairStatistics | None = None,
     ranges: LocalRanges | None = None,
 ) -> Patch:
-    """Match a core.
+    """Match a core from both images in its `patch_windows`; ``frame`` is that of the left view.
 
-    Parameters
-    ----------
-    views
-        Both images in the `patch_windows` of the core.
-    frame
-        Of the core in the left view.
-    config
-        Settings.
-    statistics
-        Mean and standard deviation of the whole images; None if the matching cost needs none.
-    ranges
-        Local search ranges; by default all pixels search the whole range.
+    ``statistics`` are those of the whole images; None if the matching cost needs none.
     """
     costs = cost_areas(views, patch_areas(frame, config, ranges), config, statistics)
     return match_costed(views, frame, costs, config, ranges=ranges)
@@ -208,22 +185,9 @@ def match_costed(
     borders: Sequence[Borders] | None = None,
     ranges: LocalRanges | None = None,
 ) -> Patch:
-    """Match a core from its costs.
+    """Match a core as `match_patch` does, from the costs of its `patch_areas`.
 
-    Parameters
-    ----------
-    views
-        Both images in the `patch_windows` of the core.
-    frame
-        Of the core in the left view.
-    costs
-        Of the `patch_areas`.
-    config
-        Settings.
-    borders
-        Path states of the neighbours for each area; by default every path starts where its area does.
-    ranges
-        As for `match_patch`.
+    ``borders`` are path states of the neighbours for each area; by default every path starts where its area does.
     """
     is_exact, core = config.tiles.overlap == "exact", frame.core
     output = core if is_exact else core.grown(1, 1).clipped(frame.region)

@@ -36,20 +36,12 @@ Rows = TypeVar("Rows", bound=tuple[Any, ...])
 class RawRows(NamedTuple):
     """Raw products of full-width rows, all ``(rows, columns)`` except the last.
 
-    Attributes
-    ----------
-    winner, lower, upper
-        int16 disparities in pixels, NO_DISPARITY for none; bounds may be in steps, see `Raw`.
-    disparity
-        float32 pixels, NaN for none.
-    ambiguity
-        uint32.
-    validity
-        uint16 flags.
-    right_winner
-        ``(rows, columns + count - 1)`` int16, see `RightView`.
-    lower_low, upper_low
-        Bounds of low-confidence pixels, see `Raw`; empty without two levels.
+    winner, lower, upper: int16 disparities in pixels, NO_DISPARITY for none; bounds may be in steps, see `Raw`.
+    disparity: float32 pixels, NaN for none.
+    ambiguity: uint32.
+    validity: uint16 flags.
+    right_winner: ``(rows, columns + count - 1)`` int16, see `RightView`.
+    lower_low, upper_low: bounds of low-confidence pixels, see `Raw`; empty without two levels.
     """
 
     winner: np.ndarray
@@ -113,22 +105,15 @@ def _median_radius(config: Config) -> int:
 
 
 def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> Bands:
-    """Final bands of the rows ``[first, last)``.
+    """Final bands of the rows ``[first, last)``, counted from the first of ``rows``.
 
-    Parameters
-    ----------
-    rows
-        Raw products of these rows and of at least `halo` rows above and below, inside the region.
-    first, last
-        Row numbers, counted from the first of ``rows``.
-    scale
-        See `confidence_scale`; the same for the whole image.
+    ``rows`` has these rows and at least `halo` rows above and below, inside the region.
     """
     return finish_rows(filter_rows(rows, scale, config), first, last, config)
 
 
 def filter_rows(rows: RawRows, scale: ConfidenceScale, config: Config) -> Filtered:
-    """Cross-check, confidence and medians: all steps before regularisation; parameters as in `postprocess_rows`."""
+    """Cross-check, confidence and medians: all steps before regularisation; see `postprocess_rows`."""
     searched = rows.winner != NO_DISPARITY
     validity = rows.validity.copy()
     if config.cross_check:
@@ -240,16 +225,9 @@ def postprocess_strips(strips: Iterable[RawRows], scale: ConfidenceScale, config
 def postprocess_strip(
     pieces: Iterable[RawRows], above: int, height: int, scale: ConfidenceScale, config: Config
 ) -> Iterator[Bands]:
-    """Final bands of a strip of a region, the same in every bit as those of the whole region.
+    """Final bands of a strip of ``height`` rows, the same in every bit as those of the whole region.
 
-    Parameters
-    ----------
-    pieces
-        Raw products from the top: the strip with `halo` rows above and below it, inside the region.
-    above, height
-        Rows above the strip, and rows of the strip.
-    scale, config
-        See `postprocess_rows`.
+    ``pieces``, from the top, are the strip with `halo` rows, inside the region, above and below it: ``above`` above.
     """
     row = -above
     for final in postprocess_strips(pieces, scale, config):

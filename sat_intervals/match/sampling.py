@@ -31,14 +31,9 @@ _AWAY = 16
 class Sample(NamedTuple):
     """A window to look at.
 
-    Attributes
-    ----------
-    left
-        Window of the left image.
-    minimum, maximum
-        Disparities to search there.
-    rows
-        Rows by which the right window lies lower, rounded from the row offset of the coarse matches.
+    left: window of the left image.
+    minimum, maximum: disparities to search there.
+    rows: rows by which the right window lies lower, rounded from the row offset of the coarse matches.
     """
 
     left: Window
@@ -131,14 +126,10 @@ def _look(codes: tuple[Codes, Codes], index: np.ndarray, known: np.ndarray, rows
 def row_offsets(left: Codes, right: Codes, index: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Rows by which the right image lies lower, one figure for each match that determines it.
 
-    Parameters
-    ----------
-    left, right
-        Codes; the right ones have `ROWS` rows more at both ends, and ``right[r + ROWS, c + k]`` faces ``left[r, c]``.
-    index
-        ``(rows, columns)`` integers: k of each match.
-    known
-        bool of the same shape: the matches.
+    left, right: codes; the right ones have `ROWS` rows more at both ends, and ``right[r + ROWS, c + k]`` faces
+        ``left[r, c]``.
+    index: ``(rows, columns)`` integers: k of each match.
+    known: bool of the same shape: the matches.
     """
     shifted = np.stack([index - 1, index, index + 1])[:, np.newaxis]
     rows = np.arange(2 * ROWS + 1)[:, np.newaxis, np.newaxis]
@@ -210,17 +201,7 @@ def _padded(image: np.ndarray, window: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_in_tile(views: Views, core: Window, minimum: int, maximum: int) -> list[Look]:
-    """Estimate noise and row offset of the pair from the middle of a tile.
-
-    Parameters
-    ----------
-    views
-        Both images around the tile.
-    core
-        Pixels of the tile.
-    minimum, maximum
-        The search range.
-    """
+    """Estimate noise and row offset of the pair from the middle of a tile, ``core``, over a search range."""
     row, column = (max(0, (side - _MIDDLE) // 2) for side in (core.height, core.width))
     middle = Window(core.row + row, core.column + column, *(min(_MIDDLE, side) for side in (core.height, core.width)))
     there = facing(middle, minimum, maximum)

@@ -71,21 +71,13 @@ class Level:
 class Found:
     """A search range with its evidence.
 
-    Attributes
-    ----------
-    minimum, maximum
-        The range in pixels, both ends included.
-    matched
-        Share of the usable left pixels with a consistent match at the finest level.
-    levels
-        From coarse to fine.
-    histogram
-        Matches of the finest level between the first and the last disparity: ``edges`` in pixels and ``counts``.
-    quality
-        ``noise`` and ``row_offset``, see `sampling.summary`, and ``collars``: the value and share of pixels of the
+    minimum, maximum: the range in pixels, both ends included.
+    matched: share of the usable left pixels with a consistent match at the finest level.
+    levels: from coarse to fine.
+    histogram: matches of the finest level between the first and the last disparity: ``edges`` in pixels and ``counts``.
+    quality: ``noise`` and ``row_offset``, see `sampling.summary`, and ``collars``: the value and share of pixels of the
         `collar` of an image, by side.
-    cells
-        The local ranges, see `LocalRanges.report`.
+    cells: the local ranges, see `LocalRanges.report`.
     """
 
     minimum: int
@@ -122,20 +114,11 @@ def with_range(config: Config, found: Found) -> Config:
 class Matches(NamedTuple):
     """Matches of a level.
 
-    Attributes
-    ----------
-    disparity
-        ``(rows, columns)`` float32 in pixels of the level.
-    kept
-        bool of the same shape: consistent matches that belong to a surface.
-    searched
-        First and last disparity searched, in pixels of the level.
-    matched
-        Share of the usable pixels that are kept.
-    step
-        Of the level.
-    images
-        The left and the right image of the level.
+    disparity: ``(rows, columns)`` float32 in pixels of the level.
+    kept: bool of the same shape: consistent matches that belong to a surface.
+    searched: first and last disparity searched, in pixels of the level.
+    matched: share of the usable pixels that are kept.
+    step, images: of the level; the left image and the right one.
     """
 
     disparity: np.ndarray
@@ -163,14 +146,8 @@ def _most_rows(rows: int) -> int:
 def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
     """Means of the usable pixels, state 0, of blocks of ``step`` pixels.
 
-    Parameters
-    ----------
-    pixels, state
-        ``(rows, columns)``; unusable pixels are 0. Rows and columns that fill no block are dropped.
-
-    Returns
-    -------
-    float32, NaN where less than half of a block is usable.
+    pixels, state: ``(rows, columns)``; unusable pixels are 0. Rows and columns that fill no block are dropped.
+    Returns float32, NaN where less than half of a block is usable.
     """
     sums, counts = pixels, (state == 0).view(np.uint8)
     for axis, size in enumerate(step):
@@ -213,23 +190,9 @@ def collar(image: np.ndarray, smallest: float) -> np.ndarray:
 def find_range(left: np.ndarray, right: np.ndarray, step: Step, shape: tuple[int, int]) -> tuple[Found, Matches]:
     """Find the search range of a pair.
 
-    Parameters
-    ----------
-    left, right
-        Both images at the finest level: float32, NaN where not usable; of the same number of rows.
-    step
-        The `finest_step`.
-    shape
-        Rows and columns of the left image itself.
-
-    Returns
-    -------
-    The range, and the matches of the finest level that has as many as the coarser ones.
-
-    Raises
-    ------
-    NoRangeError
-        Too few matches are consistent.
+    left, right: both images at the finest level, of `finest_step`: float32, NaN where not usable; of as many rows.
+    shape: rows and columns of the left image itself.
+    Returns the range, and the matches of the finest level that has as many as the coarser ones.
     """
     pyramid = [(step, left, right)]
     while max(pyramid[-1][1].shape[1], pyramid[-1][2].shape[1]) > _TOP:
@@ -330,14 +293,8 @@ def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, 
 def match_level(left: np.ndarray, right: np.ndarray, searched: tuple[int, int], speckle: int) -> Matches:
     """Match a level strip by strip; remove stray matches.
 
-    Parameters
-    ----------
-    left, right
-        float32, NaN where not usable.
-    searched
-        First and last disparity, in pixels of the level.
-    speckle
-        Pixels that a surface has at least.
+    ``left`` and ``right`` are float32, NaN where not usable; ``searched`` the first and the last disparity in pixels of
+    the level; ``speckle`` the pixels that a surface has at least.
     """
     first, last = searched
     usable = np.count_nonzero(np.isfinite(left))
