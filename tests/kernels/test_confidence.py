@@ -98,21 +98,11 @@ def test_percentiles__worked_example():
     assert reference.percentile([1, 0, 3, 1], 99) == reference.Fraction(296, 100)
 
 
-histograms = hnp.arrays(np.int64, st.integers(1, 60), elements=st.integers(0, 40)).filter(np.any)
-
-
 @bounded
-@given(histogram=histograms)
+@given(histogram=hnp.arrays(np.int64, st.integers(1, 60), elements=st.integers(0, 40)).filter(np.any))
 def test_percentiles__equal_numpy_on_the_values(histogram):
     values = np.repeat(np.arange(len(histogram)), histogram)
     assert percentiles(histogram) == tuple(np.percentile(values, [1, 99]))
-
-
-@bounded
-@given(histogram=histograms)
-def test_percentiles__equal_reference(histogram):
-    exact = [float(reference.percentile(histogram, percent)) for percent in (1, 99)]
-    assert percentiles(histogram) == pytest.approx(exact, rel=1e-12, abs=1e-12)
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 100, 101, 102, 201, 1000])

@@ -89,14 +89,18 @@ def test_cut_level__says_the_same_as_possibility(alpha, cost_span):
     assert reference.cut_level("0.9", 1600) == 160
 
 
-@pytest.mark.parametrize("refine", [True, False])
-@bounded
-@given(scene=reference.scenes(), alpha=st.sampled_from(ALPHAS))
-def test_match_costs__interval_equals_reference(refine, scene, alpha):
+def check_against_reference(scene, alpha, refine):
     raw = matched(scene, alpha=alpha, refine=refine)[0]
     bounds = reference.alpha_cut(reference.volume_of(scene), alpha, reference.span_of(scene), refine)
     for bound, expected in zip((raw.lower, raw.upper), bounds, strict=True):
         np.testing.assert_array_equal(bound, reference.absolute(expected, scene.minimum))
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@bounded
+@given(scene=reference.scenes(), alpha=st.sampled_from(ALPHAS))
+def test_match_costs__interval_equals_reference(refine, scene, alpha):
+    check_against_reference(scene, alpha, refine)
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -104,11 +108,7 @@ def test_match_costs__interval_equals_reference(refine, scene, alpha):
 @given(data=st.data())
 def test_match_costs__interval_equals_reference_at_every_count(count, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=6))
-    alpha = data.draw(st.sampled_from(ALPHAS))
-    raw = matched(scene, alpha=alpha)[0]
-    bounds = reference.alpha_cut(reference.volume_of(scene), alpha, reference.span_of(scene), True)
-    for bound, expected in zip((raw.lower, raw.upper), bounds, strict=True):
-        np.testing.assert_array_equal(bound, reference.absolute(expected, scene.minimum))
+    check_against_reference(scene, data.draw(st.sampled_from(ALPHAS)), True)
 
 
 @few

@@ -117,19 +117,11 @@ def flip(files):
         file.write_bytes(file.read_bytes()[:-1] + b"x")
 
 
-def exchange(files):
-    first, second, *_ = sorted(files)  # of the same shape
-    content = first.read_bytes()
-    first.write_bytes(second.read_bytes())
-    second.write_bytes(content)
-
-
 DAMAGES = {
     "missing": lambda files: [file.unlink() for file in files],
     "empty": lambda files: [file.write_bytes(b"") for file in files],
     "short": lambda files: [file.write_bytes(file.read_bytes()[:-1]) for file in files],
     "flipped": flip,
-    "exchanged": exchange,
 }
 
 

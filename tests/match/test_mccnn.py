@@ -27,7 +27,6 @@ from sat_intervals.match.patch import kernel_settings
 from sat_intervals.match.whole import _view
 from sat_intervals.products import COSINE_STEPS, IMPOSSIBLE_COST, INVALID
 from sat_intervals.results import open_results
-from sat_intervals.run import source
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
@@ -403,41 +402,12 @@ def test_match_tile__another_onnxruntime_on_a_worker_is_noticed(tmp_path, networ
         match_block(job, next(iter(job.store.grid)))
 
 
-def test_match_pair__weights_that_are_others_for_a_moment_are_not_used(tmp_path, monkeypatch):
-    left, right = masked_images(60, 80)
-    images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
-    file = write_network(tmp_path / "network.onnx", random_weights())
-    content = file.read_bytes()
-    other = write_network(tmp_path / "other.onnx", random_weights(seed=1)).read_bytes()
-    match_pair(*images, tmp_path / "alone", settings(-4, 6, file))
-    computed = source.cost_areas
-
-    def exchanged(*arguments):
-        file.write_bytes(other)
-        try:
-            return computed(*arguments)
-        finally:
-            file.write_bytes(content)
-
-    monkeypatch.setattr(source, "cost_areas", exchanged)
-    match_pair(*images, tmp_path / "out", settings(-4, 6, file))
-    for one, expected in zip(bands(tmp_path / "out"), bands(tmp_path / "alone"), strict=True):
-        np.testing.assert_array_equal(one, expected)
-
-
 def test_measure_subjects__other_weights_between_two_pairs_are_noticed(tmp_path):
     write_pair(tmp_path, make_scene(90, 120))
     file = write_network(tmp_path / "network.onnx", random_weights())
     left, right = (open_image(tmp_path / name) for name in ("left.tif", "right.tif"))
     config = settings(-4, 6, file)
     subject = Subject("one", "one", left, right, truth_of(left, tmp_path / "truth.tif"), config)
-
-    def exchange_for_a_moment(stage, done, total):
-        if (stage, done) == ("tiles", total):
-            file.write_bytes(file.read_bytes())
-
-    with pytest.raises(RunError, match=r"network\.onnx was replaced or changed while it was read: rerun the command"):
-        measure_subjects([subject], tmp_path, exchange_for_a_moment)
 
     def exchange_at_the_end(stage, done, total):
         if (stage, done) == ("subjects", 1):
