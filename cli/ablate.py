@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.judging import Judging, judging_options, say_scenes, watched_arguments, watched_pairs
+from sat_intervals.cli.judging import Judging, judging_options, say_scenes
 from sat_intervals.cli.options import FILE, cost_option
 
 
@@ -27,17 +27,13 @@ def ablate(pairs: tuple[Path, ...], cost: str | None, judging: Judging) -> None:
     from sat_intervals.evaluate.ablation import ablate_pair
     from sat_intervals.evaluate.paper import SceneMetrics, table_2
 
-    check_arguments = watched_arguments(pairs, judging.config_file)
     found = find_pairs(pairs)
-    check_rasters = watched_pairs(found)
     configs = [judging.load(pair, cost) for pair in found]
     scenes = []
     for pair, config in zip(found, configs, strict=True):
         if not judging.quiet:
             click.echo(f"matching {pair.name}", err=True)
         scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, config, tolerance=judging.tolerance)))
-    check_rasters()
-    check_arguments()
     if judging.as_json:
         say_scenes(scenes)
     else:

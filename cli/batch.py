@@ -27,19 +27,11 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
     from sat_intervals.cli.surface import surfaces_of
     from sat_intervals.config.pairs import REPORT, read_batch
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.raster.watching import watched
     from sat_intervals.run.batch import match_batch
 
     check_not_replaced([pairs, settings.file], [out / REPORT])
-    check_given = watched([pairs, settings.file])
     rows = read_batch(pairs)
     with Console(run.quiet or as_json) as console:
-
-        def progress(stage: str, done: int, total: int) -> None:
-            if stage == "pairs":  # between opening the images of one and those of the next
-                check_given()
-            console.progress(stage, done, total)
-
         report = match_batch(
             rows,
             out,
@@ -47,7 +39,7 @@ def batch(pairs: Path, out: Path, as_json: bool, settings: SettingsArguments, ru
             overrides=settings.sections,
             overwrite=run.overwrite,
             keep_tiles=run.keep_tiles,
-            progress=progress,
+            progress=console.progress,
             finish=surfaces_of(rows, out, console),
         )
     if as_json:

@@ -1,6 +1,5 @@
 """``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
-from sat_intervals.cli.calibration_files import checked_folder, write
-from sat_intervals.cli.judging import tolerance_option, watched_arguments
-from sat_intervals.cli.matching import SettingsArguments, named_by, settings_options
+from sat_intervals.cli.calibration_files import check_output, write
+from sat_intervals.cli.judging import tolerance_option
+from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
     SurfaceAndReference,
     json_option,
     log_options,
+    overwrite_option,
     quiet_option,
     reference_options,
     say_json,
@@ -43,6 +43,7 @@ _SETTINGS = """\
 @click.command(short_help="Find the levels that reach a coverage, on pairs with known truth.")
 @click.argument("pairs", nargs=-1, type=FILE)
 @click.option("--output", type=FILE, required=True, help="Calibration to write (YAML).")
+@overwrite_option
 @click.option("--truth", type=FILE, multiple=True, help="True disparity; one for each of PAIRS, in that order.")
 @tolerance_option
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth of each pair to its truth.")
@@ -72,6 +73,7 @@ _SETTINGS = """\
 def calibrate(
     pairs: tuple[Path, ...],
     output: Path,
+    overwrite: bool,
     truth: tuple[Path, ...],
     name: str | None,
     tune: bool,
@@ -100,7 +102,7 @@ def calibrate(
     if surface is not None:
         check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
         coverage = settings.sections.get("interval", {}).get("coverage")
-        calibrate_heights(surface, output, name, coverage, as_json, quiet)
+        calibrate_heights(surface, output, name, coverage, overwrite=overwrite, as_json=as_json, quiet=quiet)
         return
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
@@ -112,17 +114,16 @@ def calibrate(
     from sat_intervals.run.calibrate import calibration_from, check_subjects
     from sat_intervals.run.measure import measure_subjects
 
-    checks = [watched_arguments(pairs, settings.file)]
-    subjects = _subjects(pairs, truth, _Judging(settings, checks, **judging))
-    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file, *named_by(settings.file)], [output])
-    folder = checked_folder(output, _SETTINGS if tune else _CALIBRATION)
+    subjects = _subjects(pairs, truth, _Judging(settings, **judging))
+    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file], [output])
+    check_output(output, overwrite=overwrite)
+    folder = output.absolute().parent
     check_subjects(subjects)
     with Console(quiet or as_json) as console:
         if tune:
-            _tune(subjects, output, folder, name, partial(_check, checks), console, as_json)
+            _tune(subjects, output, folder, name, console, as_json)
             return
         parts, key = measure_subjects(subjects, folder, console.progress)
-    _check(checks)
     calibration, expected = calibration_from(parts, subjects, name or output.stem, key)
     write_calibration(output, calibration)
     if as_json:
@@ -132,17 +133,11 @@ def calibrate(
         click.echo(str(output))
 
 
-def _check(checks: Iterable[Callable[[], None]]) -> None:
-    for check in checks:
-        check()
-
-
 @dataclass(frozen=True)
 class _Judging:
-    """Options that decide how pairs are matched and compared with their truth; ``checks`` of files that are read."""
+    """Options that decide how pairs are matched and compared with their truth."""
 
     settings: SettingsArguments
-    checks: list[Callable[[], None]]
     tolerance: float
     remove_bias: bool
     by_group: bool
@@ -203,7 +198,6 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
     from sat_intervals.config import Cluster, load_config
     from sat_intervals.config.pairs import group_beside
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.raster.watching import watched
     from sat_intervals.results import open_results
     from sat_intervals.run.measure import Subject
 
@@ -216,10 +210,7 @@ def _of_run(out: Path, truth: Path | None, judging: _Judging) -> "Subject":
     else:
         here = run.config.model_copy(update={"cluster": Cluster()})  # the run's may be jobs of a batch system
         config = load_config(here, settings.sections)
-    group = str(out)
-    if judging.by_group:
-        judging.checks.append(watched([Path(run.left.path).with_name("meta.json")]))
-        group = group_beside(run.left.path)
+    group = group_beside(run.left.path) if judging.by_group else str(out)
     return Subject(
         str(out), group, run.left, run.right, run.truth, config, run.region, judging.tolerance, judging.remove_bias
     )
@@ -235,7 +226,6 @@ def _tune(
     output: Path,
     folder: Path,
     name: str | None,
-    check_arguments: Callable[[], None],
     console: "Console",
     as_json: bool,
 ) -> None:
@@ -243,13 +233,10 @@ def _tune(
     from sat_intervals.cli.tables import show_tuned
     from sat_intervals.config.weights import INSTALL_MCCNN
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.raster import watched_images
     from sat_intervals.run.tune import OF_ALL, best_of, candidates, has_network, settings_of, tuned
 
     if not has_network():
         console.say(f"MC-CNN is left out: to include it, {INSTALL_MCCNN}")
-    # one that cannot be read would leave out settings
-    check_images = watched_images(image for one in subjects for image in (one.left, one.right, one.truth.image))
     found = []
     for label, changes in candidates(subjects[0].config, with_network=has_network()):
         console.say(f"calibrating {label}")
@@ -259,8 +246,6 @@ def _tune(
             raise
         except SatIntervalsError as error:
             console.say(f"{label} is left out: {error}")
-    check_images()
-    check_arguments()
     best = best_of(found)
     if as_json:
         say_json([{"name": one.name, "kept": one.kept, "good": one.good, **one.figures} for one in found])

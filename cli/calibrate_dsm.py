@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.calibration_files import checked_folder, write
+from sat_intervals.cli.calibration_files import check_output, write
 from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.cli.options import SurfaceAndReference, say_json
 
@@ -31,7 +31,14 @@ def check_alone(pairs: Sequence[Path], settings: SettingsArguments, options: Map
 
 
 def calibrate_heights(
-    surface: SurfaceAndReference, output: Path, name: str | None, coverage: float | None, as_json: bool, quiet: bool
+    surface: SurfaceAndReference,
+    output: Path,
+    name: str | None,
+    coverage: float | None,
+    *,
+    overwrite: bool,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     """Calibrate the intervals of a surface model, and write and print their margins."""
     from sat_intervals.evaluate.calibration import calibrate_surface
@@ -39,7 +46,7 @@ def calibrate_heights(
 
     files = surface.dsm, surface.reference
     check_not_replaced(files, [output])
-    checked_folder(output, _HEIGHTS)
+    check_output(output, overwrite=overwrite)
     calibration = calibrate_surface(*files, name or output.stem, coverage=coverage, registers=surface.registers)
     write(output, _HEIGHTS, calibration.model_dump(mode="json"))
     if as_json:

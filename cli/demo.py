@@ -1,5 +1,6 @@
 """``sat-intervals demo``: match a procedural scene with exact truth."""
 
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -10,8 +11,11 @@ from sat_intervals.cli.matching import RunArguments, SettingsArguments, local_op
 from sat_intervals.cli.options import FILE, json_option, say_json
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from sat_intervals.cli.console import Console
     from sat_intervals.config import Config
+    from sat_intervals.raster import Georeferencing
 
 
 @click.command(short_help="Make a scene with exact truth, match it and compare.")
@@ -52,24 +56,20 @@ def demo(
     from sat_intervals.cli.console import Console
     from sat_intervals.demo import PIXEL, make_scene
     from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.raster import north_up, put_back, stamps, write_once
+    from sat_intervals.raster import north_up
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.output import OUTPUTS, check_output
-    from sat_intervals.run.status import is_replacing
+    from sat_intervals.run.output import OUTPUTS
 
-    check_output(out, run.overwrite)
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
-    overwrite = run.overwrite or is_replacing(out / "tiles")
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))
-    with Console(run.quiet or as_json) as console, put_back(layers if overwrite else (), out / "run.json"):
-        there = stamps(out, [layer.name for layer in layers])  # what a killed demo left is restored
+    with Console(run.quiet or as_json) as console:
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
         search = {"minimum": scene.minimum, "maximum": scene.maximum} | ({"local": True} if local_range else {})
         config = settings.load(disparity=search)
         check_not_replaced([settings.file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
-            write_once(path, pixels, value, somewhere, there if overwrite else None)
+            _write(path, pixels, value, somewhere, overwrite=run.overwrite)
         console.progress("scene", 1, 1)
         report = run.match(out / "left.tif", out / "right.tif", out, config, progress=console.progress)
     figures = evaluate_run(out, out / "truth.tif")["all"]
@@ -79,6 +79,23 @@ def demo(
         console.summary(report, out)
         _judge(config, out, figures, console, run.quiet)
     run.check_strict(report["warnings"])
+
+
+def _write(path: Path, pixels: "np.ndarray", nodata: float, place: "Georeferencing", *, overwrite: bool) -> None:
+    """Write a layer of the scene, unless the file has it already: a rerun resumes."""
+    import numpy as np
+
+    from sat_intervals.errors import InputError
+    from sat_intervals.raster import read_layers, write_layer
+    from sat_intervals.raster.publishing import check_free
+
+    if path.is_file():
+        with suppress(InputError):
+            if np.array_equal(read_layers(path), pixels[np.newaxis], equal_nan=pixels.dtype.kind == "f"):
+                return
+    check_free(path, overwrite=overwrite)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_layer(path, pixels, nodata, place, {"SOFTWARE": "sat-intervals"})
 
 
 def _judge(config: "Config", out: Path, figures: dict[str, Any], console: "Console", quiet: bool) -> None:

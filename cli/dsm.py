@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import FILE, Command, json_option, log_options, quiet_option, say_json, with_options
+from sat_intervals.cli.options import (
+    FILE,
+    Command,
+    json_option,
+    log_options,
+    overwrite_option,
+    quiet_option,
+    say_json,
+    with_options,
+)
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -51,8 +60,7 @@ _CELL_OPTIONS = (
 def cell_options(command: Command) -> Command:
     """Add options for the cells of a surface; the command gets ``cells``, arguments of `make_surface`.
 
-    A `calibration_option` goes with it; the command also gets ``check_calibration``, which raises if its file is not
-    the one that was read.
+    A `calibration_option` goes with it.
     """
 
     @wraps(command)
@@ -66,12 +74,10 @@ def cell_options(command: Command) -> Command:
             raise click.UsageError("give either --resolution or --grid-like.")
         from sat_intervals.config import load_height_calibration
         from sat_intervals.heights.choices import SurfaceChoices
-        from sat_intervals.raster.watching import watched
 
-        check_calibration = watched([calibration])
         choices["calibration"] = calibration and load_height_calibration(calibration)
         cells |= {"resolution": like or cells["resolution"], "choices": SurfaceChoices(**choices)}
-        return command(cells=cells, check_calibration=check_calibration, **given)
+        return command(cells=cells, **given)
 
     return with_options(with_cells, *_CELL_OPTIONS)
 
@@ -117,19 +123,16 @@ def say_surface(console: "Console", report: dict[str, Any]) -> None:
 @click.argument("outs", metavar="OUT...", nargs=-1, required=True, type=FILE)
 @cell_options
 @calibration_option("--calibration")
-@click.option(
-    "--output",
-    type=FILE,
-    help="File to write; default dsm.tif in the first OUT. An existing surface model is replaced.",
-)
+@click.option("--output", type=FILE, help="File to write; default dsm.tif in the first OUT.")
+@overwrite_option
 @json_option
 @quiet_option
 @log_options
 def dsm(
     outs: tuple[Path, ...],
     cells: dict[str, Any],
-    check_calibration: Callable[[], None],
     output: Path | None,
+    overwrite: bool,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -144,15 +147,13 @@ def dsm(
     """
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.dsm import make_surface
+    from sat_intervals.raster.publishing import check_free
 
+    if output:
+        check_free(output, overwrite=overwrite)
     output = output or outs[0] / "dsm.tif"
     with Console(quiet or as_json) as console:
-
-        def progress(stage: str, done: int, total: int) -> None:
-            check_calibration()  # it was read before the points
-            console.progress(stage, done, total)
-
-        report = make_surface(outs, output, **cells, progress=progress)
+        report = make_surface(outs, output, **cells, progress=console.progress)
     if as_json:
         say_json(report)
     say_surface(console, report)

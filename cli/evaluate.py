@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sat_intervals.cli.evaluate_dsm import Surface, surface_options
-from sat_intervals.cli.judging import Judging, judging_options, say_scenes, watched_arguments, watched_pairs
+from sat_intervals.cli.judging import Judging, judging_options, say_scenes
 from sat_intervals.cli.options import COSTS, FILE
 
 if TYPE_CHECKING:
@@ -83,17 +83,13 @@ def evaluate(
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.evaluate.paper import SceneMetrics
 
-    check_arguments = watched_arguments(folders, judging.config_file)
     sources = _sources(folders, truth, mask, cost)
-    check_rasters = watched_pairs([source.pair for source in sources if source.pair], *_truths(sources, group))
     configs = _configs(sources, judging, cost)
     judge = partial(evaluate_run, tolerance=judging.tolerance, remove_bias=remove_bias)
     scenes = [
         SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config, judging.quiet))
         for source, config in zip(sources, configs, strict=True)
     ]
-    check_rasters()
-    check_arguments()
     if not judging.quiet:
         _warn_of_whole_truth(scenes, judging.tolerance)
     if judging.as_json:
@@ -144,18 +140,6 @@ def _sources(
         for (name, pair), truth, mask in named
         for cost in ((costs if pair else costs[:1]) or (None,))
     ]
-
-
-def _truths(sources: list[_Source], group: str | None) -> list[Path | None]:
-    """Return truths and masks that are given, and what is read beside the left images of runs."""
-    from sat_intervals.results import open_run
-
-    found = [file for source in sources for file in (source.truth, source.mask)]
-    for source in sources:
-        if not source.pair:
-            beside = open_run(source.name).truth_beside
-            found += [None if source.truth else beside, None if group else beside.with_name("meta.json")]
-    return found
 
 
 def _configs(sources: list[_Source], judging: Judging, costs: tuple[str, ...]) -> "list[Config | None]":

@@ -4,13 +4,20 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import click
 
-from sat_intervals.cli.options import FILE, Command, SurfaceAndReference, reference_options, say_json, with_options
+from sat_intervals.cli.options import (
+    FILE,
+    Command,
+    SurfaceAndReference,
+    overwrite_option,
+    reference_options,
+    say_json,
+    with_options,
+)
 
 Line = tuple[float, float, float, float]
 # Files of --pictures: figures and pictures.
@@ -26,6 +33,7 @@ class Surface:
     classes: Path | None
     folder: Path | None
     line: Line | None
+    overwrite: bool
 
     def check_alone(self, folders: Sequence[Path], options: Mapping[str, Any]) -> None:
         """Raise if there are runs to evaluate too, or options for them."""
@@ -39,12 +47,10 @@ class Surface:
         """Print figures, and write them with pictures to the folder, whose names are not printed if quiet."""
         from sat_intervals.cli.tables import show_surface
         from sat_intervals.evaluate.dsm import evaluate_surface
-        from sat_intervals.raster import watched_rasters
 
         given = self.given
         if self.folder is not None:
-            _check_kept(self.folder, [given.dsm, given.reference, self.classes])
-        check_unchanged = watched_rasters([given.dsm, given.reference])
+            self._check_folder(self.folder)
         report = evaluate_surface(given.dsm, given.reference, self.classes, registers=given.registers)
         if as_json:
             say_json(report)
@@ -52,9 +58,20 @@ class Surface:
             show_surface(str(given.dsm), report)
         if self.folder is not None:
             written = _drawn(given, self.folder, self.line, report)
-            check_unchanged()
             for path in () if quiet else written:
                 click.echo(path, err=as_json)
+
+    def _check_folder(self, folder: Path) -> None:
+        """Raise if there is no such folder, or files in it would be replaced."""
+        from sat_intervals.raster.identity import check_not_replaced
+        from sat_intervals.raster.publishing import check_free
+
+        if not folder.is_dir():
+            raise click.UsageError(f"--pictures {folder} is not a folder: give an existing one.")
+        paths = [folder / name for name in (*_TEXTS, *_PICTURES)]
+        check_not_replaced([self.given.dsm, self.given.reference, self.classes], paths)
+        for path in paths:
+            check_free(path, overwrite=self.overwrite)
 
 
 _OPTIONS = (
@@ -72,6 +89,7 @@ _OPTIONS = (
         metavar="X Y X Y",
         help="Ends of the profile of --pictures; default the middle row.",
     ),
+    overwrite_option,
 )
 
 
@@ -85,13 +103,14 @@ def surface_options(command: Command) -> Command:
         classes: Path | None,
         pictures: Path | None,
         line: Line | None,
+        overwrite: bool,
         **others: Any,
     ) -> Any:
-        given = {"--classes": classes, "--pictures": pictures, "--line": line}
+        given = {"--classes": classes, "--pictures": pictures, "--line": line, "--overwrite": overwrite}
         extra = next((name for name, value in given.items() if value), None)
         if extra and surface is None:
             raise click.UsageError(f"{extra} goes with --dsm: leave it out.")
-        return command(surface=surface and Surface(surface, classes, pictures, line), **others)
+        return command(surface=surface and Surface(surface, classes, pictures, line, overwrite), **others)
 
     add_reference = reference_options("Evaluate this surface model against --reference, instead of runs.")
     return add_reference(with_options(with_surface, *_OPTIONS))
@@ -102,37 +121,16 @@ def _drawn(given: SurfaceAndReference, folder: Path, line: Line | None, report: 
     from sat_intervals.cli.tables import surface_markdown
     from sat_intervals.evaluate.comparison import moved_by, open_comparison
     from sat_intervals.evaluate.dsm import read_profile
-    from sat_intervals.raster.watching import watched_folder
+    from sat_intervals.raster.publishing import write_file
     from sat_intervals.show.accuracy import draw_error_map, draw_height_profile, draw_reliability
-    from sat_intervals.show.marks import TEXT_MARK, replaceable_here, write_made_here
 
-    paths = [folder / name for name in (*_TEXTS, *_PICTURES)]
+    figures, table, reliability, errors, heights = paths = [folder / name for name in (*_TEXTS, *_PICTURES)]
     names = given.dsm.name, given.reference.name
     compared = moved_by(open_comparison(given.dsm, given.reference), report["registration"])
     profile = read_profile(compared, line)
-    texts = (
-        json.dumps({"software": TEXT_MARK} | report, indent=1),
-        f"<!-- {TEXT_MARK} -->\n{surface_markdown(str(given.dsm), report)}",
-    )
-    there = replaceable_here(folder, [path.name for path in paths])
-    reliability, errors, heights = pictures = BytesIO(), BytesIO(), BytesIO()
+    write_file(figures, json.dumps({"software": "sat-intervals"} | report, indent=1).encode())
+    write_file(table, f"<!-- sat-intervals -->\n{surface_markdown(str(given.dsm), report)}".encode())
     draw_reliability(report, reliability, names[0])
     draw_error_map(compared, report["all"]["nmad"], errors)
     draw_height_profile(profile, heights, names)
-    check_folder = watched_folder(folder)
-    contents = [*(text.encode() for text in texts), *(picture.getvalue() for picture in pictures)]
-    write_made_here(dict(zip(paths, contents, strict=True)), there)
-    check_folder()
     return paths
-
-
-def _check_kept(folder: Path, inputs: Sequence[Path | None]) -> None:
-    """Raise if there is no such folder, or if files there would be replaced that are inputs or of others."""
-    from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.show.marks import check_made_here
-
-    if not folder.is_dir():
-        raise click.UsageError(f"--pictures {folder} is not a folder: give an existing one.")
-    paths = [folder / name for name in (*_TEXTS, *_PICTURES)]
-    check_not_replaced(inputs, paths)
-    check_made_here(paths)

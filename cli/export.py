@@ -4,15 +4,16 @@ from pathlib import Path
 
 import click
 
-from sat_intervals.cli.options import FILE, log_options
+from sat_intervals.cli.options import FILE, log_options, overwrite_option
 
 
 @click.command(short_help="Export a run to the files of CARS, OTB, ASP or s2p.")
 @click.argument("out", type=FILE)
 @click.argument("target", type=FILE)
 @click.option("--to", "form", type=click.Choice(["cars", "otb", "asp", "s2p"]), required=True, help="Target tool.")
+@overwrite_option
 @log_options
-def export(out: Path, target: Path, form: str) -> None:
+def export(out: Path, target: Path, form: str, overwrite: bool) -> None:
     """Export the finished run in the folder OUT to the folder TARGET in the format of another tool.
 
     \b
@@ -26,9 +27,9 @@ def export(out: Path, target: Path, form: str) -> None:
            rectified_mask.png (1 = valid), rectified_disp_confidence.tif
 
     Experimental formats follow the documentation of the tool. They have not been tested with the tool itself. All files
-    have the size of the left image. Earlier exports of these names are replaced, other files are not.
+    have the size of the left image.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.interop.export import export
 
-    for file in export(out, form, target):
+    for file in export(out, form, target, overwrite=overwrite):
         click.echo(file)

@@ -1,7 +1,6 @@
 """Options and output shared by the commands that evaluate pairs with known truth."""
 
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -9,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.matching import watched_settings
 from sat_intervals.cli.options import FILE, Command, json_option, log_options, preset_option, say_json, with_options
 
 if TYPE_CHECKING:
@@ -90,32 +88,6 @@ def judging_options(command: Command) -> Command:
         click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
     )
-
-
-def watched_arguments(pairs: Iterable[Path], settings: Path | None) -> Callable[[], None]:
-    """Return a function that raises if pairs, settings or files that these name are not those of now.
-
-    Call this before they are read. Of a pair, its CSV file or meta.json is meant, not its images; of a run, its files.
-    """
-    from sat_intervals.raster.watching import watched
-    from sat_intervals.run.output import OUTPUTS
-
-    check_files = watched(pair / name if pair.is_dir() else pair for pair in pairs for name in ("meta.json", *OUTPUTS))
-    check_settings = watched_settings(settings)
-
-    def check() -> None:
-        check_files()
-        check_settings()
-
-    return check
-
-
-def watched_pairs(pairs: "Iterable[Pair]", *others: Path | None) -> Callable[[], None]:
-    """Return a function that raises if an image, a truth or another raster was replaced since."""
-    from sat_intervals.raster import pixel_files, watched_rasters
-
-    files = [*(file for pair in pairs for file in (pair.left, pair.right, pair.truth)), *others]
-    return watched_rasters(files, pixel_files)
 
 
 def say_scenes(scenes: "list[SceneMetrics]") -> None:

@@ -11,7 +11,6 @@ from sat_intervals.cli.matching import (
     pair_options,
     run_options,
     search_options,
-    watched_settings,
 )
 from sat_intervals.cli.options import FILE, json_option, say_json
 
@@ -44,14 +43,12 @@ def match(
 
         click.echo(job_script(settings.load().cluster, out))
         return
-    check_settings = watched_settings(settings.file, settings.sections)
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.run.output import OUTPUTS
 
         check_not_replaced([settings.file], [out / name for name in OUTPUTS], [out / "tiles"])
         left, right = pair.open()
-        check_settings()  # they and the images are of the same moment
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
     if as_json:
         say_json(report)

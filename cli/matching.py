@@ -75,25 +75,6 @@ def named_by(settings: Path | None) -> list[str]:
     return named_files(read_yaml(settings)) if settings and os.path.isfile(settings) else []
 
 
-def watched_settings(file: Path | None, sections: Mapping[str, Any] | None = None) -> Callable[[], None]:
-    """Return a function that raises if settings, or files that they or ``sections`` name, are not those of now.
-
-    Call this before they are read: a calibration is read with the settings.
-    """
-    from sat_intervals.config import named_files
-    from sat_intervals.raster import watched_rasters
-    from sat_intervals.raster.watching import watched
-
-    check_file = watched([file])
-    check_named = watched_rasters([*named_by(file), *named_files(sections)])  # one of ranges may be virtual
-
-    def check() -> None:
-        check_file()
-        check_named()
-
-    return check
-
-
 @dataclass(frozen=True)
 class RunArguments:
     """How a run treats the tiles and files of its folder, and what it prints."""

@@ -121,6 +121,7 @@ def reference_options(dsm_help: str) -> Callable[[Command], Command]:
     return decorated
 
 
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print all figures as JSON.")
 
 

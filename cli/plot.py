@@ -1,7 +1,6 @@
 """``sat-intervals plot``: draw pictures of a finished run."""
 
 from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,19 +54,17 @@ def plot(
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
-    from sat_intervals.raster import watched_images
     from sat_intervals.results import open_results
     from sat_intervals.show.coverage import draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
-    from sat_intervals.show.marks import replaceable_here, write_made_here
     from sat_intervals.show.profile import draw_curve, draw_profile
     from sat_intervals.show.search_range import draw_range, has_range
 
     results = open_results(out, truth)
     _check(results, row, columns, pixel, beside)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
-    drawings: dict[str, Callable[[BytesIO], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
+    drawings: dict[str, Callable[[Path], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
     if _is_judged(results):
         drawings["errors"] = lambda target: draw_errors(results, target, dpi)
         drawings["coverage"] = lambda target: draw_coverage([out, *beside], target, dpi, truth=truth, **judging)
@@ -77,19 +74,11 @@ def plot(
         drawings["profile"] = lambda target: draw_profile(results, target, row, columns, dpi)
     if pixel:
         drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
-    check_unchanged = watched_images(results.images, judging["mask"])
-    pictures = dict[Path, BytesIO]()
-    with results.unchanged("dsm.tif"):
-        if _is_current(surface := out / "dsm.tif", results.report["finished"]):
-            drawings["dsm"] = lambda target: draw_surface(surface, target, dpi)
-        there = replaceable_here(out, [f"{name}.png" for name in drawings])
-        for name, draw in drawings.items():
-            draw(pictures.setdefault(out / f"{name}.png", BytesIO()))
-        check_unchanged()
-    with results.unchanged():  # another run may come to the folder
-        write_made_here({path: drawn.getvalue() for path, drawn in pictures.items()}, there)
-    for picture in pictures:
-        click.echo(picture)
+    if _is_current(surface := out / "dsm.tif", results.report["finished"]):
+        drawings["dsm"] = lambda target: draw_surface(surface, target, dpi)
+    for name, draw in drawings.items():
+        draw(out / f"{name}.png")
+        click.echo(out / f"{name}.png")
 
 
 def _is_judged(results: "Results") -> bool:

@@ -20,7 +20,7 @@ def project(out: Path) -> None:
     OUT/dsm_half_width.vrt    half the width of the intervals of heights
     OUT/*.qml                 style of the raster of the same name
 
-    QGIS 3.22 or newer opens it. Styles saved by QGIS are kept; a project saved by QGIS is not replaced.
+    QGIS 3.22 or newer opens it. Files of these names are replaced: save changes in QGIS under another name.
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.show.project import write_project
 

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from sat_intervals.cli.matching import PairArguments, pair_options
-from sat_intervals.cli.options import FILE, json_option, log_options, quiet_option, say_json
+from sat_intervals.cli.options import FILE, json_option, log_options, overwrite_option, quiet_option, say_json
 
 # Bars of the histogram that are printed, each of several bins.
 _BARS = 8
@@ -15,26 +15,33 @@ _BARS = 8
 @click.command("range", short_help="Find the search range of a pair.")
 @pair_options
 @click.option("--output", type=FILE, help="Write the local ranges, for --range-grid of match.")
+@overwrite_option
 @json_option
 @quiet_option
 @log_options
-def search_range(pair: PairArguments, output: Path | None, as_json: bool, quiet: bool) -> None:
+def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_json: bool, quiet: bool) -> None:
     """Find the search range of the epipolar images LEFT and RIGHT, as match does without --disparity.
 
     Prints the range and its evidence; --output keeps the ranges of the cells. --window has no effect: a range is always
     that of the whole images.
     """
     from sat_intervals.cli.console import Console
-    from sat_intervals.run.local_ranges import replaceable_ranges, write_ranges
+    from sat_intervals.raster import files_of
+    from sat_intervals.raster.identity import check_not_replaced
+    from sat_intervals.raster.publishing import check_free
+    from sat_intervals.run.local_ranges import write_ranges
     from sat_intervals.run.quality import doubts
     from sat_intervals.run.search_range import find_here
 
     with Console(quiet or as_json) as console:
         left, right = pair.open()
-        there = replaceable_ranges(output, left, right) if output else {}
+        if output:
+            names = [name for image in (left, right) for name in (image.path, image.mask) if name]
+            check_not_replaced([file for name in names for file in (name, *files_of(name))], [output])
+            check_free(output, overwrite=overwrite)
         found = find_here(left, right, console.progress)
         if output:
-            write_ranges(output, found.local, left, there)
+            write_ranges(output, found.local, left)
     if as_json:
         say_json(found.report())
         return

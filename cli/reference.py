@@ -5,7 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import FILE, json_option, log_options, quiet_option, say_json, sensor_options
+from sat_intervals.cli.options import (
+    FILE,
+    json_option,
+    log_options,
+    overwrite_option,
+    quiet_option,
+    say_json,
+    sensor_options,
+)
 
 if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
@@ -23,6 +31,7 @@ _SUSPECT_HEIGHT, _SUSPECT_ROWS = 10.0, 0.5
 @click.option("--crs", metavar="EPSG", help="CRS of the heights, in place of the file's.")
 @click.option("--no-register", is_flag=True, help="Do not move the reference to the points of the run.")
 @click.option("--output", type=FILE, help="File to write; default truth.tif in OUT.")
+@overwrite_option
 @sensor_options
 @json_option
 @quiet_option
@@ -36,6 +45,7 @@ def reference(
     crs: str | None,
     no_register: bool,
     output: Path | None,
+    overwrite: bool,
     sensor_files: tuple[Path, Path, Path, Path],
     as_json: bool,
     quiet: bool,
@@ -59,7 +69,10 @@ def reference(
     from sat_intervals.cli.console import Console
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
     from sat_intervals.raster import Vertical
+    from sat_intervals.raster.publishing import check_free
 
+    if output:
+        check_free(output, overwrite=overwrite)
     vertical = Vertical(ellipsoid, geoid)
     given = Reference(heights or points, points is not None, vertical, crs)  # type: ignore[arg-type]
     files = SensorFiles(*sensor_files)

@@ -17,7 +17,7 @@ from sat_intervals.cli.options import FILE, json_option, say_json, store_option
 def status(out: Path, store: str | None, as_json: bool) -> None:
     """Show how many tiles and strips of the run in OUT are done, during the run or after it ended.
 
-    The files of a complete run are compared with their checksums. For the folder of a batch, show the progress of each
+    For the folder of a batch, show the progress of each
     pair, and why pairs failed, without reading the files.
     """
     from sat_intervals.results import open_run
@@ -27,7 +27,7 @@ def status(out: Path, store: str | None, as_json: bool) -> None:
     pairs = read_report(out)
     if pairs is None:
         if is_complete(out):
-            open_run(out)  # raises if a file was damaged since
+            open_run(out)  # raises if a file is missing
         found = {str(out): _state(out, store)}
     else:
         found = {str(out / name): _state_of_pair(out / name, store, ended) for name, ended in pairs.items()}

@@ -1,6 +1,6 @@
 """``sat-intervals surface``: from two epipolar images to a surface model in one command."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,6 @@ from sat_intervals.cli.matching import (
     pair_options,
     run_options,
     search_options,
-    watched_settings,
 )
 from sat_intervals.cli.options import FILE, json_option, say_json, sensor_options
 from sat_intervals.cli.triangulate import point_warnings, say_points
@@ -23,11 +22,10 @@ if TYPE_CHECKING:
     from sat_intervals.cli.console import Console
     from sat_intervals.config import Interval
     from sat_intervals.config.pairs import PairOfBatch
-    from sat_intervals.results import Run
     from sat_intervals.run.batch import Finish
 
 # What is made of a run, in its folder.
-_FILES = "points.tif", "points.json", "dsm.tif"
+_FILES = "points.tif", "dsm.tif"
 
 
 @click.command(short_help="Match a pair, triangulate it and make a surface model.")
@@ -44,7 +42,6 @@ def surface(
     out: Path,
     sensor_files: tuple[Path, Path, Path, Path],
     cells: dict[str, Any],
-    check_calibration: Callable[[], None],
     as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
@@ -56,24 +53,20 @@ def surface(
     """
     from sat_intervals.cli.console import Console
 
-    check_settings = watched_settings(settings.file, settings.sections)
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
         from sat_intervals.run.before import report_before, tidy
 
         _check_kept(out, cells, [*sensor_files, *pair.files], settings.file)
-        check_unchanged = _watched(sensor_files, cells)
-        _check(out, cells, sensor_files, resolved(config).interval)
+        _check(cells, sensor_files, resolved(config).interval)
         left, right = pair.open()
-        check_settings()
-        check_calibration()
         report = None if run.overwrite else report_before(left, right, out, config, pair.window)
         if report is None:
             report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
         else:
             tidy(out, run.keep_tiles, config.cluster.store)
-        points, made = _points_and_surface(out, report["finished"], sensor_files, cells, check_unchanged, console)
+        points, made = _points_and_surface(out, sensor_files, cells, console)
     if as_json:
         say_json({"run": report, "points": points, "surface": made})
     console.summary(report, out)
@@ -87,13 +80,13 @@ def _check_kept(
     out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path], config: Path | None = None
 ) -> None:
     """Raise if a step would write over a file that is read."""
-    from sat_intervals.raster import other_files
+    from sat_intervals.raster import files_of
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.output import OUTPUTS
 
     results = [out / name for name in (*OUTPUTS, *_FILES)]
     rasters = [str(name) for name in (cells["geoid"], cells["resolution"]) if isinstance(name, (str, Path))]
-    read = [file for name in rasters for file in (name, *other_files(name))]
+    read = [file for name in rasters for file in files_of(name)]
     check_not_replaced([config, *sensor_files, *read], results, [out / "tiles"])
 
 
@@ -108,65 +101,25 @@ def _check_kept_by_all(pairs: "Sequence[PairOfBatch]", out: Path) -> None:
     )
 
 
-def _watched(sensor_files: Sequence[str | Path], cells: dict[str, Any]) -> Callable[[], None]:
-    """Return a function that raises if models, grids or rasters were changed since they were checked."""
-    from sat_intervals.raster import watched_rasters
-
-    like = cells["resolution"] if isinstance(cells["resolution"], Path) else None
-    return watched_rasters([*sensor_files, cells["geoid"], like])
-
-
 def _points_and_surface(
-    out: Path,
-    finished: str,
-    sensor_files: tuple[Any, Any, Any, Any],
-    cells: dict[str, Any],
-    check_unchanged: Callable[[], None],
-    console: "Console",
+    out: Path, sensor_files: tuple[Any, Any, Any, Any], cells: dict[str, Any], console: "Console"
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Make points and surface of the run that ended at ``finished``, and of no other; return their reports."""
+    """Make points and surface of a finished run; return their reports."""
     from sat_intervals.heights.dsm import make_surface
     from sat_intervals.heights.triangulate import triangulate
-
-    check_unchanged()
-    run = _opened(out, finished)
-    points = triangulate(run, *sensor_files, console.progress)
-    made = make_surface([run], out / "dsm.tif", **cells, progress=console.progress)
-    check_unchanged()
-    _check_of_run(out, finished, points["file"])
-    return points, made
-
-
-def _opened(out: Path, finished: str) -> "Run":
-    """Open a run; raise if it is not the one that ended at this time: another one took its place."""
-    from sat_intervals.errors import RunError
     from sat_intervals.results import open_run
 
     run = open_run(out)
-    if run.report["finished"] != finished:
-        raise RunError(f"the run in {out} was replaced before its points were made: rerun the command")
-    return run
+    points = triangulate(run, *sensor_files, console.progress)
+    return points, make_surface([run], out / "dsm.tif", **cells, progress=console.progress)
 
 
-def _check_of_run(out: Path, finished: str, points: dict[str, int]) -> None:
-    """Raise if the surface is of a run that ended at another time, or of other points: a command replaced these."""
-    from sat_intervals.errors import RunError
-    from sat_intervals.raster import read_tags
-    from sat_intervals.raster.published import published_points
-
-    if read_tags(out / "dsm.tif").get("RUNS") != finished or published_points(out) != points:
-        raise RunError(f"the run in {out} or its points were replaced before the surface was made: rerun the command")
-
-
-def _check(out: Path, cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
+def _check(cells: dict[str, Any], sensor_files: Sequence[str | Path], interval: "Interval | None") -> None:
     """Raise for what the later steps cannot use, before hours of matching."""
     from sat_intervals.heights.dsm import checked_cells, surface_tags
     from sat_intervals.heights.sensors import Sensors
-    from sat_intervals.raster import check_place
 
-    check_place(out / "points.tif")
-    given = (cells[name] for name in ("resolution", "crs", "radius", "geoid"))
-    _, cell, _, radius = checked_cells(out / "dsm.tif", *given)
+    _, cell, _, radius = checked_cells(*(cells[name] for name in ("resolution", "crs", "radius", "geoid")))
     surface_tags(["run"], [interval], cells["choices"].for_intervals([interval]), cell, radius)
     Sensors.load(*map(Path, sensor_files))
 
@@ -181,18 +134,16 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
 
     cells = {"crs": None, "radius": None, "geoid": None, "choices": SurfaceChoices()}
     errors: dict[str, SatIntervalsError] = {}
-    checked: dict[str, tuple[dict[str, Any], Callable[[], None]]] = {}
     if any(pair.sensors for pair in pairs):
         import sat_intervals.heights.sensors  # noqa: F401 (without its extra it raises, for all pairs)
     _check_kept_by_all(pairs, out)
     for pair in pairs:
         if not pair.sensors:
             continue
-        folder, of_pair = out / pair.name, {"resolution": pair.resolution, **cells}
-        _check_kept(folder, of_pair, pair.sensors)
+        of_pair = {"resolution": pair.resolution, **cells}
+        _check_kept(out / pair.name, of_pair, pair.sensors)
         try:
-            checked[pair.name] = of_pair, _watched(pair.sensors, of_pair)
-            _check(folder, of_pair, pair.sensors, None)
+            _check(of_pair, pair.sensors, None)
         except SatIntervalsError as error:
             errors[pair.name] = error
             click.echo(f"{pair.name}: there will be no surface: {error}", err=True)
@@ -202,7 +153,8 @@ def surfaces_of(pairs: "Sequence[PairOfBatch]", out: Path, console: "Console") -
             return {}
         if pair.name in errors:
             raise errors[pair.name]
-        points, made = _points_and_surface(out / pair.name, finished, pair.sensors, *checked[pair.name], console)
+        of_pair = {"resolution": pair.resolution, **cells}
+        points, made = _points_and_surface(out / pair.name, pair.sensors, of_pair, console)
         return {"points": points, "surface": made}
 
     return surface_of

@@ -28,7 +28,6 @@ def triangulate(out: Path, sensor_files: tuple[Path, Path, Path, Path], as_json:
     \b
     OUT/points.tif   longitude, latitude, height, its two bounds, residual,
                      positions of the points at both bounds
-    OUT/points.json  size and checksum of points.tif
 
     Models are GeoTIFFs with RPC tags, .geom or DIMAP XML files. Grids contain the sensor column and row (bands 1 and 2)
     of epipolar positions, as written by CARS and shareloc, or displacements to them, if OTB's tag METADATATYPE=OTB

@@ -114,13 +114,7 @@ class Calibration(CalibrationFile):
 
 
 def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calibration") -> Calibration:
-    """Read and check a calibration: the name of a built-in one, a YAML file, or its content.
-
-    Raises
-    ------
-    ConfigError
-        Names the file and the first error, in one line.
-    """
+    """Read and check a calibration: the name of a built-in one, a YAML file, or its content."""
     if isinstance(source, Calibration):
         return source
     if isinstance(source, Mapping):
@@ -188,10 +182,7 @@ def key_of(config: "Config") -> dict[str, Any]:
 def calibration_of(config: "Config") -> Calibration:
     """Return the calibration of the settings: the one that they give, else the built-in one with their key.
 
-    Raises
-    ------
-    ConfigError
-        The one given belongs to other settings, or no built-in one to these; names the first difference.
+    If there is none, the error names the first difference.
     """
     assert config.interval is not None
     given, key = config.interval.calibration, key_of(config)
@@ -239,13 +230,7 @@ def _flat(key: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def resolved(config: "Config") -> "Config":
-    """Return the settings with the content of their calibration, which decides the bytes of a run.
-
-    Raises
-    ------
-    ConfigError
-        See `calibration_of`.
-    """
+    """Return the settings with the content of their calibration, which decides the bytes of a run."""
     if config.interval is None or config.interval.coverage is None:
         return config
     interval = config.interval.model_copy(update={"calibration": calibration_of(config)})

@@ -7,7 +7,6 @@ from typing import Any
 
 import yaml
 
-from sat_intervals.config.sealing import is_as_made
 from sat_intervals.config.sections import ConfigError
 from sat_intervals.errors import SatIntervalsError
 
@@ -50,13 +49,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
-    """Parse YAML; duplicate keys and more than ``most`` nodes are errors.
-
-    Raises
-    ------
-    yaml.YAMLError, ValueError, RecursionError
-        The text is not valid YAML.
-    """
+    """Parse YAML; duplicate keys and more than ``most`` nodes are errors."""
     loader = _Loader(text, most)
     try:
         return loader.get_single_data()
@@ -65,15 +58,7 @@ def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
 
 
 def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:
-    """Read a file of settings or pairs of at most ``most`` bytes.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    SatIntervalsError
-        The file is larger.
-    """
+    """Read a file of settings or pairs of at most ``most`` bytes."""
     with file.open("rb") as stream:
         content = stream.read(most + 1)
     if len(content) > most:
@@ -82,22 +67,9 @@ def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:
 
 
 def read_mapping(file: Path, holds: str) -> Mapping[str, Any]:
-    """Read a YAML file that holds a mapping, ``holds`` in words; an empty file is an empty one.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    SatIntervalsError
-        It is too large, not YAML, holds something else, or its bytes differ from the CRC-32 in it.
-    """
+    """Read a YAML file that holds a mapping, ``holds`` in words; an empty file is an empty one."""
     try:
-        content = read_small(file)
-        if is_as_made(content) is False:
-            raise ConfigError(
-                f"{file} is damaged or was edited: restore it, or delete its line with CRC-32 if you edited it"
-            )
-        values = load_yaml(content)
+        values = load_yaml(read_small(file))
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         raise ConfigError(f"{file}: {line}{error.problem}") from error

@@ -87,13 +87,7 @@ class HeightCalibration(CalibrationFile):
         return [kind.margin for kind in self.classes]
 
     def check_surface(self, key: Mapping[str, str]) -> None:
-        """Raise if the calibration belongs to other surfaces than one with this key.
-
-        Raises
-        ------
-        ConfigError
-            Names the first difference.
-        """
+        """Raise if the calibration belongs to other surfaces than one with this key."""
         if different := differences(self.surface, key, "the surface"):
             raise ConfigError(f"calibration {self.name} belongs to other surfaces, {different[0]}: {_MAKE_ONE}")
 
@@ -105,13 +99,7 @@ def surface_key(tags: Mapping[str, str], cell: float) -> dict[str, str]:
 
 
 def load_height_calibration(path: str | os.PathLike[str]) -> HeightCalibration:
-    """Read and check a calibration of heights.
-
-    Raises
-    ------
-    ConfigError
-        Names the file and the first error, in one line.
-    """
+    """Read and check a calibration of heights."""
     file = Path(path)
     try:
         values = read_mapping(file, f"keys {', '.join(HeightCalibration.model_fields)}")

@@ -82,11 +82,6 @@ def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
     A folder holds ``left.tif``, ``right.tif``, ``truth.tif`` and ``meta.json`` with ``disparity``, the search range
     ``[minimum, maximum]``, and optionally ``group``. A CSV file has a header with the columns left, right, truth,
     minimum, maximum and optionally name, group, tolerance and remove_bias; its paths are relative to the file.
-
-    Raises
-    ------
-    SatIntervalsError
-        Names the file or row and what is missing there.
     """
     pairs = []
     for path in map(Path, paths):
@@ -106,11 +101,6 @@ def read_batch(file: Path) -> list[PairOfBatch]:
     ``left_grid``, ``right_grid`` and ``resolution`` for a surface model; and any setting under its dotted name, such as
     ``sgm.p2``. YAML and JSON hold a list of such rows, in which a setting may also be a section. Paths
     are relative to the file.
-
-    Raises
-    ------
-    SatIntervalsError
-        Names the file, the row and the error.
     """
     pairs = [_of_batch(place, row, file) for place, row in _rows(file, ("name", "left", "right"))]
     check_names((pair.name for pair in pairs), f"{file}: ")

@@ -104,13 +104,7 @@ def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:
 
 
 def read_yaml(file: Path) -> Mapping[str, Any]:
-    """Read the sections of a file of settings, which `load_config` checks.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, or has no sections.
-    """
+    """Read the sections of a file of settings, which `load_config` checks."""
     try:
         values = read_mapping(file, f"sections {', '.join(Config.model_fields)}")
     except OSError as error:

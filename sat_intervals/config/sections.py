@@ -102,20 +102,7 @@ class Disparity(Section):
         return self.maximum - self.minimum + 1
 
     def check_images(self, left: str, left_columns: int, right: str, right_columns: int) -> None:
-        """Raise if no pixel of the left image has a candidate in the right one.
-
-        Parameters
-        ----------
-        left, right
-            Names of the images, for the message.
-        left_columns, right_columns
-            Widths in pixels.
-
-        Raises
-        ------
-        ConfigError
-            Names the range and both images.
-        """
+        """Raise if no pixel of the left image has a candidate in the right one; names of both are for the message."""
         if left_columns - 1 + self.maximum < 0 or self.minimum > right_columns - 1:
             raise ConfigError(
                 f"disparities {self.minimum} to {self.maximum} move every pixel of {left} ({left_columns} columns) "

@@ -13,13 +13,7 @@ _LARGEST = 256 * 10**6
 
 
 def weights_file(weights: str | None) -> Path:
-    """Find the file of a network: the given one, or the official one without an import of its package.
-
-    Raises
-    ------
-    SatIntervalsError
-        If there is no such file, or it is too large.
-    """
+    """Find the file of a network: the given one, or the official one without an import of its package."""
     if weights is not None:
         if not Path(weights).is_file():
             raise SatIntervalsError(f"cost.weights {weights}: no such file: name an ONNX network, or null")

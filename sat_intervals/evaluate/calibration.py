@@ -26,7 +26,7 @@ from sat_intervals.evaluate.comparison import (
     tiles,
 )
 from sat_intervals.kernels.conformal import least_number, margins, widened
-from sat_intervals.raster import read_tags, watched_rasters
+from sat_intervals.raster import read_tags
 
 # Heights that are used: a sample, if there are more.
 _MOST = 1 << 20
@@ -89,14 +89,12 @@ def calibrate_surface(
         A file cannot be used, both do not overlap or have too few cells in common; or seem to have different datums,
         and the reference was not moved.
     """
-    check_unchanged = watched_rasters([surface, reference])
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)
     coverage = _checked_coverage(given.surface, tags, coverage)
     found = registered(given) if registers else None
     moved = moved_by(given, found and found.report())
     sample, cells_of_height = _sample(moved)
-    check_unchanged()
     warnings = [NOT_MOVED] if registers and found is None else []
     warnings += _datum_warnings(given, sample, moved.shift[2], is_registered=found is not None)
     sample = sample.of(np.isfinite(sample.width))

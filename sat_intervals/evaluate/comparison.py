@@ -82,11 +82,7 @@ class Comparison:
     ) -> np.ndarray:
         """Read the moved reference in ``shape`` cells at a place, ``finer`` of them along each side of its cells.
 
-        Raises
-        ------
-        SatIntervalsError
-            A ``needed`` height is impossible on Earth: a no-data value that the file does not declare, or another unit.
-            Others are NaN.
+        Heights that no ground has are NaN, and errors where they are ``needed``: undeclared no data, or another unit.
         """
         east, north, up = self.shift
         cells = place.moved(-east, -north).refined(finer)
@@ -101,13 +97,7 @@ class Comparison:
 
 
 def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
-    """Open a surface model and its reference.
-
-    Raises
-    ------
-    SatIntervalsError
-        A file cannot be read or used.
-    """
+    """Open a surface model and its reference."""
     surface, reference = Path(surface), Path(reference)
     shape, place = read_place(surface)
     if not is_surface(surface):

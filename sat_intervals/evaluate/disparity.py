@@ -15,8 +15,7 @@ from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.match.histogram import bias_histogram
 from sat_intervals.match.postprocess import cut_rows, with_halo
 from sat_intervals.products import Bands
-from sat_intervals.raster import Layer, watched_images
-from sat_intervals.raster.identity import is_changed
+from sat_intervals.raster import Layer
 from sat_intervals.results import Run, open_run
 
 _PIXELS = 1 << 20  # evaluated at a time, 150 bytes each; pixels read ahead take 25 bytes
@@ -60,7 +59,7 @@ def evaluate_run(
     Raises
     ------
     SatIntervalsError
-        The folder is not a run, there is no truth, the left image beside it has changed, or sizes do not fit.
+        The folder is not a run, there is no truth, or sizes do not fit.
     """
     run = open_run(out)
     config = run.config
@@ -73,23 +72,16 @@ def evaluate_run(
     def strips() -> Iterator[Bands]:
         return _read_strips(run, truth_layer, mask_layer)
 
-    check_unchanged = watched_images(layer.image for layer in (truth_layer, mask_layer) if layer is not None)
     figures = evaluate(strips, criteria, remove_bias=remove_bias, with_rejected=config.products.keep_rejected)
-    check_unchanged()
     return {"cost": config.cost.method, **figures}
 
 
 def _truth_beside(run: Run) -> Path:
-    """Return the truth beside the left image; raise if there is none, or if it may be that of another image."""
-    left, truth = run.report["inputs"]["left"], run.truth_beside
-    if not truth.exists():
-        raise SatIntervalsError(f"{run.out}: there is no truth.tif beside its left image {left['path']}: give --truth")
-    if is_changed(left["path"], left):
-        raise SatIntervalsError(
-            f"{truth} is beside {left['path']}, which has changed since it was matched: restore that image or give "
-            "--truth"
-        )
-    return truth
+    """Return the truth beside the left image; raise if there is none."""
+    if not run.truth_beside.exists():
+        left = run.report["inputs"]["left"]["path"]
+        raise SatIntervalsError(f"{run.out}: there is no truth.tif beside its left image {left}: give --truth")
+    return run.truth_beside
 
 
 def criteria_of(config: Config, tolerance: float = 0.0) -> Criteria:

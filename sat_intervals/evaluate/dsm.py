@@ -18,7 +18,7 @@ from sat_intervals.evaluate.comparison import (
     registered,
     tiles,
 )
-from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags, watched_rasters
+from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.tiling import Window
 
 # Limits of classes: slope of the reference in degrees, width of the interval in metres.
@@ -63,13 +63,7 @@ def evaluate_surface(
     ``from`` and ``to`` are the limits of a class, ``class`` its number. ``registration``, see `Registration.report`;
     None without, or with too few heights (see ``warnings``). ``nominal``: coverage or alpha of the surface;
     None if unknown.
-
-    Raises
-    ------
-    SatIntervalsError
-        A file cannot be read, or both do not overlap, or their heights differ by too much.
     """
-    check_unchanged = watched_rasters([surface, reference, classes])
     given = open_comparison(surface, reference)
     nominal = nominal_of(given.surface)
     if classes is not None:
@@ -90,7 +84,6 @@ def evaluate_surface(
             _add_classes(kinds, errors, _classes(given, Path(classes), window)[known], Path(classes), nominal)
         if moved is not given:
             before.add(_errors(given, window)[0])
-    check_unchanged()
     report = whole.report()
     in_place = before.report() if moved is not given else report
     check_common(given, in_place["count"], in_place["median"])
@@ -173,11 +166,6 @@ def read_profile(given: Comparison, line: tuple[float, float, float, float] | No
     """Read a surface and its reference along a line, by default the middle row.
 
     ``line`` is easting and northing of both ends, in the surface's CRS.
-
-    Raises
-    ------
-    SatIntervalsError
-        The line does not cross the surface.
     """
     place = given.place.transform
     assert place is not None

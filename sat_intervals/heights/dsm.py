@@ -20,19 +20,13 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import (
     OutputWriter,
     Projection,
-    check_as_made,
-    check_place,
+    files_of,
     geoid_grid,
-    is_surface,
     north_up,
-    other_files,
     read_place,
-    replaceable,
     surface_file,
     utm_of,
-    watched_rasters,
 )
-from sat_intervals.raster.published import POINTS_FILE, checksum_of_points, folders_of
 from sat_intervals.results import Run
 from sat_intervals.tiling import Window
 
@@ -63,7 +57,7 @@ def make_surface(
     outs
         Folders of triangulated runs of the same place, or such runs as they were opened.
     path
-        The Cloud-Optimized GeoTIFF to write.
+        The Cloud-Optimized GeoTIFF to write; an existing file is replaced.
     resolution
         Side of a cell in metres; or a north-up raster with square pixels, whose grid and CRS are used.
     crs
@@ -92,18 +86,20 @@ def make_surface(
         A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
-    like = resolution if isinstance(resolution, Path) else None
-    inputs = [*((out.out if isinstance(out, Run) else Path(out)) / "points.tif" for out in outs), geoid, like]
-    check_unchanged = watched_rasters(inputs)
-    with replaceable(path.parent, [surface_file(path.name)]) as there:
-        grid, resolution, crs, radius = checked_cells(path, resolution, crs, radius, geoid)
-    runs = _runs(outs, path, inputs)
+    given = [file for name in (geoid, resolution) if isinstance(name, Path) for file in files_of(str(name))]
+    grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
+    runs = triangulated(outs)
+    for run in runs:
+        run.check_kept([path], [run.out / "points.tif", *given])
     intervals = [run.config.interval for run in runs]
     choices = choices.for_intervals(intervals)
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
-    tags |= _origin(runs, path, geoid)
+    tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
     projection = _projection(runs, crs, geoid)
-    clouds = _clouds(runs, projection, choices, progress)
+    clouds = []
+    for done, run in enumerate(runs):
+        progress("extent", done, len(runs))
+        clouds.append(PointCloud(run, projection, choices))
     cells = _cells(clouds, resolution, radius, grid)
     place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
     writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
@@ -113,13 +109,15 @@ def make_surface(
             tally.add(strip)
             writer.write(row, strip.bands)
             progress("cells", row + strip.bands.shape[1], cells.rows)
-        check_unchanged()
         progress("files", 0, 1)
-        writer.publish(replaceable=there)
+        writer.publish()
         progress("files", 1, 1)
+    counts = {name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")}
     return {
         "crs": projection.crs,
-        **_counts(cells, clouds),
+        "rows": cells.rows,
+        "columns": cells.columns,
+        **counts,
         **tally.report(cells.rows * cells.columns),
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
@@ -127,40 +125,10 @@ def make_surface(
     }
 
 
-def _origin(runs: Sequence[Run], path: Path, geoid: Path | None) -> dict[str, str]:
-    """Return the tags of points and folders, which `is_surface_of` compares, and of what heights refer to."""
-    points = " ".join(checksum_of_points(run.out / POINTS_FILE) for run in runs)
-    folders = folders_of(path, [run.out for run in runs])
-    return {"POINTS": points, "FOLDERS": folders, "HEIGHTS": f"above {geoid or 'the WGS 84 ellipsoid'}"}
-
-
-def _counts(cells: Cells, clouds: Sequence[PointCloud]) -> dict[str, int]:
-    points = {name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")}
-    return {"rows": cells.rows, "columns": cells.columns, **points}
-
-
-def _runs(outs: Sequence[str | Path | Run], path: Path, inputs: Sequence[Path | None]) -> list[Run]:
-    runs = triangulated(outs)
-    read = [*inputs, *(file for name in inputs if name for file in other_files(str(name)))]
-    for run in runs:
-        run.check_kept([path], read)
-    return runs
-
-
 def checked_cells(
-    path: Path, resolution: float | Path, crs: str | None, radius: float | None, geoid: Path | None = None
+    resolution: float | Path, crs: str | None, radius: float | None, geoid: Path | None = None
 ) -> tuple[Cells | None, float, str | None, float]:
-    """Check the arguments of `make_surface` that need no run; return the grid of a raster, resolution, CRS and radius.
-
-    Raises
-    ------
-    SatIntervalsError
-        The file to write is something else, or an argument cannot be used.
-    """
-    if path.exists() and not is_surface(path):
-        raise SatIntervalsError(f"{path} exists and is not a surface model: move it away")
-    check_as_made(path)
-    check_place(path)
+    """Check the arguments of `make_surface` that need no run; return grid of a raster, resolution, CRS and radius."""
     grid = None
     if isinstance(resolution, Path):
         grid, crs = _grid_of(resolution, crs)
@@ -170,30 +138,23 @@ def checked_cells(
     elif geoid is not None:
         geoid_grid(geoid)
     radius = resolution if radius is None else radius
-    _check_lengths(resolution, radius)
+    for name, value in (("resolution", resolution), ("radius", radius)):
+        if not 0 < value <= _LARGEST:
+            raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, up to {_LARGEST:g}")
+    if radius > _REACH * resolution:
+        raise SatIntervalsError(
+            f"radius is {radius:g} m, {radius / resolution:.0f} cells of {resolution:g} m: choose at most "
+            f"{_REACH * resolution:g} m, or a coarser --resolution"
+        )
     return grid, resolution, crs, radius
 
 
 def surface_tags(
     runs: Sequence[str], intervals: Sequence[Interval | None], choices: SurfaceChoices, cell: float, radius: float
 ) -> dict[str, str]:
-    """Return tags of a surface: its runs, how its intervals are made and which coverage they are to reach.
+    """Return tags of a surface: when its runs finished, how its intervals are made, which coverage they are to reach.
 
-    Parameters
-    ----------
-    runs
-        When each run finished, which identifies it.
-    intervals
-        Settings of the runs.
-    choices
-        With the defaults of these runs.
-    cell, radius
-        Metres.
-
-    Raises
-    ------
-    SatIntervalsError
-        The calibration belongs to other surfaces.
+    ``choices`` have the defaults of these runs; ``cell`` and ``radius`` are metres.
     """
     levels = {("COVERAGE", one.coverage) if one.coverage else ("ALPHA", one.alpha) for one in intervals if one}
     tags = {"RUNS": " ".join(runs), **choices.tags(), "RADIUS": f"{radius:g} m"}
@@ -208,17 +169,6 @@ def surface_tags(
     tags.pop("ALPHA", None)
     tags |= {"COVERAGE": f"{calibration.coverage:g}", "CALIBRATION": f"{calibration.name} {calibration.sha256}"}
     return tags | {"REGISTERED": "yes" if calibration.registered else "no"}
-
-
-def _check_lengths(resolution: float, radius: float) -> None:
-    for name, value in (("resolution", resolution), ("radius", radius)):
-        if not 0 < value <= _LARGEST:
-            raise SatIntervalsError(f"{name} is {value:g} m: give one above 0, up to {_LARGEST:g}")
-    if radius > _REACH * resolution:
-        raise SatIntervalsError(
-            f"radius is {radius:g} m, {radius / resolution:.0f} cells of {resolution:g} m: choose at most "
-            f"{_REACH * resolution:g} m, or a coarser --resolution"
-        )
 
 
 def _projection(runs: Sequence[Run], crs: str | None, geoid: Path | None) -> Projection:
@@ -243,16 +193,6 @@ def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
     code = place.crs.to_epsg()
     crs = f"EPSG:{code}" if code else place.crs.to_wkt()
     return Cells(place.transform.c, place.transform.f, across, rows, columns), crs
-
-
-def _clouds(
-    runs: Sequence[Run], projection: Projection, choices: SurfaceChoices, progress: Progress
-) -> list[PointCloud]:
-    clouds = []
-    for done, run in enumerate(runs):
-        progress("extent", done, len(runs))
-        clouds.append(PointCloud(run, projection, choices))
-    return clouds
 
 
 def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float, grid: Cells | None) -> Cells:

@@ -30,11 +30,6 @@ def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
     left
         Georeferencing of the whole left epipolar image. OTB takes it as the position of its pixels in epipolar
         coordinates, for the right image, too.
-
-    Raises
-    ------
-    SatIntervalsError
-        Sensor positions change by less than 0.4 or more than 40 pixels per epipolar pixel. Nothing else is tested.
     """
     grid = RectificationGrid(str(path))
     has_displacements = read_tags(path).get(_TAG) == _OTB

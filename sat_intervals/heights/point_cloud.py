@@ -26,7 +26,7 @@ from sat_intervals.kernels.splat import (
     splat,
 )
 from sat_intervals.products import OPEN_ABOVE, OPEN_BELOW
-from sat_intervals.raster import Projection, watched_rasters
+from sat_intervals.raster import Projection
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Window
 
@@ -99,7 +99,6 @@ class PointCloud:
     def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices | None = None) -> None:
         self.run = run
         self._path = run.out / "points.tif"
-        self._check_unchanged = watched_rasters([self._path])
         self._projection = projection
         self._choices = choices or SurfaceChoices().for_intervals([run.config.interval])
         self._extents: list[tuple[Window, Extent]] = []
@@ -116,7 +115,6 @@ class PointCloud:
         if not self._choices.keeps_open:
             validity = self.run.read_bands(window).validity.astype(np.int64)
             open_ended = known & ~outlying & (validity & (OPEN_BELOW | OPEN_ABOVE) != 0)
-        self._check_unchanged()
         return bands, known & ~outlying & ~open_ended, int(outlying.sum()), int(open_ended.sum())
 
     def _outlying(self, window: Window, limit: float) -> np.ndarray:

@@ -1,26 +1,15 @@
 """Read points with heights in parts: CSV, GeoPackage and other vector files (pyogrio), LAS and LAZ (laspy)."""
 
 import csv
-from collections.abc import Callable, Iterator
-from glob import escape
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.errors import ChangedInputError, SatIntervalsError, check_file, check_regular
-from sat_intervals.raster import GROUND, Frame, Vertical, stamps
-from sat_intervals.raster.watching import watched
+from sat_intervals.errors import SatIntervalsError, check_file
+from sat_intervals.raster import GROUND, Frame, Vertical
 
-# Bytes in which GDAL looks for what a file is.
-_HEAD = 4096
-# Endings of files that are read with a Shapefile or a table.
-_WITH = ".dbf", ".shx", ".prj", ".cpg", ".csvt"
-# Formats of vectors in one file, or in those with `_WITH`.
-_DRIVERS = {
-    "CSV", "ESRI Shapefile", "ESRIJSON", "FlatGeobuf", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "JSONFG", "KML",
-    "LIBKML", "ODS", "Parquet", "SQLite", "TopoJSON", "XLSX",
-}  # fmt: skip
 # Points read at a time.
 _PART = 500_000
 # Names of columns, in lower case; the first found counts. Those of ICESat-2 products are among them.
@@ -43,11 +32,6 @@ class PointFile:
         Replaces the CRS of the file. Longitude and latitude of a CSV file are on the WGS 84 ellipsoid without it.
     vertical
         What its heights refer to.
-
-    Raises
-    ------
-    SatIntervalsError
-        The file cannot be read, or lacks heights, a CRS or a vertical reference.
     """
 
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
@@ -60,7 +44,6 @@ class PointFile:
 
     def parts(self) -> Iterator[np.ndarray]:
         """Yield ``(n, 3)`` float64 x, y and height in the frame, of points that have all and are on the ground."""
-        check_regular(self._path)  # again: a pipe may have taken its place
         try:
             for part in self._parts(self._path):
                 metres = part[:, 2] * self.frame.unit
@@ -70,37 +53,6 @@ class PointFile:
             raise
         except Exception as error:  # the libraries raise many types
             raise _unreadable(self._path, error) from error
-
-
-def watched_points(path: Path) -> Callable[[], None]:
-    """Return a function that raises if a file of points, or one that is read with it, was replaced or changed since.
-
-    Raises
-    ------
-    SatIntervalsError
-        It is a virtual file, whose sources could change unnoticed.
-    """
-    if path.suffix.lower() in (".csv", ".las", ".laz"):
-        return watched([path])
-    if path.is_file():
-        with path.open("rb") as stream:
-            is_virtual = b"<OGRVRTDataSource" in stream.read(_HEAD)
-        if is_virtual:
-            raise SatIntervalsError(
-                f"{path} is read from other files, which may change meanwhile: convert it with ogr2ogr"
-            )
-    beside = [file for file in path.parent.glob(f"{escape(path.stem)}.*") if file.suffix.lower() in _WITH]
-    check_files = watched([path, *beside, *(path.with_suffix(ending) for ending in _WITH)])
-    target = path.resolve()  # beside which SQLite keeps them
-    journals = [target.name + ending for ending in ("-wal", "-journal")]
-    before = stamps(target.parent, journals)  # root's reading changes their other times
-
-    def check() -> None:
-        check_files()
-        if stamps(target.parent, journals) != before:
-            raise ChangedInputError(f"{path} was changed while it was read: rerun the command")
-
-    return check
 
 
 def _unreadable(path: Path, error: Exception) -> SatIntervalsError:
@@ -203,15 +155,9 @@ def _vector_library() -> tuple[Any, Any]:
 def _crs_of_vectors(path: Path) -> str | None:
     pyogrio, _ = _vector_library()
     try:
-        info = pyogrio.read_info(path)
+        crs = pyogrio.read_info(path)["crs"]
     except Exception as error:
         raise _unreadable(path, error) from error
-    if info["driver"] not in _DRIVERS:
-        raise SatIntervalsError(
-            f"{path} has the format {info['driver']}, of which GDAL may read more files: convert it to GeoPackage with "
-            "ogr2ogr"
-        )
-    crs = info["crs"]
     return None if crs is None else str(crs)
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import POINTS
 from sat_intervals.raster import read_layers, read_shape, read_tags
-from sat_intervals.raster.published import check_points
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Grid, Window
 
@@ -19,13 +18,7 @@ WINDOW = 512
 
 
 def triangulated(outs: Sequence[str | Path | Run]) -> list[Run]:
-    """Open runs with points of their own, unless they are open.
-
-    Raises
-    ------
-    SatIntervalsError
-        A folder is not a run, is given twice, or has no points, those of an earlier run, or damaged ones.
-    """
+    """Open runs, unless they are open; raise if one is given twice, or has no points or those of an earlier run."""
     runs: list[Run] = []
     for given in outs:
         run = given if isinstance(given, Run) else open_run(given)
@@ -34,7 +27,6 @@ def triangulated(outs: Sequence[str | Path | Run]) -> list[Run]:
             raise SatIntervalsError(f"{out} has no points.tif: run sat-intervals triangulate on it first")
         if read_tags(path).get("RUN") != run.report["finished"] or read_shape(path) != (len(POINTS), *run.shape):
             raise SatIntervalsError(f"{path} belongs to an earlier run in {out}: triangulate again")
-        check_points(out)
         if known := [one.out for one in runs if one.report["finished"] == run.report["finished"]]:
             raise SatIntervalsError(f"{known[0]} and {out} are the same run: give each run once")
         runs.append(run)
@@ -42,20 +34,9 @@ def triangulated(outs: Sequence[str | Path | Run]) -> list[Run]:
 
 
 def read_points(path: Path, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Read the bands of ``points.tif`` in a window and the mask of its points.
-
-    Raises
-    ------
-    SatIntervalsError
-        A pixel has some of longitude, latitude and height, but not all.
-    """
+    """Read the bands of ``points.tif`` in a window, and the mask of its points ``(rows, columns)``."""
     bands = read_layers(path, window)
-    if len(bands) != len(POINTS):
-        raise RunError(f"{path} was replaced by another file while it was read: rerun the command")
-    known = np.isfinite(bands[: POINT["height"] + 1])
-    if (known != known[0]).any():
-        raise SatIntervalsError(f"{path} is damaged, some pixels have only part of a point: triangulate again")
-    return bands, known[0]
+    return bands, np.isfinite(bands[POINT["height"]])
 
 
 def point_near_the_middle(runs: Sequence[Run]) -> tuple[float, float]:

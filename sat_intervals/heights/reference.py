@@ -14,7 +14,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.heights.location import GroundLattice, Location
-from sat_intervals.heights.point_files import PointFile, watched_points
+from sat_intervals.heights.point_files import PointFile
 from sat_intervals.heights.point_sight import PointSight
 from sat_intervals.heights.points import point_near_the_middle, read_points, triangulated
 from sat_intervals.heights.raster_sight import RasterSight, Scene, Shift
@@ -23,19 +23,13 @@ from sat_intervals.heights.sensors import Sensors
 from sat_intervals.kernels.registration import LEAST, Blocks, Registration, register
 from sat_intervals.progress import Progress
 from sat_intervals.raster import (
-    MARK,
     HeightRaster,
     OutputWriter,
     Projection,
     Vertical,
-    check_as_made,
-    check_made_by,
-    check_place,
     read_layers,
-    replaceable,
     truth_file,
     utm_of,
-    watched_rasters,
 )
 from sat_intervals.raster.published import tag_of_left
 from sat_intervals.results import Run, open_run
@@ -104,7 +98,7 @@ def make_truth(
     reference
         The heights.
     path
-        The file to write; by default ``truth.tif`` in ``out``.
+        The file to write, an existing one is replaced; by default ``truth.tif`` in ``out``.
     registers
         Whether to move the reference by its constant shift from the points of the run.
     progress
@@ -117,45 +111,32 @@ def make_truth(
     images show a point; ``correlation`` of disparity and truth over valid pixels, None for few; ``registration``, None
     without: ``shift`` and ``deviation`` (easting, northing, height in metres), ``is_horizontal``, ``used`` points, and
     figures of height - reference ``before`` and ``after``, see `kernels.registration.summary`.
-
-    Raises
-    ------
-    SatIntervalsError
-        An input cannot be used, files do not fit, or the file cannot be written.
     """
     run = open_run(out)
     path = run.out / "truth.tif" if path is None else path
-    with replaceable(path.parent, [truth_file(path.name)]) as there:
-        check_made_by(path, "reference", "REFERENCE")
-        check_as_made(path)
-    check_place(path)
     run.check_kept([path], [*files, reference.path, run.out / "points.tif"])
-    check_rasters = watched_rasters([reference.path, reference.vertical.geoid, run.out / "points.tif"])
-    check_points = watched_points(reference.path) if reference.is_points else lambda: None
     if registers:
         triangulated([run.out])
     work = _Work(run, Sensors.load(*files, left=run.left_georeferencing), reference)
     if registers:
-        with run.unchanged("points.tif"):
-            work.check_points()
+        work.check_points()
     found = work.registration(progress) if registers else None
     shift = Shift() if found is None else Shift(*map(float, found.shift))
-    tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), "REGION": run.region.in_words, **MARK}
+    tags = {"RUN": run.report["finished"], "REFERENCE": str(reference.path), "REGION": run.region.in_words}
+    tags["SOFTWARE"] = "sat-intervals"
     tags |= tag_of_left(run.report["inputs"]["left"])
     tags["SHIFT"] = " ".join(f"{part:.3f}" for part in shift) + " m"
     tally = _Tally(run)
     with (
         OutputWriter(path.parent, [truth_file(path.name)], *run.shape, run.georeferencing, tags) as writer,
-        TemporaryFile(dir=path.parent) as file,  # without a name, so that nobody can exchange it
+        TemporaryFile(dir=path.parent) as file,
     ):
         for row, strip in work.strips(shift, file, progress):
             writer.write(row, strip[np.newaxis].astype(np.float32))
             tally.add(row, strip)
-        check_rasters()
-        check_points()
         tally.check(reference.path, work.place)
         progress("files", 0, 1)
-        writer.publish(replaceable=there)
+        writer.publish()
         progress("files", 1, 1)
     return tally.report() | {"row_misfit": work.row_misfit, "registration": found and found.report()}
 

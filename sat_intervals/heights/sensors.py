@@ -13,7 +13,7 @@ from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.heights.grids import read_grid
 from sat_intervals.kernels.compiled import kernels_of_others
 from sat_intervals.kernels.lattice import interpolate
-from sat_intervals.raster import GROUND, Georeferencing, watched_rasters
+from sat_intervals.raster import GROUND, Georeferencing
 from sat_intervals.tiling import Window
 
 try:
@@ -75,19 +75,11 @@ class Sensors:
         """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`.
 
         ``left`` is the georeferencing of the whole left epipolar image, which grids of OTB refer to.
-
-        Raises
-        ------
-        SatIntervalsError
-            A file is missing, has another content, or was replaced meanwhile.
         """
-        check_unchanged = watched_rasters([left_model, right_model, left_grid, right_grid])
         models = (_read(path, "RPC model", GeoModel) for path in (left_model, right_model))
         read = partial(read_grid, left=left or Georeferencing())
         grids = (_read(path, "epipolar grid", read) for path in (left_grid, right_grid))
-        sensors = cls(*models, *grids)
-        check_unchanged()
-        return sensors
+        return cls(*models, *grids)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions, see `Points`.
@@ -139,11 +131,6 @@ class Lattice:
         Columns of the right image.
     minimum, maximum
         The search range.
-
-    Raises
-    ------
-    SatIntervalsError
-        The grids do not cover the region, or the models do not fit.
     """
 
     def __init__(self, sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:

@@ -4,21 +4,14 @@ Points are interpolated from a lattice at about three seconds of processor time 
 without resuming is enough. Rows are read, computed and written strip by strip, so memory does not depend on the size.
 """
 
-import json
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.progress import Progress
-from sat_intervals.raster import POINT_FILES, OutputWriter, examined, read_tags
-from sat_intervals.raster.identity import checksum_of
-from sat_intervals.raster.old_publishing import POINTS_REPORT
-from sat_intervals.raster.published import POINTS_FILE, published_points
-from sat_intervals.raster.seal import is_as_made
+from sat_intervals.raster import POINT_FILES, OutputWriter
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -40,12 +33,12 @@ def triangulate(
     right_grid: str | Path,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Triangulate a run and write ``points.tif`` to its folder, with its size and CRC-32 in ``points.json``.
+    """Triangulate a run and write ``points.tif`` to its folder; an existing one is replaced.
 
     Parameters
     ----------
     out
-        Folder of the finished run, or the run as it was opened: another one in its folder is then refused.
+        Folder of the finished run, or the run as it was opened.
     left_model, right_model
         RPC models of the sensor images: GeoTIFF with RPC tags, ``.geom`` or DIMAP XML.
     left_grid, right_grid
@@ -57,7 +50,7 @@ def triangulate(
 
     Returns
     -------
-    ``file``, size and CRC-32 of ``points.tif``; ``points``, the number of points; ``lost``, the number of valid pixels
+    ``points``, the number of points; ``lost``, the number of valid pixels
     without a point, because grids or models have no values there; ``beyond``, the number of pixels by which the left
     grid reaches beyond the left image, and the ``grid_step`` in pixels; if there are points, minimum and maximum of
     ``height`` (metres above the ellipsoid) and ``residual`` (metres); ``median_residual`` (metres) at some positions
@@ -71,9 +64,7 @@ def triangulate(
     from sat_intervals.heights.sensors import Lattice, Sensors  # needs the extra `dsm`
 
     run = out if isinstance(out, Run) else open_run(out)
-    run.check_kept(
-        [run.out / name for name in (POINTS_FILE, POINTS_REPORT)], [left_model, right_model, left_grid, right_grid]
-    )
+    run.check_kept([run.out / "points.tif"], [left_model, right_model, left_grid, right_grid])
     search = run.config.disparity
     models = map(Path, (left_model, right_model, left_grid, right_grid))
     sensors = Sensors.load(*models, left=run.left_georeferencing)
@@ -82,19 +73,15 @@ def triangulate(
     tags = {"RUN": run.report["finished"], "LEFT_MODEL": str(left_model), "RIGHT_MODEL": str(right_model)}
     tally = _Tally()
     with OutputWriter(run.out, POINT_FILES, *run.shape, run.georeferencing, tags) as writer:
-        with examined(run.out, [POINTS_FILE, POINTS_REPORT]) as there:
-            _check_own(run.out)
         for window, disparities in _strips(run):
             bands = _bands(lattice, window, disparities)
             writer.write(window.row, bands)
             tally.add(int(np.isfinite(disparities[0]).sum()), height=bands[2], residual=bands[5])
             progress("points", window.row_stop, run.shape[0])
         progress("files", 0, 1)
-        files = writer.build()
-        writer.publish((POINTS_REPORT, json.dumps({"files": files}, indent=1) + "\n"), replaceable=there)
+        writer.publish()
         progress("files", 1, 1)
-    more = {"file": files[POINTS_FILE], "median_residual": lattice.residual}
-    return tally.report() | _beyond(sensors.left_grid, run) | more
+    return tally.report() | _beyond(sensors.left_grid, run) | {"median_residual": lattice.residual}
 
 
 def _beyond(grid: Any, run: Run) -> dict[str, float]:
@@ -103,22 +90,6 @@ def _beyond(grid: Any, run: Run) -> dict[str, float]:
     ends = zip((rows, columns), (left["height"], left["width"]), strict=True)
     beyond = max(max(float(-nodes[0]), float(nodes[-1]) - (size - 1)) for nodes, size in ends)
     return {"beyond": beyond, "grid_step": float(max(np.diff(rows).max(), np.diff(columns).max()))}
-
-
-def _check_own(out: Path) -> None:
-    """Raise if ``points.tif`` or ``points.json`` exists and was not made by this tool, or was changed since."""
-    path = out / POINTS_FILE
-    published = published_points(out)  # raises for a points.json of others
-    if os.path.lexists(path):
-        try:
-            as_made = published == checksum_of(path) if published else is_as_made(path)
-            is_own = "LEFT_MODEL" in read_tags(path) and as_made
-        except SatIntervalsError:
-            is_own = False
-        if not is_own:
-            raise SatIntervalsError(
-                f"{path} exists and was not made by triangulate, or was changed since: move it away"
-            )
 
 
 class _Tally:

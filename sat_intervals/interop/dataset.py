@@ -39,8 +39,7 @@ class _Layer(BackendArray):
             return np.empty([len(places) for places in ranges], self.dtype)[dropped]
         first, end = zip(*((min(places), max(places) + 1) for places in ranges), strict=True)
         window = Window(first[0], first[1], end[0] - first[0], end[1] - first[1])
-        with self.run.unchanged():
-            pixels = read_layers(self.run.out / self.name, window, self.band)
+        pixels = read_layers(self.run.out / self.name, window, self.band)
         chosen = (np.asarray(places) - start for places, start in zip(ranges, first, strict=True))
         return np.asarray(pixels[np.ix_(*chosen)][dropped])
 
@@ -66,9 +65,7 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     Raises
     ------
     SatIntervalsError
-        The folder is not a finished run, or a file is damaged.
-    RunError
-        Raised by reading: another run has replaced the files.
+        The folder is not a finished run, or a file cannot be read.
     """
     run = open_run(out)
     place = run.georeferencing
@@ -157,15 +154,7 @@ class Intervals:
     def coverage(self, truth: xr.DataArray | np.ndarray) -> float:
         """Return the share of intervals of valid pixels that contain the truth, NaN if no truth is known.
 
-        Parameters
-        ----------
-        truth
-            True disparity in pixels, as large as the dataset; NaN where unknown.
-
-        Raises
-        ------
-        SatIntervalsError
-            The truth has another size.
+        ``truth`` is the true disparity in pixels, as large as the dataset; NaN where unknown.
         """
         dataset = self._dataset
         if truth.shape != dataset["lower"].shape:
@@ -181,20 +170,7 @@ class Intervals:
         return float(counts["hits"] / counts["judged"]) if counts["judged"] else float("nan")
 
     def profile(self, row: int, columns: Sequence[int] | None = None) -> xr.Dataset:
-        """Return one row, read into memory.
-
-        Parameters
-        ----------
-        row
-            Counted from 0 at the top.
-        columns
-            First and last column; by default all.
-
-        Raises
-        ------
-        SatIntervalsError
-            The row or a column is outside the dataset.
-        """
+        """Return one row, counted from 0 at the top, read into memory; ``columns`` are the first and the last."""
         rows, width = self._dataset["lower"].shape
         first, last = columns or (0, width - 1)
         if not (0 <= row < rows and 0 <= first <= last < width):

@@ -13,12 +13,11 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import LEFT_WINDOW, Band, Bands
-from sat_intervals.raster import MARK, File, Georeferencing, OutputWriter, check_as_made, check_made_by, examined
+from sat_intervals.raster import File, Georeferencing, OutputWriter
+from sat_intervals.raster.publishing import check_free
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window, strips
 
-# Tag of the files: their format.
-_FORMAT = "EXPORT"
 # Pixels of a strip.
 _STRIP = 1 << 22
 
@@ -84,7 +83,7 @@ def _otb(prefix: str, config: Config) -> list[Raster]:
 FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "otb": _otb, "asp": _asp, "s2p": _s2p}
 
 
-def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
+def export(out: str | Path, form: str, target: str | Path, *, overwrite: bool = False) -> list[Path]:
     """Write a run in the format of another tool.
 
     Parameters
@@ -95,16 +94,12 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
         One of FORMATS.
     target
         The folder to write to; for ``asp`` the prefix of the file, such as ``stereo/run`` of ``stereo/run-F.tif``.
+    overwrite
+        Whether to replace existing files.
 
     Returns
     -------
-    The files written. Existing exports of these names and this format are replaced. A band that the run lacks, such as
-    bounds without intervals, has no file.
-
-    Raises
-    ------
-    SatIntervalsError
-        The folder is not a run, or a file cannot be written or would replace one that is not an export in this format.
+    The files written. A band that the run lacks, such as bounds without intervals, has no file.
     """
     run, target = open_run(out), Path(target)
     left = run.report["inputs"]["left"]
@@ -114,18 +109,17 @@ def export(out: str | Path, form: str, target: str | Path) -> list[Path]:
         raise SatIntervalsError(f"{target} is a folder: give a prefix for ASP's file, such as {target / 'run'}")
     rasters = FORMATS[form](prefix, run.config)
     files = [file for file, _ in rasters]
-    run.check_kept([folder / file.name for file in files], [run.out / "points.tif"])
+    paths = [folder / file.name for file in files]
+    run.check_kept(paths, [run.out / "points.tif"])
+    for path in paths:
+        check_free(path, overwrite=overwrite)
     place = Georeferencing(transform=run.left_georeferencing.transform if form == "otb" else None)
-    with OutputWriter(folder, files, *shape, place, {**MARK, _FORMAT: form}) as writer:
-        with examined(folder, [file.name for file in files]) as there:
-            for file in files:
-                check_made_by(folder / file.name, f"export --to {form}", _FORMAT, form)
-                check_as_made(folder / file.name)
+    with OutputWriter(folder, files, *shape, place, {"SOFTWARE": "sat-intervals", "EXPORT": form}) as writer:
         for window in strips(*shape, _STRIP):
             pixels = _read(run, window)
             writer.write(window.row, *(_filled(make(pixels), file) for file, make in rasters))
-        writer.publish(replaceable=there)
-    return [folder / file.name for file in files]
+        writer.publish()
+    return paths
 
 
 def _read(run: Run, window: Window) -> Bands:

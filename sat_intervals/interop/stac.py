@@ -6,27 +6,17 @@ import logging
 import os
 import re
 from collections.abc import Iterator
-from contextlib import suppress
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sat_intervals.config.sealing import ROOM, is_as_made, sealed
-from sat_intervals.errors import SatIntervalsError, check_regular, open_regular
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
-from sat_intervals.raster import (
-    Georeferencing,
-    examined,
-    footprint,
-    read_layers,
-    read_place,
-    read_shape,
-    write_file,
-)
-from sat_intervals.raster.published import check_points, is_points_of, is_surface_of
+from sat_intervals.raster import Georeferencing, footprint, read_layers, read_place, read_shape
+from sat_intervals.raster.published import is_points_of, is_surface_of
+from sat_intervals.raster.publishing import write_file
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
 
@@ -61,22 +51,12 @@ def write_item(out: str | Path, *, taken: str | None = None, identifier: str | N
         When the left image was taken, ISO 8601 with a time zone; by default, when the run ended.
     identifier
         Of the item; by default the name of the folder.
-
-    Raises
-    ------
-    SatIntervalsError
-        The folder is not a run, the time cannot be read, or ``stac.json`` was not made by this tool.
     """
     run = open_run(out)
     file = run.out / "stac.json"
     run.check_kept([file])
-    with examined(run.out, [file.name]) as there:
-        _check_own(file)
-    with run.unchanged("points.tif", "dsm.tif", "overview.png"):
-        item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
-    content = sealed((json.dumps(item, indent=1, allow_nan=False) + "\n").encode())
-    with run.unchanged():
-        write_file(file, content, there, partial(_check_own, file))  # again: a file may have appeared meanwhile
+    item = _item(run, _time(taken or run.report["finished"]), identifier or run.out.resolve().name)
+    write_file(file, (json.dumps(item, indent=1, allow_nan=False) + "\n").encode())
     return file
 
 
@@ -90,21 +70,6 @@ def _time(text: str) -> str:
     return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")
 
 
-def _check_own(file: Path) -> None:
-    """Raise if the file exists and is not an item of this tool, or was changed since.
-
-    Links pass: they are replaced, never followed.
-    """
-    if not os.path.lexists(file) or file.is_symlink():
-        return
-    check_regular(file, "move it away")
-    with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
-        content = file.read_bytes()
-        if "sat-intervals" in json.loads(content)["properties"]["processing:software"] and is_as_made(content):
-            return
-    raise SatIntervalsError(f"{file} exists and was not made by sat-intervals, or was changed since: move it away")
-
-
 def _item(run: Run, taken: str, identifier: str) -> dict[str, Any]:
     place = run.georeferencing
     assets = dict(_assets(run, place))
@@ -114,7 +79,6 @@ def _item(run: Run, taken: str, identifier: str) -> dict[str, Any]:
         corners = footprint(of_surface, shape)
     item: dict[str, Any] = {
         "type": "Feature",
-        "sat-intervals": ROOM,
         "stac_version": "1.1.0",
         "stac_extensions": _EXTENSIONS,
         "id": identifier,
@@ -165,7 +129,6 @@ def _assets(run: Run, place: Georeferencing) -> Iterator[tuple[str, dict[str, An
     finished = run.report["finished"]
     points, surface, picture = (run.out / name for name in ("points.tif", "dsm.tif", "overview.png"))
     if _is_taken(points, points.exists() and is_points_of(points, finished), "triangulate"):
-        check_points(run.out)
         yield "points", _raster(points, "Longitude, latitude and height of every pixel", POINTS, place)
     if _is_taken(surface, surface.exists() and is_surface_of(surface, finished), "dsm"):
         yield "dsm", _raster(surface, "Surface model with intervals", SURFACE, read_place(surface)[1])
@@ -186,12 +149,12 @@ def _is_of_run(picture: Path, finished: str) -> bool:
     """Return whether a picture notes that it is of a run; a user's, or one of an earlier run, does not."""
     if not picture.is_file():
         return False
-    with open_regular(picture) as stream:
+    with picture.open("rb") as stream:
         return b"Comment\0" + finished.encode() in stream.read(_BEGINNING)
 
 
 def _file(path: Path) -> dict[str, Any]:
-    with open_regular(path) as stream:
+    with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {"href": f"./{path.name}", "file:size": path.stat().st_size, "file:checksum": _SHA256 + digest}
 

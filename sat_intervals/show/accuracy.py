@@ -1,20 +1,21 @@
 """Draw how a surface model compares with reference heights: reliability of intervals, map of errors, profile."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.evaluate.comparison import Comparison
 from sat_intervals.evaluate.dsm import Profile, error_map
-from sat_intervals.show.canvas import DPI, INK, NOTHING, Target, page, plain_logarithm, pointed_ends, say_empty
+from sat_intervals.show.canvas import DPI, INK, NOTHING, page, plain_logarithm, pointed_ends, say_empty
 from sat_intervals.show.legend import BLUE, ORANGE
 
 # Cells of a class that are worth a point, and pixels of the longer side of a map.
 _WORTH, _LONGEST = 50, 900
 
 
-def draw_reliability(report: dict[str, Any], target: Target, name: str, dpi: int = DPI) -> None:
+def draw_reliability(report: dict[str, Any], target: Path, name: str, dpi: int = DPI) -> None:
     """Draw the half widths of intervals against those that would have been needed, and coverage, by class of width."""
     nominal = report["nominal"]
     kinds = [kind for kind in report["width"] if kind["with_interval"] >= _WORTH]
@@ -45,7 +46,7 @@ def _limits(kind: dict[str, Any]) -> str:
     return f"{kind['from']:g}+" if kind["to"] is None else f"{kind['from']:g}-{kind['to']:g}"
 
 
-def draw_error_map(given: Comparison, nmad: float, target: Target, dpi: int = DPI) -> None:
+def draw_error_map(given: Comparison, nmad: float, target: Path, dpi: int = DPI) -> None:
     """Draw height - reference, within three NMAD of 0; large surfaces are sampled."""
     errors, extent = error_map(given, _LONGEST)
     end = max(3 * nmad, 0.1)
@@ -66,7 +67,7 @@ def draw_error_map(given: Comparison, nmad: float, target: Target, dpi: int = DP
         bar.set_label("height - reference (m), red: too high")
 
 
-def draw_height_profile(profile: Profile, target: Target, names: Sequence[str], dpi: int = DPI) -> None:
+def draw_height_profile(profile: Profile, target: Path, names: Sequence[str], dpi: int = DPI) -> None:
     """Draw heights, their intervals and the reference along a line; ``names`` of surface and reference."""
     with page(target, (11.0, 4.0), dpi, f"{names[0]} and {names[1]} along a line") as figure:
         chart = figure.subplots()

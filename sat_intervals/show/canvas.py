@@ -5,14 +5,13 @@ Every picture imports this module, so it reports a missing matplotlib (the extra
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.show.marks import TEXT_MARK, replaceable_here, write_made_here
+from sat_intervals.raster.publishing import new_file
 
 try:
     from matplotlib import rc_context
@@ -30,27 +29,18 @@ INK = "#555555"
 _WIDEST = 90  # percentile of widths at the end of their scale: low-confidence areas are often as wide as the range
 _BARS, _LEAST_SHARE = 48, 0.001  # of a histogram of widths: most bars, least share shown
 
-Target = Path | BytesIO
-"""Where a picture goes: to a file, or to memory."""
-
 _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left"}
 
 
 @contextmanager
-def page(target: Target, size: tuple[float, float], dpi: int, title: str, run: str = "") -> Iterator[Figure]:
-    """Yield a figure of ``size`` inches and write it as PNG at the end, to a file as `write_made_here` does.
-
-    The picture notes the ``finished`` of its ``run``.
-    """
-    there = replaceable_here(target.parent, [target.name]) if isinstance(target, Path) else {}
-    drawn = BytesIO() if isinstance(target, Path) else target
+def page(target: Path, size: tuple[float, float], dpi: int, title: str, run: str = "") -> Iterator[Figure]:
+    """Yield a figure of ``size`` inches and write it as PNG at the end; it notes the ``finished`` of its ``run``."""
     with rc_context(_STYLE):
         figure = Figure(size, layout="constrained")
         figure.suptitle(title, fontsize=10, x=0.01, ha="left", color=INK)
         yield figure
-        figure.savefig(drawn, dpi=dpi, format="png", metadata={"Software": TEXT_MARK, "Comment": run})
-    if isinstance(target, Path):
-        write_made_here({target: drawn.getvalue()}, there)
+        with new_file(target) as file:
+            figure.savefig(file, dpi=dpi, format="png", metadata={"Software": "sat-intervals", "Comment": run})
 
 
 def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:

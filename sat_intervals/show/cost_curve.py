@@ -53,16 +53,7 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     """Match a pixel again with the pixels around it that support it.
 
     SGM's aggregation reaches beyond the overlap, so the curve may differ slightly from that of the run.
-
-    Parameters
-    ----------
-    row, column
-        Counted from 0 at the first pixel of the results.
-
-    Raises
-    ------
-    SatIntervalsError
-        The pixel is outside the results or has no possible candidate.
+    ``row`` and ``column`` count from 0 at the first pixel of the results.
     """
     results.check_pixel(row, column)
     config = results.config

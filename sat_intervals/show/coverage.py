@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.results import open_run
-from sat_intervals.show.canvas import DPI, INK, Target, page, plain_logarithm
+from sat_intervals.show.canvas import DPI, INK, page, plain_logarithm
 from sat_intervals.show.legend import BLUE, ORANGE
 
 _CLASSES = (("all", "valid pixels", "black"), ("high", "high confidence", BLUE), ("low", "low confidence", ORANGE))
@@ -25,7 +25,7 @@ def check_one_pair(runs: Sequence[Path]) -> None:
             raise SatIntervalsError(f"{run} is a run of other images than {runs[0]}: give runs of one pair")
 
 
-def draw_coverage(runs: Sequence[Path], target: Target, dpi: int = DPI, **judging: Any) -> None:
+def draw_coverage(runs: Sequence[Path], target: Path, dpi: int = DPI, **judging: Any) -> None:
     """Draw nominal against measured coverage, and mean width against measured coverage.
 
     ``runs`` are folders of runs of one pair at several coverages, or one; ``judging`` are the arguments of

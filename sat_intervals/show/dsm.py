@@ -15,7 +15,6 @@ from sat_intervals.show.canvas import (
     DPI,
     INK,
     NOTHING,
-    Target,
     add_histogram,
     fitting,
     limits,
@@ -35,15 +34,10 @@ _MOST, _TIMES = 98, 12
 _BAND = {band.name: index for index, band in enumerate(SURFACE)}
 
 
-def draw_surface(surface: Path, target: Target, dpi: int = DPI) -> None:
+def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
     """Draw hillshade, height, interval width and confidence of a surface model, read from its overviews.
 
     If several runs overlap, their agreement replaces confidence.
-
-    Raises
-    ------
-    SatIntervalsError
-        The file cannot be read or the picture cannot be written.
     """
     shape, place = read_place(surface)
     if not is_surface(surface):

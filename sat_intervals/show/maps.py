@@ -18,7 +18,6 @@ from sat_intervals.show.canvas import (
     DPI,
     INK,
     NOTHING,
-    Target,
     add_histogram,
     fitting,
     limits,
@@ -35,7 +34,7 @@ _STRETCHED = 5.0  # largest ratio of the sides of a map; pixels of longer ones a
 _EDGE = "#888888"
 
 
-def draw_overview(results: Results, target: Target, dpi: int = DPI) -> None:
+def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
     """Draw left image, disparity, interval width, confidence and validity side by side, read from overviews."""
     rows, columns = _arrangement(results.shape)
     width, height = _inches(results.shape, _PANEL if columns > 1 else _LARGE)
@@ -59,7 +58,7 @@ def draw_overview(results: Results, target: Target, dpi: int = DPI) -> None:
         _draw_validity(panels[4], panels[5], results, bands.validity)
 
 
-def draw_errors(results: Results, target: Target, dpi: int = DPI) -> None:
+def draw_errors(results: Results, target: Path, dpi: int = DPI) -> None:
     """Draw the left image and, in colour, the valid pixels whose interval misses the truth (the paper's figure 7).
 
     All pixels are counted; of large results, every n-th row and column is drawn.

@@ -1,12 +1,14 @@
 """Draw line charts: the interval along a row, and the cost curve of a pixel."""
 
+from pathlib import Path
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.products import INVALID, Bands
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, NOTHING, Target, fitting, limits, page, say_empty
+from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
 from sat_intervals.show.cost_curve import Curve, read_curve
 from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION
 from sat_intervals.tiling import Window
@@ -17,7 +19,7 @@ _LOW = "#d4d4d4"
 
 
 def draw_profile(
-    results: Results, target: Target, row: int, columns: tuple[int, int] | None = None, dpi: int = DPI
+    results: Results, target: Path, row: int, columns: tuple[int, int] | None = None, dpi: int = DPI
 ) -> None:
     """Draw interval, disparity and truth along a row, low-confidence sections in grey (the paper's figures 5, 7, 8).
 
@@ -57,7 +59,7 @@ def draw_profile(
         say_empty(chart, disparity, "no valid pixel")
 
 
-def draw_curve(results: Results, target: Target, row: int, column: int, dpi: int = DPI) -> None:
+def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int = DPI) -> None:
     """Draw a pixel's cost curve, its possibility distribution, the cut and the interval (the paper's figures 2 and 3).
 
     The pixel is matched again. The interval that the run wrote, after median filter and regularisation, is shown below.

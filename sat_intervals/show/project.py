@@ -11,13 +11,10 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from sat_intervals.config.sealing import sealed
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, POINTS, SURFACE
 from sat_intervals.raster import (
     Georeferencing,
-    check_place,
-    examined,
     is_surface,
     open_image,
     read_layers,
@@ -25,12 +22,11 @@ from sat_intervals.raster import (
     read_shape,
     read_small_image,
     read_small_layers,
-    watched_images,
 )
-from sat_intervals.raster.published import check_points, is_points_of, is_surface_of
+from sat_intervals.raster.published import is_points_of, is_surface_of
+from sat_intervals.raster.publishing import write_file
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.show import styles
-from sat_intervals.show.marks import check_made_here, is_replaceable, write_made_here
 from sat_intervals.tiling import Window
 
 # Longest side in pixels of what percentiles are taken from.
@@ -77,11 +73,10 @@ class Layer:
 
 @dataclass(frozen=True)
 class Written:
-    """The contents of the files that were written, lines about what was left out or kept, and the files of others."""
+    """The contents of the files that were written, and lines about what was left out."""
 
     files: dict[Path, bytes]
     notes: list[str]
-    kept: set[Path]
 
 
 def write_project(out: str | Path) -> Written:
@@ -89,61 +84,23 @@ def write_project(out: str | Path) -> Written:
 
     The project has the images and the truth, disparity, interval width, confidence and validity; if ``points.tif`` and
     ``dsm.tif`` are of this run, also their heights. Paths in it are relative where the files are local.
-
-    Raises
-    ------
-    SatIntervalsError
-        The folder is not a run, or ``project.qgz`` was not made by this tool, or was saved by QGIS since; or see
-        `check_place`.
     """
     run = open_run(out)
     file = run.out / "project.qgz"
-    others = [run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt")]
-    run.check_kept([file, *others])
-    with examined(run.out, [path.name for path in (file, *others)]) as there:
-        check_made_here([file])
-        written = Written({}, [], {path for path in others if not is_replaceable(path)})
-    with run.unchanged("points.tif", "dsm.tif"):
-        _check_places(run)
-        layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
-        _add_defaults(run, layers, written)
-        layers += _images(run, written)
-        written.files[file] = _archive(styles.text_of(_project(run, layers), styles.HEAD))
-    with run.unchanged():  # another run may come to the folder
-        _check_places(run)
-        write_made_here(written.files, there)
-        _check_places(run)  # again: files may have appeared meanwhile
-    return written
-
-
-def _archive(project: bytes) -> bytes:
-    """Return an archive of a project, which is `sealed`; it is stored, so that the mark is in the first bytes."""
+    run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
+    written = Written({}, [])
+    layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
+    for layer in layers:
+        if layer.is_default:
+            written.files[run.out / f"{Path(layer.source).stem}.qml"] = styles.default_style(layer.renderer)
+    layers += _images(run, written)
     content = BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr(zipfile.ZipInfo("project.qgs"), sealed(project))
-    return content.getvalue()
-
-
-def _check_places(run: Run) -> None:
-    """Raise if GDAL would read other files with the virtual rasters of the project."""
-    for name in ("width", "dsm_half_width"):
-        check_place(run.out / f"{name}.vrt")
-
-
-def _add_defaults(run: Run, layers: list[Layer], written: Written) -> None:
-    for layer in layers:
-        if layer.is_default and _is_free(style := run.out / f"{Path(layer.source).stem}.qml", written):
-            written.files[style] = styles.default_style(layer.renderer)
-
-
-def _is_free(file: Path, written: Written) -> bool:
-    """Return whether a file may be written; note if it is kept."""
-    if is_kept := file in written.kept:
-        note = f"{file} was not made by sat-intervals, or was changed since, and is kept"
-        if file.suffix == ".vrt":
-            note += ": its layer is left out; to have it, move the file away and rerun sat-intervals project"
-        written.notes.append(note)
-    return not is_kept
+        archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(_project(run, layers), styles.HEAD))
+    written.files[file] = content.getvalue()
+    for path, text in written.files.items():
+        write_file(path, text)
+    return written
 
 
 def _results(run: Run, written: Written) -> Iterator[Layer]:
@@ -158,7 +115,7 @@ def _results(run: Run, written: Written) -> Iterator[Layer]:
     unclear = styles.ramped(4, np.linspace(0, 1, len(styles.CIVIDIS)), styles.CIVIDIS)
     yield Layer(group, "confidence", BANDS[3].meaning, file, place, run.shape, unclear)
     width = run.out / "width.vrt"
-    if run.config.interval and _is_free(width, written):
+    if run.config.interval:
         written.files[width] = styles.difference((file.name, 3, 2), place, run.shape)
         wide = styles.widths(1, upper - lower, unit="px")
         yield Layer(group, "interval width", "upper - lower bound, pixels", width, place, run.shape, wide, True)
@@ -173,7 +130,6 @@ def _points(run: Run, written: Written) -> Iterator[Layer]:
     if not is_points_of(file, run.report["finished"]) or read_shape(file)[1:] != run.shape:
         written.notes.append(f"{file} belongs to another run and is left out: rerun sat-intervals triangulate")
         return
-    check_points(run.out)
     place = run.georeferencing
     bands = read_small_layers(file, _fitting(run.shape))
     for number, ramp in ((6, styles.MAGMA), (3, styles.VIRIDIS)):
@@ -194,10 +150,9 @@ def _surface(run: Run, written: Written) -> Iterator[Layer]:
     shape, place = read_place(file)
     bands = dict(zip((band.name for band in SURFACE), read_small_layers(file, _fitting(shape)), strict=True))
     half = run.out / "dsm_half_width.vrt"
-    if _is_free(half, written):
-        written.files[half] = styles.difference((file.name, 3, 2), place, shape, 0.5)
-        wide = styles.widths(1, (bands["height_upper"] - bands["height_lower"]) / 2, unit="m")
-        yield Layer(group, "half width", "half the width of the height's interval, m", half, place, shape, wide, True)
+    written.files[half] = styles.difference((file.name, 3, 2), place, shape, 0.5)
+    wide = styles.widths(1, (bands["height_upper"] - bands["height_lower"]) / 2, unit="m")
+    yield Layer(group, "half width", "half the width of the height's interval, m", half, place, shape, wide, True)
     unclear = styles.ramped(5, np.linspace(0, 1, len(styles.CIVIDIS)), styles.CIVIDIS)
     yield Layer(group, "confidence of heights", SURFACE[4].meaning, file, place, shape, unclear)
     ramp = styles.colours(1, bands["height"], styles.VIRIDIS, unit="m")
@@ -216,10 +171,8 @@ def _images(run: Run, written: Written) -> Iterator[Layer]:
             image = open_input(run.report["inputs"]["left" if name == "truth" else name])
             if name == "truth":
                 image = open_image(run.truth_beside, band=1)
-            check_unchanged = watched_images([image])
             shape = image.height, image.width
             pixels = read_small_image(image, Window(0, 0, *shape), _fitting(shape))
-            check_unchanged()
         except SatIntervalsError as error:
             written.notes.append(f"the {name} image is left out: {error}")
             continue

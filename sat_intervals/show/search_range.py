@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, Target, page
+from sat_intervals.show.canvas import DPI, INK, page
 from sat_intervals.show.legend import BLUE, SKY
 
 
@@ -17,7 +17,7 @@ def has_range(results: Results) -> bool:
     return bool(results.report.get("search") or results.report.get("local_ranges"))
 
 
-def draw_range(results: Results, target: Target, dpi: int = DPI) -> None:
+def draw_range(results: Results, target: Path, dpi: int = DPI) -> None:
     """Draw the matches of the search by disparity, and first and last disparity of the cells."""
     report, search = results.report, results.config.disparity
     found = report.get("search")

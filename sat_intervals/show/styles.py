@@ -12,7 +12,6 @@ import numpy as np
 from sat_intervals.products import FLAGS, INVALID
 from sat_intervals.raster import Georeferencing
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
-from sat_intervals.show.marks import XML_MARK
 
 # Colours at equal steps of matplotlib's maps.
 VIRIDIS = "#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"
@@ -169,7 +168,7 @@ def _add_place(root: Element, place: Georeferencing) -> None:
 
 
 def text_of(root: Element, head: str = "") -> bytes:
-    """Return XML with the mark of this tool in its first lines."""
-    root.insert(0, ElementTree.Comment(XML_MARK))
+    """Return XML with a comment that names this tool."""
+    root.insert(0, ElementTree.Comment("made by sat-intervals"))
     ElementTree.indent(root, " ")
     return (head + ElementTree.tostring(root, encoding="unicode") + "\n").encode()
