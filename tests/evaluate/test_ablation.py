@@ -1,8 +1,6 @@
 """Products of a whole volume against the slow twins; the ablation against runs, the paper and Pandora."""
 
-import itertools
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -13,12 +11,12 @@ from helpers import invoke, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sat_intervals import match_arrays, match_pair
+from sat_intervals import match_arrays
 from sat_intervals.config import load_config
 from sat_intervals.config.pairs import Pair, find_pairs
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.evaluate import ablation, disparity
+from sat_intervals.errors import SatIntervalsError
+from sat_intervals.evaluate import ablation
 from sat_intervals.evaluate.ablation import ablate_pair
 from sat_intervals.evaluate.disparity import criteria_of, evaluate
 from sat_intervals.evaluate.paper import METHODS, SceneMetrics, table_2
@@ -26,7 +24,6 @@ from sat_intervals.kernels.curves import read_alpha_cuts, read_baseline, read_ri
 from sat_intervals.match import memory
 from sat_intervals.match.memory import PROCESS_BYTES, volume_bytes
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DISPARITY, Bands
-from sat_intervals.run import pair as run_pair
 
 some = settings(max_examples=40, derandomize=True, deadline=None)
 X = IMPOSSIBLE_COST
@@ -146,120 +143,6 @@ def test_ablate_pair__matches_once(folder, monkeypatch):
     monkeypatch.setattr(ablation, "match_right", None)
     ablate_pair(*find_pairs([folder]))
     assert len(calls) == 1
-
-
-@pytest.mark.parametrize("name", ["truth.tif", "left.tif"])
-def test_ablate_pair__ends_where_an_image_is_replaced_meanwhile(folder, tmp_path, monkeypatch, name):
-    shutil.copytree(folder, tmp_path / "pair")
-    file, judge = tmp_path / "pair" / name, ablation.evaluate
-
-    def replaced_before(*arguments):
-        shutil.copy(file, tmp_path / "new.tif")
-        (tmp_path / "new.tif").replace(file)
-        return judge(*arguments)
-
-    monkeypatch.setattr(ablation, "evaluate", replaced_before)
-    with pytest.raises(RunError, match=rf"{name} was replaced or changed while it was read"):
-        ablate_pair(*find_pairs([tmp_path / "pair"]))
-
-
-@pytest.mark.parametrize("command", ["evaluate", "ablate"])
-def test_commands__end_where_a_pair_is_replaced_after_they_began(folder, tmp_path, monkeypatch, command):
-    """Else an old match is judged by a new truth, or new images are matched in an old search range."""
-    shutil.copytree(folder, tmp_path / "pair")
-    truth, match, judge = tmp_path / "pair" / "truth.tif", run_pair.match_pair, ablation.ablate_pair
-
-    def and_replaced(work):
-        def call(*arguments, **named):
-            result = work(*arguments, **named)
-            shutil.copy(truth, tmp_path / "new.tif")
-            (tmp_path / "new.tif").replace(truth)
-            return result
-
-        return call
-
-    monkeypatch.setattr(run_pair, "match_pair", and_replaced(match))
-    monkeypatch.setattr(ablation, "ablate_pair", and_replaced(judge))
-    result = invoke(command, tmp_path / "pair", "--quiet")
-    assert (result.exit_code, "truth.tif was replaced or changed while it was read" in result.stderr) == (1, True)
-
-
-@pytest.mark.parametrize("command", ["evaluate", "ablate"])
-def test_commands__go_on_where_a_pyramid_of_an_image_appears(folder, tmp_path, monkeypatch, command):
-    shutil.copytree(folder, tmp_path / "pair")
-    name = "match_pair" if command == "evaluate" else "ablate_pair"
-    module = run_pair if command == "evaluate" else ablation
-    work = getattr(module, name)
-
-    def and_appears(*arguments, **named):
-        result = work(*arguments, **named)
-        shutil.copy(tmp_path / "pair" / "truth.tif", tmp_path / "pair" / "left.tif.ovr")
-        return result
-
-    monkeypatch.setattr(module, name, and_appears)
-    assert invoke(command, tmp_path / "pair", "--quiet").exit_code == 0
-
-
-def written_again(file, work):
-    """A function that does the same, but writes a file anew before it."""
-
-    def call(*arguments, **named):
-        new = file.with_name("new")
-        shutil.copy(file, new)
-        new.replace(file)
-        return work(*arguments, **named)
-
-    return call
-
-
-@pytest.mark.parametrize(
-    ("command", "name"),
-    [*itertools.product(["evaluate", "ablate"], ["pair/meta.json", "settings.yaml"]), ("evaluate", "given.tif")],
-)
-def test_commands__end_where_what_they_were_given_is_replaced_after_they_began(
-    folder, tmp_path, monkeypatch, command, name
-):
-    """Else pairs are matched in an old search range, or each with other settings, or judged by two truths."""
-    shutil.copytree(folder, tmp_path / "pair")
-    shutil.copy(folder / "truth.tif", tmp_path / "given.tif")
-    (tmp_path / "settings.yaml").write_text("sgm: {p1: 5}")
-    for module, work in ((run_pair, "match_pair"), (ablation, "ablate_pair")):
-        monkeypatch.setattr(module, work, written_again(tmp_path / name, getattr(module, work)))
-    options = ["--truth", tmp_path / "given.tif"] if command == "evaluate" else []
-    result = invoke(command, tmp_path / "pair", "--quiet", "--config", tmp_path / "settings.yaml", *options)
-    assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
-
-
-@pytest.mark.parametrize("name", ["pair/truth.tif", "pair/meta.json", "other/intervals.tif", "other/run.json"])
-def test_evaluate_command__ends_where_a_file_of_several_runs_is_replaced_between_them(
-    folder, tmp_path, monkeypatch, name
-):
-    (pair,) = find_pairs([shutil.copytree(folder, tmp_path / "pair")])
-    search = {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
-    runs = [tmp_path / "one", tmp_path / "other"]
-    for out in runs:
-        match_pair(pair.left, pair.right, out, search)
-    monkeypatch.setattr(disparity, "evaluate_run", written_again(tmp_path / name, disparity.evaluate_run))
-    result = invoke("evaluate", *runs, "--quiet")
-    assert (result.exit_code, f"{name} was replaced or changed while it was read" in result.stderr) == (1, True)
-
-
-def test_evaluate_command__does_not_mind_files_that_it_does_not_read(folder, tmp_path, monkeypatch):
-    (pair,) = find_pairs([shutil.copytree(folder, tmp_path / "pair")])
-    match_pair(
-        pair.left, pair.right, tmp_path / "run", {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}
-    )
-    shutil.copy(folder / "truth.tif", tmp_path / "given.tif")
-
-    def rewritten(*arguments, **named):
-        pair.truth.write_text("another truth")
-        pair.truth.with_name("meta.json").write_text("{}")
-        return evaluated(*arguments, **named)
-
-    evaluated = disparity.evaluate_run
-    monkeypatch.setattr(disparity, "evaluate_run", rewritten)
-    result = invoke("evaluate", tmp_path / "run", "--truth", tmp_path / "given.tif", "--group", "all")
-    assert result.exit_code == 0, result.output
 
 
 def test_ablate_pair__says_what_it_cannot_use(folder, monkeypatch):

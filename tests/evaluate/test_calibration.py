@@ -1,20 +1,17 @@
 """Calibrations of surface models in metres, from heights made up with a known error."""
 
 import json
-import os
-import re
 
 import numpy as np
 import pytest
 import rasterio
 import yaml
-from helpers import invoke, late_file
+from helpers import invoke
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.config import ConfigError, load_height_calibration
-from sat_intervals.evaluate import calibration
+from sat_intervals.config import load_height_calibration
 from sat_intervals.evaluate.calibration import calibrate_surface
 
 TAGS = {
@@ -162,10 +159,10 @@ def test_calibrate_command__writes_a_file_that_says_what_to_expect(tmp_path):
     assert "calibrated on the other blocks" in result.stdout
     loaded = load_height_calibration(tmp_path / "heights.yaml")
     assert loaded == calibrate_surface(model, reference, "city", registers=False)
-    as_json = invoke(*words, tmp_path / "heights.yaml", "--coverage", 0.5, "--json")  # its own file is replaced
+    as_json = invoke(*words, tmp_path / "heights.yaml", "--coverage", 0.5, "--json", "--overwrite")
     assert json.loads(as_json.stdout)["coverage"] == 0.5
     before = (tmp_path / "heights.yaml").read_bytes()
-    assert invoke(*words, tmp_path / "heights.yaml", "--coverage", 0.5, "--quiet").stdout == ""
+    assert invoke(*words, tmp_path / "heights.yaml", "--coverage", 0.5, "--quiet", "--overwrite").stdout == ""
     assert (tmp_path / "heights.yaml").read_bytes() == before
 
 
@@ -184,11 +181,7 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
     geoid = write_raster(tmp_path / "geoid.tif", [height - 47.5])
     away = write_raster(tmp_path / "away.tif", [height], Affine(1, 0, 5, 0, -1, 5))
     (tmp_path / "mine.yaml").write_text("mine: 1\n")
-    os.truncate(tmp_path / "mine.yaml", 1 << 40)  # only its beginning is read
     given = ["--dsm", model, "--reference", reference]
-    (tmp_path / "levels.yaml").write_text(
-        "# Calibration: levels of the cost curve that reach a coverage, found by sat-i"
-    )
     for words, message in (
         ([], "give PAIRS, or --dsm and --reference"),
         (["--dsm", model], "--dsm and --reference go together"),
@@ -202,8 +195,8 @@ def test_calibrate_command__a_surface_that_it_cannot_use_is_one_line(tmp_path):
         ([*given, "--overlap", 100], "--overlap applies to pairs, not to --dsm"),
         ([*given, "--coverage", 2], "coverage is 2, allowed: 0.5 to 0.99"),
         ([*given, "--coverage", 0.99, "--output", reference], "would be written: choose another output"),
-        ([*given, "--output", tmp_path / "mine.yaml"], "exists and was not made by sat-intervals calibrate"),
-        ([*given, "--output", tmp_path / "levels.yaml"], "levels.yaml exists and was not made by"),
+        ([*given, "--output", tmp_path / "mine.yaml"], "mine.yaml exists: choose another name or --overwrite"),
+        ([*given, "--output", tmp_path / "no" / "x.yaml"], "give --output a file in an existing folder"),
         (["--dsm", reference, "--reference", model], "is not a surface model of sat-intervals dsm"),
         (["--dsm", calibrated, "--reference", flat], "was made with --calibration: make it without"),
         (["--dsm", cut, "--reference", flat], "was made with --max-width: make it without"),
@@ -258,73 +251,3 @@ def test_load_height_calibration__what_it_cannot_use_is_one_line(tmp_path):
     assert invoke("match", "a", "b", tmp_path, "--coverage", 0.9, "--calibration", file).stderr.count(
         "is a calibration of heights: give it to dsm --calibration"
     )
-
-
-def test_calibrate_dsm_command__keeps_a_file_that_appears_meanwhile(tmp_path, monkeypatch):
-    model, reference = scene(tmp_path)
-    output = tmp_path / "heights.yaml"
-
-    def slow(*files, **options):
-        output.write_text("mine")
-        return calibrate_surface(*files, **options)
-
-    monkeypatch.setattr(calibration, "calibrate_surface", slow)
-    done = invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
-    assert done.exit_code == 2
-    assert (
-        f"{output} exists and was not made by sat-intervals calibrate, holds something else, or was changed"
-        in done.stderr
-    )
-    assert output.read_text() == "mine"
-
-
-def test_calibrate_dsm_command__keeps_a_calibration_that_was_edited(tmp_path, monkeypatch):
-    model, reference = scene(tmp_path)
-    output = tmp_path / "heights.yaml"
-    words = ["calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output]
-    for _ in range(2):  # its own file is replaced
-        assert invoke(*words).exit_code == 0
-    said = "was not made by sat-intervals calibrate, holds something else, or was changed since: move it away"
-    made = output.read_text()
-    seal = next(line for line in made.splitlines(keepends=True) if "CRC-32" in line)
-    for mine in (made + "# mine\n", made.replace(seal, "")):
-        output.write_text(mine)
-        done = invoke(*words)
-        assert (done.exit_code, output.read_text()) == (2, mine)
-        assert said in done.stderr
-
-    def edited_meanwhile(*files, **options):
-        output.write_text(made + "# mine\n")
-        return calibrate_surface(*files, **options)
-
-    output.write_text(made)
-    monkeypatch.setattr(calibration, "calibrate_surface", edited_meanwhile)
-    done = invoke(*words)
-    assert (done.exit_code, output.read_text()) == (2, made + "# mine\n")
-    assert said in done.stderr
-
-
-def test_load_height_calibration__refuses_what_was_cut_or_changed(tmp_path):
-    model, reference = scene(tmp_path)
-    output = tmp_path / "heights.yaml"
-    words = ["calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output]
-    assert invoke(*words).exit_code == 0
-    made, content = output.read_bytes(), load_height_calibration(output)
-    seal = re.search(rb"CRC-32 [0-9a-f]{8}", made)
-    rng = np.random.default_rng(1)
-    for place in rng.integers(seal.end(), len(made), 40):
-        for damaged in (made[:place], made[:place] + bytes([made[place] ^ 1]) + made[place + 1 :]):
-            output.write_bytes(damaged)
-            with pytest.raises(ConfigError, match="is damaged or was edited: restore it, or delete its line with"):
-                load_height_calibration(output)
-    edited = made.decode().replace(f"# {seal[0].decode()} of this file: delete this line if you edit others.\n", "")
-    output.write_text(edited + "# mine\n")
-    assert load_height_calibration(output) == content
-
-
-def test_calibrate_dsm_command__keeps_a_file_that_appears_after_its_last_check(tmp_path, monkeypatch):
-    model, reference = scene(tmp_path)
-    output = tmp_path / "heights.yaml"
-    monkeypatch.setattr("sat_intervals.raster.write_file", late_file(output))
-    done = invoke("calibrate", "--dsm", model, "--reference", reference, "--no-register", "--output", output)
-    assert (done.exit_code, output.read_text()) == (2, "mine")

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from sat_intervals import match_pair
 from sat_intervals.config.pairs import find_pairs, group_beside
 from sat_intervals.demo import make_scene
-from sat_intervals.errors import RunError, SatIntervalsError
-from sat_intervals.evaluate import disparity
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate, evaluate_run
 from sat_intervals.evaluate.metrics import Criteria
 from sat_intervals.evaluate.paper import SceneMetrics, table_1
@@ -262,20 +261,6 @@ def test_evaluate_run__of_a_region_takes_its_truth_or_the_whole(pair, tmp_path):
         evaluate_run(tmp_path / "out", tmp_path / "other.tif")
 
 
-def test_evaluate_run__ends_where_the_truth_is_replaced_meanwhile(pair, run, tmp_path, monkeypatch):
-    truth = shutil.copy(pair / "truth.tif", tmp_path)
-    median_bias = disparity._median_bias
-
-    def replaced_after(strips):
-        found = median_bias(strips)
-        shutil.copy(pair / "truth.tif", tmp_path)
-        return found
-
-    monkeypatch.setattr(disparity, "_median_bias", replaced_after)
-    with pytest.raises(RunError, match=r"truth.tif was replaced or changed while it was read: rerun the command"):
-        evaluate_run(run, truth, remove_bias=True)
-
-
 def test_evaluate_run__says_what_is_missing(run, pair, tmp_path):
     with pytest.raises(SatIntervalsError, match=r"run.json: No such file or directory: give the folder of a finished"):
         evaluate_run(tmp_path)
@@ -294,21 +279,6 @@ def test_evaluate_run__says_what_is_missing(run, pair, tmp_path):
     (tmp_path / "off" / "run.json").write_text("{")
     with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run"):
         evaluate_run(tmp_path / "off")
-
-
-def test_evaluate_run__takes_no_truth_beside_another_image(run, pair, tmp_path):
-    moved = tmp_path / "moved"
-    moved.mkdir()
-    for name in ("left.tif", "right.tif", "truth.tif"):
-        shutil.copy(pair / name, moved)
-    match_pair(moved / "left.tif", moved / "right.tif", tmp_path / "out", settings_of(pair))
-    expected = evaluate_run(tmp_path / "out")
-    shutil.copy(pair / "left.tif", moved)  # at another time
-    assert evaluate_run(tmp_path / "out") == expected
-    shutil.copy(pair / "right.tif", moved / "left.tif")
-    with pytest.raises(SatIntervalsError, match=r"truth.tif is beside .*left.tif, which has changed .* give --truth"):
-        evaluate_run(tmp_path / "out")
-    assert evaluate_run(tmp_path / "out", moved / "truth.tif") == expected
 
 
 def test_evaluate__warns_of_a_truth_of_another_left_image(run, pair, tmp_path):

@@ -1,24 +1,19 @@
 """Surface models against reference heights."""
 
 import json
-import os
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import contents, exchanged, invoke, late_file
+from helpers import invoke
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 from surfaces import PLACE, write_raster, write_surface
 
 from sat_intervals import SatIntervalsError
-from sat_intervals.errors import RunError
-from sat_intervals.evaluate import dsm
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.match.histogram import Histogram
-from sat_intervals.raster import layers
 
 
 def test_evaluate_surface__worked_example(tmp_path):
@@ -242,123 +237,17 @@ def test_evaluate_command__writes_figures_and_pictures(tmp_path):
     assert json.loads(written[0].read_text())["all"]["median"] == pytest.approx(0.1)
     assert "| all cells | 4200 | 0.100 |" in written[1].read_text()
     assert all(path.stat().st_size > 5000 for path in written[2:])
-    again = invoke(*words, "--pictures", tmp_path, "--quiet")  # its own files are replaced
+    refused = invoke(*words, "--pictures", tmp_path)
+    assert (refused.exit_code, refused.stdout) == (2, "")
+    assert f"{written[0]} exists: choose another name or --overwrite" in refused.stderr
+    again = invoke(*words, "--pictures", tmp_path, "--quiet", "--overwrite")
     assert again.exit_code == 0
     assert "all cells" in again.stdout
     assert "dsm-accuracy" not in again.stdout
     for line, message in (((0, 0, 1, 1), "does not cross"), ((PLACE.c, PLACE.f, PLACE.c + 70, PLACE.f - 60), "")):
-        result = invoke(*words, "--pictures", tmp_path, "--line", *line)
+        result = invoke(*words, "--pictures", tmp_path, "--overwrite", "--line", *line)
         assert result.exit_code == (2 if message else 0)
         assert message in result.stderr
-    for file in written[:2]:
-        made = file.read_text()
-        file.write_text(made + "mine\n")
-        result = invoke(*words, "--pictures", tmp_path)
-        assert (result.exit_code, file.read_text()) == (2, made + "mine\n")
-        assert f"{file.name} exists and was not made by sat-intervals, was changed since" in result.stderr
-        file.write_text("# Notes on sat-intervals")
-        result = invoke(*words, "--pictures", tmp_path)
-        assert result.exit_code == 2
-        assert f"{file.name} exists and was not made by sat-intervals" in result.stderr
-        file.unlink()
-        os.mkfifo(file)
-        assert f"{file.name} is a named pipe" in invoke(*words, "--pictures", tmp_path).stderr
-        file.unlink()
-        file.mkdir()
-        result = invoke(*words, "--pictures", tmp_path)
-        assert (result.stderr, result.stdout) == (f"sat-intervals: {file} is a folder: move it away\n", "")
-        file.rmdir()
-        file.write_text(made)
-    written[-1].unlink()
-    os.mkfifo(written[-1])
-    result = invoke(*words, "--pictures", tmp_path)
-    assert result.stderr == f"sat-intervals: {written[-1]} is a named pipe: move it away or choose another output\n"
-    assert result.stdout == ""
-
-
-@pytest.mark.peer("matplotlib")
-@pytest.mark.parametrize("name", ["dsm-accuracy.json", "dsm-accuracy.md"])
-def test_evaluate_command__keeps_a_file_that_appears_after_its_check(tmp_path, monkeypatch, name):
-    row, column = np.indices((60, 70)).astype(np.float64)
-    truth = relief(row, column)
-    model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
-    reference = write_raster(tmp_path / "reference.tif", [truth])
-    monkeypatch.setattr("sat_intervals.show.marks.write_file", late_file(tmp_path / name))
-    done = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register", "--pictures", tmp_path)
-    assert (done.exit_code, (tmp_path / name).read_text()) == (2, "mine")
-    assert f"{name} exists and was not made by sat-intervals" in done.stderr
-
-
-def test_evaluate_surface__ends_where_a_file_is_replaced_meanwhile(tmp_path, monkeypatch):
-    model = write_surface(tmp_path / "dsm.tif", [[1.0, 2]], [[0.0, 1]], [[2.0, 3]])
-    reference = write_raster(tmp_path / "reference.tif", [[[1.5, 2]]])
-    compared = dsm.compared
-
-    def replaced_after(*arguments):
-        write_raster(reference, [[[1.5, 9]]])
-        return compared(*arguments)
-
-    monkeypatch.setattr(dsm, "compared", replaced_after)
-    with pytest.raises(RunError, match=r"reference.tif was replaced or changed while it was read: rerun"):
-        evaluate_surface(model, reference, registers=False)
-
-
-@pytest.mark.peer("matplotlib")
-def test_evaluate_command__ends_where_a_surface_is_replaced_before_its_pictures(tmp_path, monkeypatch):
-    row, column = np.indices((60, 70)).astype(np.float64)
-    truth = relief(row, column)
-    model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
-    reference = write_raster(tmp_path / "reference.tif", [truth])
-    read_profile = dsm.read_profile
-
-    def replaced_before(*arguments):
-        write_surface(tmp_path / "dsm.tif", truth + 9, truth + 8, truth + 10)
-        return read_profile(*arguments)
-
-    monkeypatch.setattr(dsm, "read_profile", replaced_before)
-    done = invoke("evaluate", "--dsm", model, "--reference", reference, "--no-register", "--pictures", tmp_path)
-    assert done.exit_code == 1
-    assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
-
-
-@pytest.mark.peer("matplotlib")
-@pytest.mark.parametrize("name", ["dsm-accuracy.json", "dsm-errors.png"])
-@pytest.mark.parametrize("is_empty", [False, True])
-def test_evaluate_command__pictures_are_not_mixed_with_those_of_another_folder(tmp_path, monkeypatch, name, is_empty):
-    row, column = np.indices((60, 70)).astype(np.float64)
-    truth = relief(row, column)
-    model = write_surface(tmp_path / "dsm.tif", truth, truth - 1, truth + 1)
-    words = (
-        "evaluate",
-        "--dsm",
-        model,
-        "--reference",
-        write_raster(tmp_path / "reference.tif", [truth]),
-        "--no-register",
-    )
-    for folder in ("own", "other"):
-        (tmp_path / folder).mkdir()
-        if not (is_empty and folder == "other"):
-            assert invoke(*words, "--pictures", tmp_path / folder).exit_code == 0
-    mine = contents(tmp_path / "other")
-
-    @contextmanager
-    def there_for_one(path, there):
-        is_one = path.name == name
-        if is_one:
-            exchanged(tmp_path / "own", tmp_path / "other")
-        try:
-            with whole_file(path, there) as new:
-                yield new
-        finally:
-            if is_one:
-                exchanged(tmp_path / "own", tmp_path / "other")
-
-    whole_file = layers.whole_file
-    monkeypatch.setattr(layers, "whole_file", there_for_one)
-    done = invoke(*words, "--pictures", tmp_path / "own")
-    assert (done.exit_code in (1, 2), done.stderr.count("\n")) == (True, 1), done.output
-    assert mine.items() <= contents(tmp_path / "other").items()
 
 
 def test_evaluate_command__what_it_cannot_use_gets_one_line(tmp_path):

@@ -1,8 +1,6 @@
 """Surface models from made-up points."""
 
 import json
-import os
-import re
 import shutil
 import signal
 import subprocess
@@ -22,11 +20,7 @@ from rasterio.shutil import copy
 from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
-from sat_intervals import config as of_config
 from sat_intervals.config import load_calibration, load_height_calibration
-from sat_intervals.errors import RunError
-from sat_intervals.heights import cells
-from sat_intervals.heights import dsm as of_dsm
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.heights.point_cloud import Cells, PointCloud
@@ -34,13 +28,8 @@ from sat_intervals.kernels.splat import AGREEING, COUNT, MEDIAN, NEAREST, cell_b
 from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
 from sat_intervals.raster import (
     POINT_FILES,
-    RUN_FILES,
-    Georeferencing,
-    OutputWriter,
     Projection,
     north_up,
-    read_layers,
-    read_tags,
     write_layer,
 )
 from sat_intervals.raster.projection import transformed
@@ -84,78 +73,13 @@ def surface_of(outs, tmp_path, **options):
 
 
 @pytest.mark.parametrize("command", ["stac", "project", "plot"])
-def test_surface__of_earlier_points_is_left_out(tmp_path, command):
-    y, x = np.mgrid[:20, :20]
-    out = write_points(tmp_path / "run", x, y, np.full(x.shape, 100.0))
-    points, tags = read_layers(out / "points.tif", Window(0, 0, *x.shape)), read_tags(out / "points.tif")
-
-    def triangulate(height):
-        (out / "points.tif").unlink()
-        points[2:5] += height
-        with OutputWriter(out, POINT_FILES, *x.shape, Georeferencing(), tags) as writer:
-            writer.write(0, points)
-            writer.publish()
-
-    for height in (1.0, 2.0):  # the first points have no CRC-32 in them
-        make_surface([out], out / "dsm.tif", resolution=1.0, crs="EPSG:32631")
-        assert "dsm.tif is" not in invoke(command, out).stderr
-        triangulate(height)
-        done = invoke(command, out)
-        assert done.exit_code == 0
-        assert "dsm.tif is " in done.stderr
-        assert done.stderr.endswith(": rerun sat-intervals dsm\n")
-    make_surface([out], out / "dsm.tif", resolution=1.0, crs="EPSG:32631")
-    triangulate(0.0)  # the same points
-    assert "dsm.tif is" not in invoke(command, out).stderr
-
-
-@pytest.mark.parametrize("command", ["stac", "project", "plot"])
-@pytest.mark.parametrize("changed", ["points.tif", "run.json"])
-def test_surface__of_several_runs_is_left_out_where_another_of_them_was_made_again(tmp_path, command, changed):
-    y, x = np.mgrid[:20, :20]
-    one, other = (write_points(tmp_path / name, x, y, np.full(x.shape, 100.0)) for name in "ab")
-    make_surface([one, other], one / "dsm.tif", resolution=1.0, crs="EPSG:32631")
-    assert json.loads(read_tags(one / "dsm.tif")["FOLDERS"]) == [".", "../../b/out"]
-    assert "dsm.tif is" not in invoke(command, one).stderr
-    again = write_points(tmp_path / "c", x, y, np.full(x.shape, 101.0), run=read_tags(other / "points.tif")["RUN"])
-    shutil.copy(again / changed, other / changed)
-    done = invoke(command, one)
-    assert done.exit_code == 0
-    assert "dsm.tif is " in done.stderr
-    (other / changed).write_text("damaged")
-    assert "dsm.tif is " in invoke(command, one).stderr
-    shutil.rmtree(other)  # nothing to compare with
-    assert "dsm.tif is" not in invoke(command, one).stderr
-
-
-@pytest.mark.parametrize("shape", [(20, 20), (9, 9)])
-def test_dsm__names_points_that_another_raster_replaces_while_it_reads_them(tmp_path, monkeypatch, shape):
-    y, x = np.mgrid[:20, :20]
-    out = write_points(tmp_path / "run", x, y, np.full(x.shape, 100.0))
-    middle = of_dsm.point_near_the_middle
-
-    def replaced_after(runs):
-        place = middle(runs)
-        write_file(out / "points.tif", RUN_FILES[0], np.ones((4, *shape)))
-        return place
-
-    monkeypatch.setattr(of_dsm, "point_near_the_middle", replaced_after)
-    done = invoke("dsm", out, "--resolution", "1")
-    assert done.exit_code == 1
-    assert re.search(r"points\.tif (was replaced by another file|has 4 x 9 x 9 pixels now)", done.stderr), done.stderr
-    assert not (out / "dsm.tif").exists()
-
-
-@pytest.mark.parametrize("command", ["stac", "project", "plot"])
 def test_surface__that_cannot_be_read_is_named(tmp_path, command):
     y, x = np.mgrid[:20, :20]
     out = write_points(tmp_path / "run", x, y, np.full(x.shape, 100.0))
     (out / "dsm.tif").touch()
     done = invoke(command, out)
     assert done.exit_code == 2
-    assert "dsm.tif cannot be read: it is damaged or something else: move it away" in done.stderr
-    os.mkfifo(out / "dsm.tif.aux.xml")
-    assert "dsm.tif.aux.xml is a named pipe" in invoke(command, out).stderr
+    assert "dsm.tif cannot be read" in done.stderr
 
 
 def cell_of(place, x, y):
@@ -237,101 +161,10 @@ def test_make_surface__a_point_reaches_the_cell_it_falls_in_at_any_radius(tmp_pa
     assert np.isnan(surface[BAND["confidence"]]).all()  # of a run without confidence
 
 
-def test_make_surface__ends_where_points_are_replaced_meanwhile(tmp_path, monkeypatch):
-    x, y = np.meshgrid(np.arange(20.0), -np.arange(60.0))
-    out = write_points(tmp_path / "a", x, y, 10 + 0 * x)
-    other = write_points(tmp_path / "b", x, y, 99 + 0 * x)
-    monkeypatch.setattr(cells, "_TILE_ROWS", 16)
-
-    def replace(stage, done, total):
-        if stage == "cells" and done < total:
-            shutil.copy(other / "points.tif", out / "new.tif")
-            (out / "new.tif").replace(out / "points.tif")
-
-    with pytest.raises(RunError, match=r"points.tif was replaced or changed while it was read: rerun the command"):
-        surface_of([out], tmp_path, progress=replace)
-    assert not (tmp_path / "dsm.tif").exists()
-
-
-def test_make_surface__replaces_no_surface_that_was_changed_since(tmp_path):
-    x, y = np.meshgrid(np.arange(20.0), -np.arange(20.0))
-    out = write_points(tmp_path / "a", x, y, 10 + 0 * x)
-    surface_of([out], tmp_path)
-    surface_of([out], tmp_path)
-    with rasterio.open(tmp_path / "dsm.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as dataset:
-        dataset.write(dataset.read() + 1)
-    before = (tmp_path / "dsm.tif").read_bytes()
-    with pytest.raises(SatIntervalsError, match=r"dsm.tif was changed since sat-intervals made it"):
-        surface_of([out], tmp_path)
-    assert (tmp_path / "dsm.tif").read_bytes() == before
-
-
-@pytest.mark.parametrize("name", ["points.tif", "geoid.tif"])
-def test_make_surface__ends_where_points_or_geoid_are_replaced_after_their_check(tmp_path, monkeypatch, name):
-    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
-    file = (out if name == "points.tif" else tmp_path) / name
-    triangulated = of_dsm.triangulated
-
-    def replacing(outs):
-        runs = triangulated(outs)
-        shutil.copy(file, tmp_path / "new.tif")
-        (tmp_path / "new.tif").replace(file)
-        return runs
-
-    monkeypatch.setattr(of_dsm, "triangulated", replacing)
-    with pytest.raises(RunError, match=rf"{name} was replaced or changed while it was read: rerun the command"):
-        surface_of([out], tmp_path, geoid=write_geoid(tmp_path / "geoid.tif", 49.5))
-    assert not (tmp_path / "dsm.tif").exists()
-
-
-def test_make_surface__keeps_a_file_that_appears_after_the_check(tmp_path, monkeypatch):
-    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
-    triangulated = of_dsm.triangulated
-
-    def triangulated_late(outs):
-        (tmp_path / "dsm.tif").write_text("mine")
-        return triangulated(outs)
-
-    monkeypatch.setattr(of_dsm, "triangulated", triangulated_late)
-    with pytest.raises(
-        SatIntervalsError, match=r"dsm.tif is not of this run, or was changed since it started: move it"
-    ):
-        surface_of([out], tmp_path)
-    assert (tmp_path / "dsm.tif").read_text() == "mine"
-
-
 def test_make_surface__of_a_run_that_was_moved(tmp_path):
     out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
     out.rename(tmp_path / "moved")
     make_surface([tmp_path / "moved"], tmp_path / "moved" / "dsm.tif", resolution=1.0)
-
-
-def test_make_surface__goes_on_where_it_was_killed_while_it_published(tmp_path):
-    out = write_points(tmp_path / "a", [0.5], [-0.5], [100.0])
-    surface_of([out], tmp_path)
-    whole = (tmp_path / "dsm.tif").read_bytes()
-    aside = tmp_path / ".unpublished-dsm.tif" / "files" / "replaced"
-    aside.mkdir(parents=True)
-    (tmp_path / "dsm.tif").rename(aside / "dsm.tif")
-    (aside.parents[1] / ".sat-intervals.files").touch()  # as a killed process leaves it
-    surface_of([out], tmp_path)
-    assert (tmp_path / "dsm.tif").read_bytes() == whole
-    assert not aside.exists()
-
-
-def test_point_cloud__ends_where_points_are_replaced_before_outliers_are_found(tmp_path, monkeypatch):
-    x, y = np.meshgrid(np.arange(20.0), -np.arange(20.0))
-    out = write_points(tmp_path / "a", x, y, 10 + 0 * x)
-    other = write_points(tmp_path / "b", x, y, 99 + 0 * x)
-    outlying = PointCloud._outlying
-
-    def replaced_before(*arguments):
-        (other / "points.tif").replace(out / "points.tif")
-        return outlying(*arguments)
-
-    monkeypatch.setattr(PointCloud, "_outlying", replaced_before)
-    with pytest.raises(RunError, match=r"points.tif was replaced or changed while it was read: rerun the command"):
-        PointCloud(open_run(out), Projection("EPSG:32631"), SurfaceChoices(outliers=1.0, keeps_open=True))
 
 
 def test_make_surface__keeps_the_surface_whose_grid_it_takes(tmp_path):
@@ -493,25 +326,6 @@ classes:
 """
 
 
-def test_dsm_command__ends_where_its_calibration_is_replaced_before_the_points_are_read(tmp_path, monkeypatch):
-    """Else an old calibration and new points would be mixed, where a whole folder is exchanged."""
-    out = with_coverage(write_points(tmp_path / "a", [0.5, 3.5], [-0.5, -0.9], [10, 14]))
-    file = tmp_path / "heights.yaml"
-    load = of_config.load_height_calibration
-    file.write_text(CALIBRATION)
-
-    def and_replaced(path):
-        calibration = load(path)
-        shutil.copy(file, tmp_path / "new")
-        (tmp_path / "new").replace(file)
-        return calibration
-
-    monkeypatch.setattr(of_config, "load_height_calibration", and_replaced)
-    result = invoke("dsm", out, "--resolution", 1, "--radius", 0.6, "--calibration", file)
-    assert (result.exit_code, "heights.yaml was replaced or changed" in result.stderr) == (1, True), result.output
-    assert not (out / "dsm.tif").exists()
-
-
 def test_dsm_command__a_calibration_moves_the_bounds_and_is_named_in_the_file(tmp_path):
     # Heights 10, bounds 1 below and 2, 9 above: 8.25 to 12.75; 10 (not past the height) to 15.
     out = write_points(tmp_path / "a", [0.5, 4.5], [-0.5] * 2, [10.0] * 2, upper=[[2, 9]])
@@ -611,15 +425,6 @@ def test_make_surface__refuses_a_radius_of_many_cells(tmp_path):
         surface_of([out], tmp_path, radius=500.0)
 
 
-@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_make_surface__refuses_damaged_points(tmp_path):
-    out = write_points(tmp_path / "a", [0.5, 1.5], [-0.5, -0.5], [10.0, 20.0])
-    with rasterio.open(out / "points.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as points:
-        points.write(np.array([[43.6, np.nan]]), 2)
-    with pytest.raises(SatIntervalsError, match=r"points.tif is damaged, some pixels have only part of a point"):
-        surface_of([out], tmp_path, crs=None)
-
-
 def test_make_surface__ends_at_once_when_it_is_interrupted(tmp_path, monkeypatch):
     out = write_points(tmp_path / "a", [0.5] * 20, [-0.5] * 20, [10.0] * 20)
     cloud = PointCloud(open_run(out), Projection("EPSG:32631"))
@@ -647,7 +452,7 @@ def test_dsm__ends_within_seconds_of_an_interrupt(tmp_path):
     command = [COMMAND, "dsm", out, "--output", tmp_path / "dsm.tif", "--resolution", "1", "--radius", "32"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
-            wait_until(lambda: list(tmp_path.glob(".unpublished-*/files/*")), "a temporary file")
+            wait_until(lambda: list(tmp_path.glob(".*")), "a temporary file")
             process.send_signal(signal.SIGINT)
             said = process.communicate(timeout=20)[1]
         finally:
@@ -738,12 +543,9 @@ def test_make_surface__what_it_cannot_use_gets_one_line(tmp_path):
         ([far[0]], ["--radius", "1e9"], "radius is 1e+09 m: give one above 0"),
         ([far[0], far[0]], [], "are the same run: give each run once"),
         ([far[0], shutil.copytree(far[0], tmp_path / "copy")], [], "are the same run: give each run once"),
-        (
-            [far[0]],
-            ["--output", str(far[0] / "points.tif")],
-            "exists and is not a surface model: move it away",
-        ),
-        ([far[0]], ["--output", str(tmp_path)], "exists and is not a surface model: move it away"),
+        ([far[0]], ["--output", str(far[0] / "points.tif")], "points.tif exists: choose another name or --overwrite"),
+        ([far[0]], ["--output", str(far[0] / "points.tif"), "--overwrite"], "points.tif is an input"),
+        ([far[0]], ["--output", str(tmp_path)], "is a folder: choose another name"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "wild.tif", -9999.0))], "has -9999 m at longitude 1.39"),
         ([far[0]], ["--geoid", str(tmp_path / "none.gtx")], "none.gtx: no such file"),
         ([far[0]], ["--geoid", str(write_geoid(tmp_path / "a,@b.tif", 9.0))], "a,@b.tif: PROJ reads no file with a co"),

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import shutil
 from contextlib import suppress
 
@@ -17,15 +16,11 @@ from surfaces import write_geoid
 
 from sat_intervals import SatIntervalsError
 from sat_intervals.demo import DATUM, PIXEL, VIEWS
-from sat_intervals.errors import RunError
 from sat_intervals.products import OCCLUSION
-from sat_intervals.raster import MARK, Georeferencing, Projection, Vertical, write_layer
+from sat_intervals.raster import Projection, Vertical
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
-    from sat_intervals.heights import point_files, point_sight
-    from sat_intervals.heights import reference as of_reference
     from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
-    from sat_intervals.heights.sensors import Sensors
     from sat_intervals.heights.triangulate import triangulate
 
 pytestmark = [
@@ -381,7 +376,8 @@ def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
         (["--points", tmp_path / "none.las", "--ellipsoid"], files, "none.las: no such file"),
         (ones, swapped, "points.tif was made with other models or grids: give these, or triangulate again"),
         ([*ones, "--no-register"], swapped, "models and grids of left and right are swapped"),
-        ([*ones, "--output", reference], files, "was not made by sat-intervals"),
+        ([*ones, "--output", reference], files, "exists: choose another name or --overwrite"),
+        ([*ones, "--output", reference, "--overwrite"], files, "is an input"),
     ):
         result = invoke("reference", out, *words, *sensor_words(cameras_given))
         assert result.exit_code == 2, result.output
@@ -392,178 +388,17 @@ def test_reference_command__what_it_cannot_use_gets_one_line(relief, tmp_path):
     assert "10 pixels with a true disparity" in result.output
 
 
-def test_make_truth__ends_where_the_reference_is_replaced_meanwhile(relief, tmp_path):
+def test_reference_command__replaces_a_named_file_with_overwrite_only(relief, tmp_path):
     out, files, reference = relief
-    heights = tmp_path / "heights.tif"
-    shutil.copy(reference, heights)
-
-    def replace(stage, done, total):
-        if stage == "truth":
-            shutil.copy(reference, tmp_path / "new.tif")
-            (tmp_path / "new.tif").replace(heights)
-
-    given_heights = Reference(heights, False, Vertical(True, None))
-    with pytest.raises(RunError, match=r"heights.tif was replaced or changed while it was read: rerun the command"):
-        make_truth(out, SensorFiles(*files), given_heights, path=tmp_path / "truth.tif", progress=replace)
-    assert not (tmp_path / "truth.tif").exists()
-
-
-def test_reference_command__names_the_run_that_is_replaced_while_its_points_are_checked(relief, tmp_path, monkeypatch):
-    out, files, heights = relief
-    out = shutil.copytree(out, tmp_path / "out")
-    read = of_reference.read_layers
-
-    def moved(path, *arguments, **named):
-        os.utime(path, ns=(0, 0))
-        return read(path, *arguments, **named) + 5
-
-    monkeypatch.setattr(of_reference, "read_layers", moved)
-    done = invoke("reference", out, "--heights", heights, "--ellipsoid", *sensor_words(files))
-    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
-    assert f"the run in {out} was replaced while it was read: rerun the command" in done.stderr
-
-
-@pytest.mark.parametrize("name", ["p.dbf", "p.csvt", "p.gpkg-wal"])
-def test_make_truth__ends_where_another_file_of_the_points_is_replaced_meanwhile(relief, tmp_path, monkeypatch, name):
-    """Else the truth would mix two sets of heights."""
-    out, files, _ = relief
-    points = tmp_path / {"p.dbf": "p.shp", "p.csvt": "p.tsv", "p.gpkg-wal": "p.gpkg"}[name]
-    write_csv(points, places(hills, 1500))
-    (tmp_path / name).write_text("before")
-    monkeypatch.setattr(point_files, "_crs_of_vectors", point_files._crs_of_table)
-    monkeypatch.setattr(point_files, "_vectors", point_files._table)
-
-    def replace(stage, done, total):
-        if stage == "truth":
-            (tmp_path / name).write_text("after")
-
-    given = Reference(points, True, Vertical(True, None))
-    with pytest.raises(RunError, match=r"p\.\S+ was (replaced or )?changed while it was read: rerun the command"):
-        make_truth(out, SensorFiles(*files), given, path=tmp_path / "truth.tif", registers=False, progress=replace)
-    assert not (tmp_path / "truth.tif").exists()
-
-
-def test_make_truth__keeps_its_points_where_nobody_can_exchange_them(relief, tmp_path, monkeypatch):
-    out, files, _ = relief
-    points = Reference(write_csv(tmp_path / "p.csv", places(hills, 1500)), True, Vertical(True, None))
-    strips, there = point_sight.PointSight.strips, []
-
-    def looked_at(sight):
-        there.extend(file.name for file in tmp_path.rglob("*") if file.is_file())
-        return strips(sight)
-
-    monkeypatch.setattr(point_sight.PointSight, "strips", looked_at)
-    make_truth(out, SensorFiles(*files), points, path=tmp_path / "truth.tif", registers=False)
-    assert sorted(there) == [".sat-intervals.files", ".sat-intervals.lock", "p.csv"]
-
-
-def test_point_file__does_not_wait_for_a_pipe_that_took_its_place(tmp_path):
-    path = write_csv(tmp_path / "p.csv", places(hills, 15))
-    points = point_files.PointFile(path, None, Vertical(True, None))
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(SatIntervalsError, match=r"p\.csv is a named pipe: give a regular file"):
-        next(points.parts())
-
-
-@pytest.mark.parametrize("name", ["p.vrt", "p.xml"])
-def test_make_truth__refuses_virtual_points(relief, tmp_path, name):
-    out, files, _ = relief
-    (tmp_path / name).write_text("<OGRVRTDataSource></OGRVRTDataSource>")
-    with pytest.raises(SatIntervalsError, match=rf"{name} is read from other files, .*: convert it with ogr2ogr"):
-        make_truth(out, SensorFiles(*files), Reference(tmp_path / name, True, Vertical(True, None)))
-
-
-def test_make_truth__keeps_a_file_that_appears_after_the_check(relief, tmp_path, monkeypatch):
-    out, files, reference = relief
-    truth = tmp_path / "truth.tif"
-    load = Sensors.load
-
-    def loaded_late(*files, **options):
-        truth.write_text("mine")
-        return load(*files, **options)
-
-    monkeypatch.setattr(Sensors, "load", loaded_late)
-    heights = Reference(reference, False, Vertical(True, None))
-    with pytest.raises(SatIntervalsError, match=r"truth.tif is not of this run, or was changed since it started"):
-        make_truth(out, SensorFiles(*files), heights, path=truth, registers=False)
-    assert truth.read_text() == "mine"
-
-
-@pytest.mark.peer("pyogrio", "shapely")
-def test_point_file__refuses_a_format_that_may_be_read_from_other_files(tmp_path):
-    import pyogrio
-    import shapely
-
-    path, point = tmp_path / "p.dxf", shapely.to_wkb(shapely.points([[5.0, 43.0, 100.0]]))
-    pyogrio.raw.write(path, point, [], [], geometry_type="Point Z", crs="EPSG:4326", driver="DXF")
-    with pytest.raises(SatIntervalsError, match=r"p\.dxf has the format DXF, .*: convert it to GeoPackage"):
-        point_files.PointFile(path, "EPSG:4326", Vertical(True, None))
-
-
-@pytest.mark.parametrize("is_link", [False, True])
-def test_watched_points__are_not_changed_by_reading_them(tmp_path, is_link):
-    path, journal = tmp_path / "p.gpkg", tmp_path / "p.gpkg-wal"
-    path.write_text("points")
-    journal.write_text("more points")
-    if is_link:
-        (tmp_path / "links").mkdir()
-        (tmp_path / "links" / "p.gpkg").symlink_to(path)
-    check = point_files.watched_points(tmp_path / "links" / "p.gpkg" if is_link else path)
-    journal.chmod(0o600)  # root's SQLite changes its owner
-    (tmp_path / "p.gpkg-shm").touch()
-    (tmp_path / "p.log").touch()
-    check()
-    journal.write_text("other points")
-    with pytest.raises(RunError, match=r"p\.gpkg was changed while it was read: rerun the command"):
-        check()
-
-
-@pytest.mark.parametrize("how", ["in place", "copied"])
-def test_make_truth__replaces_no_truth_that_was_changed_since(relief, tmp_path, how):
-    out, files, reference = relief
-    path, given = tmp_path / "truth.tif", Reference(reference, False, Vertical(True, None))
-    make_truth(out, SensorFiles(*files), given, path=path, registers=False)
-    make_truth(out, SensorFiles(*files), given, path=path, registers=False)
-    if how == "copied":  # with its tags, as gdal_translate does
-        with rasterio.open(path) as dataset:
-            pixels, kind, tags = dataset.read(), dataset.profile, dataset.tags()
-        with rasterio.open(path, "w", **kind) as dataset:
-            dataset.update_tags(**tags)
-            dataset.write(pixels)
-    else:
-        with rasterio.open(path, "r+", IGNORE_COG_LAYOUT_BREAK="YES") as dataset:
-            dataset.write(dataset.read() + 1)
-    before = path.read_bytes()
-    with pytest.raises(SatIntervalsError, match=r"truth.tif was changed since sat-intervals made it"):
-        make_truth(out, SensorFiles(*files), given, path=path, registers=False)
-    assert path.read_bytes() == before
-
-
-@pytest.mark.parametrize("name", ["intervals.tif", "truth.tif"])
-def test_reference_command__replaces_only_a_truth_of_its_own(relief, tmp_path, name):
-    out, files, reference = relief
-    mine = tmp_path / name
-    if name == "truth.tif":  # as that of the demo
-        write_layer(mine, np.zeros((9, 9), np.float32), np.nan, Georeferencing(), MARK)
-    else:
-        shutil.copy(out / name, mine)
-    before = mine.read_bytes()
-    words = (
-        "reference",
-        out,
-        "--heights",
-        reference,
-        "--ellipsoid",
-        "--no-register",
-        "--output",
-        mine,
-        *sensor_words(files),
-    )
-    assert f"{name} exists and was not made by sat-intervals" in invoke(*words).stderr
-    assert mine.read_bytes() == before
-    mine.unlink()
-    assert [invoke(*words).exit_code for _ in range(2)] == [0, 0]
+    mine = tmp_path / "mine.tif"
+    mine.write_text("mine")
+    given = ["--heights", reference, "--ellipsoid", "--no-register", "--output", mine, *sensor_words(files)]
+    refused = invoke("reference", out, *given)
+    assert (refused.exit_code, mine.read_text()) == (2, "mine")
+    assert "mine.tif exists: choose another name or --overwrite" in refused.stderr
+    assert invoke("reference", out, *given, "--overwrite").exit_code == 0
+    with rasterio.open(mine) as truth:
+        assert truth.tags()["SOFTWARE"] == "sat-intervals"
 
 
 def test_reference_command__needs_points_of_the_run_to_register(relief, tmp_path):

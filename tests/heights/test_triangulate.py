@@ -4,30 +4,25 @@ import csv
 import json
 import shutil
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
 from cameras import EAST, LATITUDE, LONGITUDE, NORTH, cameras, grid, sensor_words
 from finished import MAXIMUM, MINIMUM, write_run
-from helpers import Killed, invoke, killed_while_publishing, write_pair
+from helpers import invoke, write_pair
 from rasterio.shutil import copy
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
-from sat_intervals import RunError, SatIntervalsError, match_pair
+from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.demo import DATUM, PIXEL, VIEWS, make_scene
-from sat_intervals.errors import ChangedInputError
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import INVALID, POINTS
-from sat_intervals.raster import stamps
 from sat_intervals.results import open_run
 from sat_intervals.tiling import Window
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
-    from sat_intervals.heights import sensors as of_sensors
-    from sat_intervals.heights import triangulate as of_points
     from sat_intervals.heights.sensors import Lattice, Sensors
     from sat_intervals.heights.triangulate import triangulate
 
@@ -323,159 +318,6 @@ def test_triangulate_command__a_hole_in_a_grid_loses_the_points_around_it(level_
     np.testing.assert_allclose(points[~lost], whole[~lost], atol=1e-3)
 
 
-def test_triangulate__protects_the_points_by_a_checksum(level_run, tmp_path):
-    out, files = level_run
-    triangulate(out, *files)
-    surface = tmp_path / "dsm.tif"
-    whole = (out / "points.tif").read_bytes()
-    for place in range(len(whole) // 2, len(whole), len(whole) // 20):
-        (out / "points.tif").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        with pytest.raises(SatIntervalsError, match=r"points.tif is not what triangulate published; .*triangulate aga"):
-            make_surface([out], surface, resolution=1.0)
-    report = (out / "points.json").read_text()
-    (out / "points.json").unlink()
-    for place in range(len(whole) // 2, len(whole), len(whole) // 20):
-        (out / "points.tif").write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        with pytest.raises(SatIntervalsError, match=r"points.tif is damaged or was changed: its CRC-32 is"):
-            make_surface([out], surface, resolution=1.0)
-        with pytest.raises(SatIntervalsError, match=r"points.tif exists .*, or was changed since: move it away"):
-            triangulate(out, *files)
-    (out / "points.tif").write_bytes(whole)
-    make_surface([out], surface, resolution=1.0)
-    (out / "points.json").write_text(report)
-    make_surface([out], surface, resolution=1.0)
-    triangulate(out, *files)
-    make_surface([out], surface, resolution=1.0)
-    assert not list(out.glob(".unpublished-*/files"))
-
-
-@pytest.mark.parametrize("number", range(1, 5))
-def test_triangulate__goes_on_after_a_kill_while_other_points_get_their_names(level_run, number):
-    """New points beside the old report would be taken for damaged."""
-    out, files = level_run
-    triangulate(out, *files)
-    with suppress(Killed), killed_while_publishing(number):
-        triangulate(out, files[1], files[0], *files[2:])
-    triangulate(out, *files)
-    make_surface([out], out / "dsm.tif", resolution=1.0)
-    assert not [*out.glob(".unpublished-*/files/*")]
-
-
-_REPORT = '{"files": {"points.tif": {"bytes": %s, "crc32": 0}}%s}'
-
-
-@pytest.mark.parametrize("text", ["mine", "[]", _REPORT % ("1e999", ""), _REPORT % ("1", ', "note": "mine"')])
-def test_triangulate__keeps_a_foreign_report(level_run, tmp_path, text):
-    out, files = level_run
-    (out / "points.json").write_text(text)
-    with pytest.raises(SatIntervalsError, match=r"points.json is not the report of points.tif: move it away"):
-        triangulate(out, *files)
-    assert (out / "points.json").read_text() == text
-    assert not (out / "points.tif").exists()
-
-
-def test_triangulate__keeps_foreign_points(level_run):
-    out, files = level_run
-    path, foreign = out / "points.tif", [b"mine", (out / "intervals.tif").read_bytes()]
-    for content in foreign:
-        path.write_bytes(content)
-        with pytest.raises(SatIntervalsError, match=r"points.tif exists and was not made by triangulate"):
-            triangulate(out, *files)
-        assert path.read_bytes() == content
-    path.unlink()
-    triangulate(out, *files)
-    for content in foreign:
-        path.write_bytes(content)  # beside the report of the points
-        with pytest.raises(SatIntervalsError, match=r"points.tif exists and was not made by triangulate"):
-            triangulate(out, *files)
-        assert path.read_bytes() == content
-    path.unlink()
-    triangulate(out, *files)
-    (out / "points.json").unlink()  # of an earlier version
-    triangulate(out, *files)
-
-
-def test_triangulate__keeps_points_that_appear_after_the_models_are_read(level_run, monkeypatch):
-    out, files = level_run
-    read_grid = of_sensors.read_grid
-
-    def read_late(path, **options):
-        (out / "points.tif").write_bytes(b"mine")
-        return read_grid(path, **options)
-
-    monkeypatch.setattr(of_sensors, "read_grid", read_late)
-    with pytest.raises(SatIntervalsError, match=r"points.tif exists and was not made by triangulate"):
-        triangulate(out, *files)
-    assert (out / "points.tif").read_bytes() == b"mine"
-
-
-def test_triangulate__keeps_points_that_are_away_while_files_are_examined(level_run, monkeypatch):
-    out, files = level_run
-    mine, check_own = out / "points.tif", of_points._check_own
-    mine.write_text("mine")
-
-    def away(folder):
-        mine.rename(out / "away")
-        check_own(folder)
-        (out / "away").rename(mine)
-
-    monkeypatch.setattr(of_points, "_check_own", away)
-    with pytest.raises(ChangedInputError, match=r"points\.tif was replaced or changed while it was read"):
-        triangulate(out, *files)
-    assert mine.read_text() == "mine"
-
-
-@pytest.mark.parametrize("place", range(4))
-def test_triangulate__ends_where_a_model_or_grid_is_replaced_meanwhile(level_run, monkeypatch, place):
-    out, files = level_run
-    read_grid = of_sensors.read_grid
-
-    def replacing(path, **options):
-        found = read_grid(path, **options)
-        if Path(path) == files[3]:  # the last that is read
-            shutil.copy(files[place], out / "copy")
-            (out / "copy").replace(files[place])
-        return found
-
-    monkeypatch.setattr(of_sensors, "read_grid", replacing)
-    with pytest.raises(RunError, match=rf"{files[place].name} was replaced or changed while it was read: rerun"):
-        triangulate(out, *files)
-    assert not (out / "points.tif").exists()
-
-
-@pytest.mark.parametrize("name", ["intervals.tif", "validity.tif"])
-def test_triangulate__ends_where_a_raster_of_the_run_is_replaced_meanwhile(level_run, monkeypatch, name):
-    out, files = level_run
-    load = Sensors.load
-
-    def replacing(*arguments, **options):
-        shutil.copy(out / name, out / "copy")
-        (out / "copy").replace(out / name)
-        return load(*arguments, **options)
-
-    monkeypatch.setattr(Sensors, "load", replacing)
-    with pytest.raises(RunError, match=r"the run in .* was replaced while it was read: rerun the command"):
-        triangulate(out, *files)
-    assert not (out / "points.tif").exists()
-
-
-def test_triangulate__ends_where_a_file_beside_the_run_appears_meanwhile(level_run, monkeypatch):
-    """Such files may have another place, which decides what grids of OTB mean."""
-    out, files = level_run
-    load = Sensors.load
-
-    def appears(*arguments, **options):
-        (out / "validity.tif.aux.xml").write_text(
-            "<PAMDataset><GeoTransform>10,1,0,20,0,-1</GeoTransform></PAMDataset>"
-        )
-        return load(*arguments, **options)
-
-    monkeypatch.setattr(Sensors, "load", appears)
-    with pytest.raises(SatIntervalsError, match=r"validity\.tif\.aux\.xml changes what is read from .*: move it away"):
-        triangulate(out, *files)
-    assert not (out / "points.tif").exists()
-
-
 def test_triangulate_command__needs_a_run(tmp_path):
     files = cameras(tmp_path, 40, 50)
     result = invoke("triangulate", tmp_path, *sensor_words(files))
@@ -517,12 +359,7 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert (out / "run.json").read_bytes() == before
     assert "% with a height" in result.stdout
     assert "median half width +-" in result.stdout
-    noted = list(stamps(out, ("intervals.tif", "validity.tif", "run.json")).values())
-    (out / "tiles").mkdir()
-    mark = out / "tiles" / ".sat-intervals.finished"
-    mark.write_text("\n".join(["of this run", *noted]))  # as a run that was killed before it removed its tiles
     figures = json.loads(invoke(*command, "--json").stdout)
-    assert not (out / "tiles").exists()
     assert figures["run"] == open_run(out).report
     assert figures["points"]["points"] > 0
     assert 0 < figures["surface"]["filled"] <= 1
@@ -532,27 +369,6 @@ def test_surface_command__is_match_triangulate_and_dsm_and_resumes(tmp_path, mon
     assert np.array_equal(read(out / "dsm.tif"), read(steps / "dsm.tif"), equal_nan=True)
     other = invoke(*command, "--preset", "satellite")
     assert (other.exit_code, "already holds another run" in other.stderr) == (2, True)
-
-    def exchanged(*_):
-        shutil.rmtree(out)
-        shutil.copytree(steps, out)
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sat_intervals.run.before.tidy", exchanged)
-        replaced = invoke(*command)
-    assert (replaced.exit_code, "was replaced before its points were made" in replaced.stderr) == (1, True)
-    assert {file.name: file.read_bytes() for file in out.iterdir()} == {
-        file.name: file.read_bytes() for file in steps.iterdir()
-    }
-
-    def late(*arguments, **options):
-        points = triangulate(*arguments, **options)
-        return points | {"file": points["file"] | {"crc32": 1}}  # as if points with other models came then
-
-    monkeypatch.setattr("sat_intervals.heights.triangulate.triangulate", late)
-    replaced = invoke(*command)
-    assert replaced.exit_code == 1
-    assert "or its points were replaced before the surface was made: rerun the command" in replaced.stderr
 
 
 def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
@@ -586,28 +402,8 @@ def test_batch_command__rows_with_models_and_grids_go_on_to_a_surface(tmp_path):
     assert (result.exit_code, "intervals.tif would be written" in result.stderr) == (2, True)
     assert batch(f"a,{images},{sensors},2").exit_code == 0
     assert read(out / "a" / "dsm.tif").shape[1] < 60  # made again
-    (out / "a" / "points.tif").write_bytes(b"mine")
-    (out / "a" / "points.json").unlink()
-    result = batch(f"a,{images},{sensors},1", f"b,{images},{sensors},1")
-    assert result.exit_code == 1
-    assert "a: " in result.stderr
-    assert "points.tif exists and was not made by triangulate" in result.stderr
+    assert batch(f"a,{images},{sensors},1", f"b,{images},{sensors},1").exit_code == 0
     assert (out / "b" / "dsm.tif").exists()
-
-
-def test_triangulate_command__replaces_no_points_that_were_changed_since(tmp_path):
-    out = write_run(tmp_path, np.full((4, 60, 80), 5, np.float32), np.zeros((60, 80), np.uint16))
-    command = "triangulate", out, *sensor_words(cameras(tmp_path, 60, 80))
-    assert [invoke(*command).exit_code for _ in range(2)] == [0, 0]
-    with rasterio.open(out / "points.tif", "r+", IGNORE_COG_LAYOUT_BREAK="YES") as dataset:
-        dataset.write(dataset.read() + 1)
-    before = (out / "points.tif").read_bytes()
-    result = invoke(*command)
-    assert (result.exit_code, "or was changed since" in result.stderr) == (
-        2,
-        True,
-    )
-    assert (out / "points.tif").read_bytes() == before
 
 
 def test_surface_command__refuses_an_image_that_its_points_would_replace(tmp_path):
@@ -651,18 +447,6 @@ def test_batch_command__refuses_a_grid_that_a_run_would_replace(tmp_path):
     assert result.exists()
 
 
-@pytest.mark.parametrize("name", ["points.tif.msk", "dsm.tif.ovr"])
-def test_surface_command__refuses_a_file_beside_its_results_before_it_matches(tmp_path, name):
-    write_pair(tmp_path, make_scene(60, 80, seed=4))
-    files = cameras(tmp_path, 60, 80)
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / name).write_text("mine")
-    images = tmp_path / "left.tif", tmp_path / "right.tif"
-    result = invoke("surface", *images, tmp_path / "out", *sensor_words(files), "--disparity", 0, 9, "--resolution", 1)
-    assert (result.exit_code, f"{name} changes what is read from" in result.stderr) == (2, True), result.output
-    assert [file.name for file in (tmp_path / "out").iterdir()] == [name]
-
-
 def test_surface_command__keeps_the_source_of_its_grid(tmp_path):
     write_pair(tmp_path, make_scene(60, 80, seed=4))
     files, out = cameras(tmp_path, 60, 80), tmp_path / "out"
@@ -675,25 +459,6 @@ def test_surface_command__keeps_the_source_of_its_grid(tmp_path):
     result = invoke("surface", *images, out, *sensor_words(files), *words)
     assert (result.exit_code, "dsm.tif is an input" in result.stderr) == (2, True), result.output
     assert [file.name for file in out.iterdir()] == ["dsm.tif"]
-
-
-def test_surface_command__ends_where_a_grid_is_replaced_while_it_matches(tmp_path, monkeypatch):
-    scene = make_scene(60, 80, seed=4)
-    write_pair(tmp_path, scene)
-    files = cameras(tmp_path, 60, 80)
-    other = grid(tmp_path / "other.tif", 60, 80, offset=3.5)
-
-    def match(*arguments, **options):
-        report = match_pair(*arguments, **options)
-        other.replace(files[2])
-        return report
-
-    monkeypatch.setattr("sat_intervals.run.pair.match_pair", match)
-    search = "--disparity", scene.minimum, scene.maximum
-    images = tmp_path / "left.tif", tmp_path / "right.tif"
-    result = invoke("surface", *images, tmp_path / "out", *sensor_words(files), *search, "--resolution", 1)
-    assert (result.exit_code, (tmp_path / "out" / "points.tif").exists()) == (1, False)
-    assert "left_grid.tif was replaced or changed while it was read: rerun the command" in result.stderr
 
 
 def test_surface_command__warns_of_models_that_nearly_fit(tmp_path):

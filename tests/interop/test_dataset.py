@@ -1,6 +1,5 @@
 """Finished runs as lazy datasets."""
 
-import json
 import subprocess
 import sys
 
@@ -12,7 +11,7 @@ from finished import PLACE, random_bands, write_run
 from numpy.testing import assert_allclose, assert_array_equal
 
 import sat_intervals
-from sat_intervals import RunError, SatIntervalsError, decode_flags, evaluate_run
+from sat_intervals import SatIntervalsError, decode_flags, evaluate_run
 from sat_intervals.interop.dataset import Intervals
 from sat_intervals.products import FLAGS, INVALID
 
@@ -95,17 +94,6 @@ def test_accessor__width_and_profile(made):
     for row, columns in ((70, None), (-1, None), (0, (5, 90)), (0, (8, 3))):
         with pytest.raises(SatIntervalsError, match="are outside the dataset: rows are 0 to 69, columns 0 to 89"):
             dataset.intervals.profile(row, columns)
-
-
-def test_open__of_a_run_that_was_replaced_does_not_mix_two_runs(tmp_path):
-    bands, validity, _ = random_bands(20, 30)
-    out = write_run(tmp_path, bands, validity)
-    dataset = sat_intervals.open(out)
-    report = json.loads((out / "run.json").read_text())
-    (out / "run.json").unlink()
-    (out / "run.json").write_text(json.dumps(report))
-    with pytest.raises(RunError, match="was replaced while it was read"):
-        dataset["lower"].compute()
 
 
 def test_open__refuses_what_is_no_run(tmp_path):

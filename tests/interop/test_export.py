@@ -11,11 +11,7 @@ from helpers import invoke
 from numpy.testing import assert_array_equal
 from rasterio.transform import Affine
 
-from sat_intervals.errors import SatIntervalsError
-from sat_intervals.interop import export as module
-from sat_intervals.interop.export import export
 from sat_intervals.products import INVALID
-from sat_intervals.results import Run
 
 # Epipolar images have no georeferencing.
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -123,33 +119,14 @@ def test_export__a_region_lies_at_its_place_in_the_left_image(tmp_path, row):
             assert (dataset.transform, dataset.crs) == (PLACE.transform @ Affine.translation(-7, -row), None)
 
 
-def test_export__keeps_a_file_that_appears_after_the_run_is_opened(run, tmp_path, monkeypatch):
-    mine = tmp_path / "disparity.tif"
-    check_kept = Run.check_kept
-
-    def checked_late(*arguments):
-        check_kept(*arguments)
-        mine.write_text("mine")
-
-    monkeypatch.setattr(Run, "check_kept", checked_late)
-    with pytest.raises(SatIntervalsError, match=r"disparity.tif exists and was not made by sat-intervals"):
-        export(run[0], "otb", tmp_path)
-    assert mine.read_text() == "mine"
-
-
-def test_export__keeps_a_file_that_is_away_while_files_are_examined(run, tmp_path, monkeypatch):
-    mine, check_made_by = tmp_path / "disparity.tif", module.check_made_by
-    mine.write_text("mine")
-
-    def away(file, *arguments):
-        mine.rename(tmp_path / "away")
-        check_made_by(file, *arguments)
-        (tmp_path / "away").rename(mine)
-
-    monkeypatch.setattr(module, "check_made_by", away)
-    with pytest.raises(SatIntervalsError, match=r"disparity\.tif was (replaced or )?changed "):
-        export(run[0], "otb", tmp_path)
-    assert mine.read_text() == "mine"
+def test_export__replaces_files_with_overwrite_only(run, tmp_path):
+    (tmp_path / "mask.tif").write_text("mine")
+    refused = invoke("export", run[0], tmp_path, "--to", "otb")
+    assert (refused.exit_code, [file.name for file in tmp_path.iterdir()]) == (2, ["mask.tif"])
+    assert "mask.tif exists: choose another name or --overwrite" in refused.stderr
+    assert invoke("export", run[0], tmp_path, "--to", "otb", "--overwrite").exit_code == 0
+    with rasterio.open(tmp_path / "mask.tif") as dataset:
+        assert dataset.tags()["EXPORT"] == "otb"
 
 
 def test_export__refuses_what_is_no_run_and_what_it_does_not_know(run, tmp_path):

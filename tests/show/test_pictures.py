@@ -12,7 +12,7 @@ from operator import getitem
 import numpy as np
 import pytest
 from finished import PLACE, no_bands, random_bands, without_intervals, write_file, write_run, write_surface
-from helpers import exchanged, invoke, write_pair
+from helpers import invoke, write_pair
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -22,7 +22,6 @@ from PIL import Image
 import sat_intervals
 from sat_intervals import match_pair
 from sat_intervals.cli.console import Console
-from sat_intervals.config.sealing import ROOM
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import (
@@ -40,7 +39,7 @@ from sat_intervals.products import (
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, stamps, surface_file, write_layer
 from sat_intervals.results import open_results, open_run
 from sat_intervals.run.statistics import Tally
-from sat_intervals.show import coverage, dsm, maps, marks
+from sat_intervals.show import maps
 from sat_intervals.show.canvas import widest
 from sat_intervals.show.cost_curve import read_curve
 from sat_intervals.show.dsm import _relief, draw_surface
@@ -82,7 +81,7 @@ def share_of(picture, colour):
 @pytest.fixture
 def unrendered(monkeypatch):
     """Figures are made and not rendered, which takes most of their time: for tests that look at what is drawn."""
-    monkeypatch.setattr(Figure, "savefig", lambda figure, stream, **options: stream.write(ROOM.encode()))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: path.write_bytes(b"drawn"))
 
 
 def test_plot__makes_every_picture_and_names_it(run):
@@ -347,24 +346,6 @@ def test_plot__draws_no_surface_of_an_earlier_run_and_none_that_is_no_surface(tm
         draw_surface(tmp_path / "dsm.tif", tmp_path / "dsm.png")
 
 
-@pytest.mark.parametrize("name", ["truth.tif", "left.tif", "mask.tif"])
-def test_plot__ends_where_an_image_is_replaced_meanwhile(tmp_path, monkeypatch, unrendered, name):
-    out = write_run(tmp_path, *random_bands(40, 50))
-    (truth,) = tmp_path.rglob("truth.tif")
-    shutil.copy(truth, tmp_path / "mask.tif")
-    (file,) = tmp_path.rglob(name)
-    counted = coverage.evaluate_run
-
-    def replaced_before(*arguments, **named):
-        shutil.copy(file, tmp_path / "new.tif")
-        (tmp_path / "new.tif").replace(file)
-        return counted(*arguments, **named)
-
-    monkeypatch.setattr(coverage, "evaluate_run", replaced_before)
-    done = invoke("plot", out, "--dpi", "40", "--mask", tmp_path / "mask.tif")
-    assert (done.exit_code, f"{name} was replaced or changed" in done.stderr) == (1, True), done.stderr
-
-
 @pytest.mark.parametrize("name", ["overview.png", "coverage.png"])
 def test_plot__keeps_the_mask_that_it_is_given(run, name):
     mask = run / name
@@ -373,38 +354,6 @@ def test_plot__keeps_the_mask_that_it_is_given(run, name):
     done = invoke("plot", run, "--dpi", "40", "--mask", mask)
     assert (done.exit_code, f"{name} is an input" in done.stderr) == (2, True)
     assert mask.read_bytes() == before
-
-
-def test_plot__ends_where_a_surface_is_replaced_meanwhile(tmp_path, monkeypatch, unrendered):
-    """Else dsm.png is of another run than the other pictures, or its caption of another surface than its maps."""
-    out = write_run(tmp_path, *random_bands(40, 50)[:2])
-    write_surface(out, np.full((40, 50), 700.0))
-    figures = dsm._figures
-
-    def replaced_before(*arguments):
-        write_surface(out, np.full((40, 50), 1700.0))
-        return figures(*arguments)
-
-    monkeypatch.setattr(dsm, "_figures", replaced_before)
-    done = invoke("plot", out, "--dpi", "40")
-    assert done.exit_code == 1
-    assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
-    assert not [*out.glob("*.png")]  # the one of the surface may show both
-
-
-def test_plot__ends_where_another_run_takes_the_folders_name_before_pictures_are_written(tmp_path, monkeypatch):
-    out = write_run(tmp_path, *random_bands(40, 50)[:2])
-    other = tmp_path / "other"
-    shutil.copytree(out, other)
-    write = marks.write_made_here
-
-    def and_exchanged(*arguments):
-        exchanged(out, other)
-        write(*arguments)
-
-    monkeypatch.setattr(marks, "write_made_here", and_exchanged)
-    done = invoke("plot", out, "--dpi", "40")
-    assert (done.exit_code, "was replaced while it was read: rerun the command" in done.stderr) == (1, True)
 
 
 def test_draw_surface__without_bounds(tmp_path, words):

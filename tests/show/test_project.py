@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import subprocess
 import zipfile
 from collections import Counter
@@ -12,8 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import rasterio
-from finished import PLACE, no_bands, random_bands, without_intervals, write_points, write_run, write_surface
-from helpers import exchanged, fail, flip_bit, invoke
+from finished import PLACE, no_bands, random_bands, without_intervals, write_run, write_surface
+from helpers import fail, invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from rasterio.crs import CRS
@@ -123,68 +122,13 @@ def test_difference__keeps_control_points(tmp_path, run):
         assert Georeferencing.of(dataset) == place
 
 
-def test_write_project__keeps_styles_and_projects_of_others(run):
+def test_write_project__replaces_its_files(run):
     out, _, _ = run
-    (out / "intervals.qml").write_text("<qgis/>")
-    done = invoke("project", out)
-    assert done.exit_code == 0
-    said = f"{out / 'intervals.qml'} was not made by sat-intervals, or was changed since, and is kept\n"
-    assert done.stderr == said
-    assert (out / "intervals.qml").read_text() == "<qgis/>"
-    assert invoke("project", out).exit_code == 0  # its own files are replaced
-    before = (out / "width.qml").read_bytes()
-    (out / "width.qml").unlink()
-    (out / "project.qgz").write_bytes(b"PK of QGIS")
-    done = invoke("project", out)
-    assert (done.exit_code, (out / "project.qgz").read_bytes()) == (2, b"PK of QGIS")
-    assert re.fullmatch(r"sat-intervals: .*project.qgz exists and was not made by sat-intervals.*\n", done.stderr)
-    assert b"made by sat-intervals" in before
-    assert not (out / "width.qml").exists()  # nothing is written before
-
-
-@pytest.mark.parametrize("name", ["width.vrt", "dsm_half_width.vrt"])
-@pytest.mark.parametrize("is_edited", [False, True])
-def test_write_project__says_that_the_layer_of_a_kept_file_is_left_out(run, name, is_edited):
-    out, _, _ = run
-    invoke("project", out)
-    mine = (out / name).read_bytes().replace(b"</VRTDataset>", b"<!-- mine --></VRTDataset>") if is_edited else b""
-    (out / name).write_bytes(mine)
-    done = invoke("project", out)
-    assert (done.exit_code, (out / name).read_bytes()) == (0, mine)
-    assert done.stderr == (
-        f"{out / name} was not made by sat-intervals, or was changed since, and is kept: its layer is left out; to "
-        "have it, move the file away and rerun sat-intervals project\n"
-    )
-
-
-def test_write_project__keeps_a_project_that_was_edited(run):
-    out, _, _ = run
-    for _ in range(2):  # its own file is replaced
-        assert invoke("project", out).exit_code == 0
-    made = (out / "project.qgz").read_bytes()
-    with zipfile.ZipFile(out / "project.qgz") as archive:
-        project = archive.read("project.qgs")
-    for files in ({"project.qgs": project + b"<!-- mine -->"}, {"project.qgs": project, "mine.txt": b"mine"}):
-        with zipfile.ZipFile(out / "project.qgz", "w") as archive:
-            for name, content in files.items():
-                archive.writestr(name, content)
-        before = (out / "project.qgz").read_bytes()
-        done = invoke("project", out)
-        assert (done.exit_code, (out / "project.qgz").read_bytes()) == (2, before)
-        assert "project.qgz exists and was not made by sat-intervals, was changed since" in done.stderr
-    (out / "project.qgz").write_bytes(made[:-9])
-    assert invoke("project", out).exit_code == 2
-
-
-def test_write_project__keeps_styles_that_were_edited(run):
-    out, _, _ = run
-    invoke("project", out)
-    style = out / "intervals.qml"
-    mine = style.read_bytes().replace(b'"Reds"', b'"Blues"') + b"<!-- mine -->\n"
-    style.write_bytes(mine)
-    done = invoke("project", out)
-    assert (done.exit_code, style.read_bytes()) == (0, mine)
-    assert f"{style} was not made by sat-intervals, or was changed since, and is kept" in done.stderr
+    for name in ("project.qgz", "width.vrt", "intervals.qml"):
+        (out / name).write_text("of before")
+    assert invoke("project", out).exit_code == 0
+    assert b"made by sat-intervals" in (out / "intervals.qml").read_bytes()
+    assert layers_of(read_project(out))
 
 
 def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
@@ -199,31 +143,6 @@ def test_write_project__leaves_out_what_is_missing_or_of_another_run(run):
     assert names == ["validity", "confidence", "interval width", "disparity", "truth", "left"]
 
 
-def test_write_project__refuses_damaged_points(run):
-    out, _, _ = run
-    write_points(out, np.full((60, 80), 700.0))
-    assert invoke("project", out).exit_code == 0
-    flip_bit(out / "points.tif")
-    done = invoke("project", out)
-    assert done.exit_code == 2
-    assert "points.tif is not what triangulate published; " in done.stderr
-
-
-def test_write_project__ends_where_a_surface_is_replaced_meanwhile(run, monkeypatch):
-    out, _, _ = run
-    read_place = project.read_place
-
-    def replaced_after(path):
-        found = read_place(path)
-        write_surface(out, np.full((60, 80), 1700.0))
-        return found
-
-    monkeypatch.setattr(project, "read_place", replaced_after)
-    done = invoke("project", out)
-    assert done.exit_code == 1
-    assert "dsm.tif was replaced or changed while it was read: rerun the command" in done.stderr
-
-
 def test_write_project__leaves_out_the_truth_beside_another_image(run):
     out, _, _ = run
     write_raster(out.parent / "left.tif", np.ones((1, 9, 9)), PLACE.transform)
@@ -233,73 +152,12 @@ def test_write_project__leaves_out_the_truth_beside_another_image(run):
         assert re.search(f"the {name} image is left out: .*left.tif has 9 x 9 pixels, but had 60 x 80", done.stderr)
 
 
-@pytest.mark.parametrize("name", ["left", "truth"])
-def test_write_project__leaves_out_an_image_that_is_another_for_a_moment(run, monkeypatch, name):
-    out, _, _ = run
-    image, other = out.parent / f"{name}.tif", out.parent / "other.tif"
-    shutil.copy(out.parent / "right.tif", other)
-    read = project.read_small_image
-
-    def of_the_other(opened, *arguments):
-        if opened.path != str(image):
-            return read(opened, *arguments)
-        exchanged(image, other)
-        found = read(opened, *arguments)
-        exchanged(image, other)
-        return found
-
-    monkeypatch.setattr(project, "read_small_image", of_the_other)
-    done = invoke("project", out)
-    assert done.exit_code == 0
-    assert f"the {name} image is left out: {image} was replaced or changed while it was read" in done.stderr
-    assert name not in [layer for _, layer, _ in layers_of(read_project(out))]
-
-
 def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_path):
     out = without_intervals(tmp_path)
     assert invoke("project", out).exit_code == 0
     assert not (out / "width.vrt").exists()
     (tmp_path / "none").mkdir()
     assert invoke("project", write_run(tmp_path / "none", *no_bands(30, 20))).exit_code == 0
-
-
-def files_in(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.mark.parametrize("last", ["_project", "write_made_here"])
-def test_write_project__replaces_nothing_of_another_run_that_takes_the_folders_name(run, monkeypatch, last):
-    out, _, _ = run
-    other = out.with_name("other")
-    shutil.copytree(out, other)
-    assert invoke("project", out).exit_code == invoke("project", other).exit_code == 0
-    before = files_in(out), files_in(other)
-    step = getattr(project, last)
-
-    def and_exchanged(*arguments):
-        exchanged(out, other)
-        return step(*arguments)
-
-    monkeypatch.setattr(project, last, and_exchanged)
-    done = invoke("project", out)
-    assert (done.exit_code, "was replaced while it was read: rerun the command" in done.stderr) == (1, True), (
-        done.output
-    )
-    assert (files_in(other), files_in(out)) == before
-
-
-@pytest.mark.parametrize("name", ["width.vrt.msk", "dsm_half_width.vrt.ovr"])
-def test_project__ends_where_a_file_appears_beside_its_rasters(run, monkeypatch, name):
-    out, _, _ = run
-
-    def and_appears(*arguments):
-        (out / name).write_text("mine")
-        return difference(*arguments)
-
-    monkeypatch.setattr(project.styles, "difference", and_appears)
-    done = invoke("project", out)
-    assert (done.exit_code, f"{name} changes what is read from" in done.stderr) == (2, True), done.output
-    assert not (out / "project.qgz").exists()
 
 
 @pytest.mark.process
