@@ -58,7 +58,7 @@ def demo(
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.raster import north_up
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.output import OUTPUTS
+    from sat_intervals.run.state import OUTPUTS
 
     layers = [out / f"{name}.tif" for name in ("left", "right", "truth")]
     somewhere, nodata = north_up(32631, x=370_000, y=4_830_000, pixel=PIXEL), (0, 0, float("nan"))

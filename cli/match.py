@@ -45,7 +45,7 @@ def match(
         return
     config = settings.load()
     with Console(run.quiet or as_json) as console:
-        from sat_intervals.run.output import OUTPUTS
+        from sat_intervals.run.state import OUTPUTS
 
         check_not_replaced([settings.file], [out / name for name in OUTPUTS], [out / "tiles"])
         left, right = pair.open()

@@ -7,30 +7,29 @@ from typing import Any
 
 import click
 
-from sat_intervals.cli.options import FILE, json_option, say_json, store_option
+from sat_intervals.cli.options import FILE, json_option, say_json
 
 
 @click.command(short_help="Show the progress of a run or a batch.")
 @click.argument("out", type=FILE)
-@store_option
 @json_option
-def status(out: Path, store: str | None, as_json: bool) -> None:
+def status(out: Path, as_json: bool) -> None:
     """Show how many tiles and strips of the run in OUT are done, during the run or after it ended.
 
     For the folder of a batch, show the progress of each
     pair, and why pairs failed, without reading the files.
     """
     from sat_intervals.results import open_run
-    from sat_intervals.run.output import is_complete
+    from sat_intervals.run.state import is_complete
     from sat_intervals.run.status import read_report
 
     pairs = read_report(out)
     if pairs is None:
         if is_complete(out):
             open_run(out)  # raises if a file is missing
-        found = {str(out): _state(out, store)}
+        found = {str(out): _state(out)}
     else:
-        found = {str(out / name): _state_of_pair(out / name, store, ended) for name, ended in pairs.items()}
+        found = {str(out / name): _state_of_pair(out / name, ended) for name, ended in pairs.items()}
     if as_json:
         say_json(found)
         return
@@ -39,28 +38,23 @@ def status(out: Path, store: str | None, as_json: bool) -> None:
             click.echo(line)
 
 
-def _state_of_pair(out: Path, store: str | None, ended: dict[str, Any]) -> dict[str, Any]:
+def _state_of_pair(out: Path, ended: dict[str, Any]) -> dict[str, Any]:
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.run.status import ElsewhereError
 
     if ended["state"] == "failed":
         return {"state": "failed", "error": ended["error"]}
     try:
-        return _state(out, store)
-    except ElsewhereError as error:
-        return {"state": ended["state"], "error": str(error)}
+        return _state(out)
     except SatIntervalsError:  # no run yet, or already removed
         return {"state": ended["state"]}
 
 
-def _state(out: Path, store: str | None) -> dict[str, Any]:
+def _state(out: Path) -> dict[str, Any]:
     """Return the state of a run: complete, or how many tiles are done."""
-    from sat_intervals.run.output import is_complete
+    from sat_intervals.run.state import is_complete
     from sat_intervals.run.status import read_status
 
-    return (
-        {"state": "complete"} if is_complete(out) else {"state": "tiles", **asdict(read_status(out / "tiles", store))}
-    )
+    return {"state": "complete"} if is_complete(out) else {"state": "tiles", **asdict(read_status(out))}
 
 
 def _lines(name: str, state: dict[str, Any]) -> Iterator[str]:

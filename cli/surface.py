@@ -56,16 +56,11 @@ def surface(
     config = settings.load()
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
-        from sat_intervals.run.before import report_before, tidy
 
         _check_kept(out, cells, [*sensor_files, *pair.files], settings.file)
         _check(cells, sensor_files, resolved(config).interval)
         left, right = pair.open()
-        report = None if run.overwrite else report_before(left, right, out, config, pair.window)
-        if report is None:
-            report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
-        else:
-            tidy(out, run.keep_tiles, config.cluster.store)
+        report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
         points, made = _points_and_surface(out, sensor_files, cells, console)
     if as_json:
         say_json({"run": report, "points": points, "surface": made})
@@ -82,7 +77,7 @@ def _check_kept(
     """Raise if a step would write over a file that is read."""
     from sat_intervals.raster import files_of
     from sat_intervals.raster.identity import check_not_replaced
-    from sat_intervals.run.output import OUTPUTS
+    from sat_intervals.run.state import OUTPUTS
 
     results = [out / name for name in (*OUTPUTS, *_FILES)]
     rasters = [str(name) for name in (cells["geoid"], cells["resolution"]) if isinstance(name, (str, Path))]

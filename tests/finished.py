@@ -6,9 +6,9 @@ import numpy as np
 from rasterio import Env
 
 from sat_intervals.config import load_config
+from sat_intervals.match.statistics import Tally
 from sat_intervals.products import FLAGS, INVALID, OCCLUSION, Bands
 from sat_intervals.raster import POINT_FILES, RUN_FILES, Georeferencing, gdal, north_up, surface_file, write_layer
-from sat_intervals.run.statistics import Tally
 from sat_intervals.show.legend import PIXEL_CLASSES
 
 PLACE = north_up(32631, x=370_000, y=4_830_000, pixel=0.5)

@@ -96,8 +96,8 @@ class Job:
             self.store.write(ONCE, "begun")  # fails at once where nothing can be written
             write_manifest(home_of(self.out), self.manifest)
             if self.found or self.local:
-                search = {"found": self.found and self.found.report(), "ranges": self.local and self.local.report()}
-                self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), **search)
+                found, ranges = self.found and self.found.report(), self.local and self.local.report()
+                self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), found=found, ranges=ranges)
         except OSError as error:
             raise _unusable(self.store, error) from error
         if waiting := self.waiting():
@@ -219,7 +219,7 @@ def _found(
     out: Path, before: Mapping[str, Any], inputs: Mapping[str, Any], find: Search | None, left: Image, right: Image
 ) -> Found:
     """Return the search range that an earlier run of the same images has found, else find it."""
-    kept: Mapping[str, Any] | None = None
+    kept: dict[str, Any] | None = None
     if PLACE in before:
         store = Store(place_of(home_of(out), before), _NO_TILES, "")
         kept = (store.meta(ONCE, _RANGE, origin_of(inputs)) or {}).get("found")

@@ -139,7 +139,8 @@ class Store:
 
     def tables(self) -> Tables:
         """Read what is summed over all tiles; raise DamagedTilesError if one is missing or damaged."""
-        histogram, seams, records = 0, [], {}
+        histogram: np.ndarray = np.zeros(1, np.int64)
+        seams, records = [], {}
         try:
             for tile in self.grid:
                 with self.opened(TILES, tile.name) as archive:
@@ -150,7 +151,7 @@ class Store:
         except DamagedFileError as error:
             raise self.damaged(self.grid) from error
         shape = self.grid.rows, self.grid.columns
-        return Tables(np.asarray(histogram), np.reshape(seams, (*shape, *seams[0].shape)) if seams else None, records)
+        return Tables(histogram, np.reshape(seams, (*shape, *seams[0].shape)) if seams else None, records)
 
     def strips(self, rows: int, count: int, first: int = 0, last: int | None = None) -> Iterator[dict[str, np.ndarray]]:
         """Yield products of full-width strips, as fields of `RawRows`.

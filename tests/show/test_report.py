@@ -70,7 +70,7 @@ def test_report__says_in_one_line_what_is_wrong(tmp_path):
 def test_write_report__that_cannot_be_written_says_so(tmp_path):
     out = write_run(tmp_path, *random_bands(4, 5))
     (out / "report.html").mkdir()
-    with pytest.raises(SatIntervalsError, match="report.html cannot be written: Is a directory"):
+    with pytest.raises(SatIntervalsError, match=r"report\.html cannot be written: Is a directory"):
         write_report(open_results(out))
 
 
