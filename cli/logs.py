@@ -1,9 +1,6 @@
 """``--debug`` and ``--log-file``: show the log of a command on stderr and append it to a file."""
 
 import logging
-import os
-import re
-import stat
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -14,12 +11,8 @@ import click
 
 from sat_intervals.cli.signals import Ended
 
-# Results end so: a log with such a name would be in the way of one.
-_OF_RESULTS = {".csv", ".html", ".json", ".las", ".laz", ".md", ".png", ".qgz", ".tif", ".vrt", ".yaml", ".yml"}
-
 _LOG = logging.getLogger(__name__)
 _LINES = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
-_TIME = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ")
 
 
 def printable(text: str) -> str:
@@ -50,19 +43,11 @@ class _Handler(logging.Handler):
             if self._file:  # such as a full disk: continue without the log
                 click.echo(f"sat-intervals: {self._file.name}: {error.strerror}: the log ends here", err=True)
             self.setLevel(logging.CRITICAL + 1)
-        except Exception:  # an error in the log must not end the command
-            self.handleError(record)
 
 
 @contextmanager
 def logged(debug: bool, log_file: Path | None) -> Iterator[None]:
-    """Log during the block: warnings on stderr, or everything with ``debug``; everything in a file.
-
-    Raises
-    ------
-    SatIntervalsError
-        The file cannot be written.
-    """
+    """Log during the block: warnings on stderr, or everything with ``debug``; everything in a file."""
     ours = logging.getLogger("sat_intervals")
     with ExitStack() as stack:
         # Libraries give the root logger handlers of their own, which would repeat our lines.
@@ -116,39 +101,13 @@ def _opened(log_file: Path) -> Iterator[IO[str]]:
 
     given = {**click.get_current_context().params, "log_file": None}.values()
     names = [name for value in given for name in (value if isinstance(value, tuple) else (value,))]
-    paths = [Path(name) for name in names if isinstance(name, (str, Path))]
-    if log_file.is_file() or not log_file.exists():  # a pipe or terminal is none of these, and is not replaced
-        check_not_replaced(paths, [log_file])
-        if (ending := log_file.suffix.lower()) in _OF_RESULTS:
-            raise SatIntervalsError(f"{log_file} ends with {ending}, as results do: choose another --log-file")
+    check_not_replaced([Path(name) for name in names if isinstance(name, (str, Path))], [log_file])
     try:
-        file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1, opener=_at_once)  # noqa: SIM115
+        file = open(log_file, "a", encoding="utf-8", errors="backslashreplace", buffering=1)  # noqa: SIM115
     except OSError as error:
         raise SatIntervalsError(f"{log_file} cannot be written: {error.strerror}: choose another --log-file") from error
     try:
-        if not _is_log(log_file, file):
-            raise SatIntervalsError(f"{log_file} exists and is not a log: choose another --log-file")
         yield file
     finally:
         with suppress(OSError):  # a full disk, already reported
             file.close()
-
-
-def _is_log(log_file: Path, opened: IO[str]) -> bool:
-    """Return whether an opened file is empty or begins with a line of a log; pipes and terminals are no files.
-
-    Another may be an input, as a VRT's source, or have taken the name of the log meanwhile.
-    """
-    status = os.fstat(opened.fileno())
-    if not stat.S_ISREG(status.st_mode) or not status.st_size:
-        return True
-    with suppress(OSError), log_file.open("rb") as stream:
-        return os.path.samestat(status, os.fstat(stream.fileno())) and _TIME.match(stream.read(24)) is not None
-    return False
-
-
-def _at_once(path: str, flags: int) -> int:
-    """Open a file for writing; raises OSError for a pipe without a reader, on which `open` would block."""
-    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
-    os.set_blocking(descriptor, True)
-    return descriptor

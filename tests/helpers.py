@@ -27,6 +27,7 @@ from sat_intervals.tiling import Window
 
 COMMAND = Path(sysconfig.get_path("scripts")) / "sat-intervals"
 OUTPUTS = ["intervals.tif", "run.json", "validity.tif"]
+LOCK = ".sat-intervals.lock"
 PLACE = north_up(32631, 300_000, 4_800_000, 0.5)
 PATIENCE = 150.0
 VRT = """<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from sat_intervals.errors import ChangedInputError, SatIntervalsError
 from sat_intervals.raster import RUN_FILES
-from sat_intervals.store.manifest import StoreError, differences, read_manifest
+from sat_intervals.store.manifest import MANIFEST, StoreError, differences, read_manifest
 from sat_intervals.store.tiles import home_of
 
 RUN_REPORT = "run.json"
@@ -27,7 +27,9 @@ def read_report(out: Path) -> dict[str, Any] | None:
     except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError, RecursionError):
         return None
     except OSError as error:
-        raise SatIntervalsError(f"{out / RUN_REPORT} cannot be read: {error.strerror}: move it away") from error
+        raise SatIntervalsError(
+            f"{out / RUN_REPORT} cannot be read: {error.strerror}: choose another folder"
+        ) from error
 
 
 def is_complete(out: Path) -> bool:
@@ -37,14 +39,14 @@ def is_complete(out: Path) -> bool:
 
 def check_folder(out: Path, *, overwrite: bool) -> None:
     """Raise if a folder cannot be that of a run, or has files of its names that no run has made."""
-    if os.path.lexists(out) and not out.is_dir():
+    if os.path.lexists(out) and not os.path.isdir(out):
         raise SatIntervalsError(f"{out} is not a folder: choose another")
-    if folders := [name for name in OUTPUTS if (out / name).is_dir()]:
+    if folders := [name for name in OUTPUTS if os.path.isdir(out / name)]:
         raise SatIntervalsError(f"{out / folders[0]} is a folder: move it away or choose another folder")
     if overwrite or read_report(out) is not None:
         return
-    is_begun = (home_of(out) / "manifest.json").exists()  # a death may have left rasters, but no report
-    if there := [name for name in OUTPUTS if (out / name).exists() and (not is_begun or name == RUN_REPORT)]:
+    is_begun = os.path.exists(home_of(out) / MANIFEST)  # a death may have left rasters, but no report
+    if there := [name for name in OUTPUTS if os.path.lexists(out / name) and (not is_begun or name == RUN_REPORT)]:
         raise SatIntervalsError(
             f"{out / there[0]} exists and is of no complete run: move it away, choose another folder or --overwrite"
         )
