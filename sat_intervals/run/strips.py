@@ -190,16 +190,20 @@ def reduce_rows(job: Job, of: str, key: PartKey, below: Sequence[PartKey]) -> st
 
 def _write(job: Job, of: str, key: PartKey, rasters: list[np.ndarray], **meta: Any) -> None:
     """Write a part; ``rasters`` are emptied on the way, to save memory."""
-    blocks, arrays = {}, []
+    blocks: dict[str, list[int]] = {}
     is_top = key[0] + 1 == len(rows_of_levels(job.store.grid.region))
-    for file in run_files(job.config.products.compression):
-        raster = rasters.pop(0)
-        made = compressed(raster, file)
-        blocks[file.kind] = made.sizes
-        arrays.append((file.kind, np.frombuffer(made.content, np.uint8)))
-        if not is_top:
-            arrays.append((_HALF.format(file.kind), np.ascontiguousarray(raster[:, ::2, ::2])))
-    job.store.write(PARTS, part_name(key), arrays, of=of, blocks=blocks, **meta)
+
+    def arrays() -> Iterator[tuple[str, np.ndarray]]:
+        for file in run_files(job.config.products.compression):
+            raster = rasters.pop(0)
+            made = compressed(raster, file)
+            blocks[file.kind] = made.sizes
+            yield file.kind, np.frombuffer(made.content, np.uint8)
+            del made
+            if not is_top:
+                yield _HALF.format(file.kind), raster[:, ::2, ::2]
+
+    job.store.write(PARTS, part_name(key), arrays(), of=of, blocks=blocks, **meta)
 
 
 def check_codecs(job: Job, of: str) -> None:

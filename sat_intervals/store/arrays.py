@@ -57,12 +57,13 @@ def packed(arrays: Iterable[tuple[str, np.ndarray]], meta: Mapping[str, Any]) ->
     """Return the content of a file; equal arrays and meta give equal bytes."""
     stream = BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))
         for name, array in arrays:
             array = np.ascontiguousarray(array)
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
                 member.write(array.reshape(-1).view(np.uint8).data)
+            del array
+        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))  # ``arrays`` may complete it
     return stream.getbuffer()
 
 

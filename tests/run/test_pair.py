@@ -1,31 +1,26 @@
 """Whole runs on real workers: tiles against the whole image, resuming, reports."""
 
-import errno
 import logging
-import os
 import shutil
 import warnings
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import rasterio
-from helpers import OUTPUTS, bands, calibration, hashes, shares_that_differ, write_pair
+from helpers import LOCK, OUTPUTS, bands, calibration, hashes, shares_that_differ, write_pair
 
 from sat_intervals import match_arrays, match_pair
-from sat_intervals.config import Cluster, load_calibration, load_config
+from sat_intervals.config import load_calibration, load_config
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.products import INVALID, NO_DATA
 from sat_intervals.raster import open_image, read_window
 from sat_intervals.results import open_run
 from sat_intervals.run import pair as run
-from sat_intervals.run.cluster import connected
 from sat_intervals.run.job import prepare
-from sat_intervals.run.output import is_complete
 from sat_intervals.run.tile import match_block
-from sat_intervals.store.folder import LocalFolder
-from sat_intervals.store.manifest import differences, digest, unsealed
+from sat_intervals.store.manifest import differences, digest
 from sat_intervals.tiling import Window
 
 
@@ -202,7 +197,7 @@ def test_match_pair__writes_a_complete_report(pair, tmp_path):
     assert report["inputs"]["left"]["bytes"] == left.stat().st_size
     assert report["cost_span"] == 448
     assert load_config(report["settings"]) == load_config(settings)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == OUTPUTS
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [LOCK, *OUTPUTS]
 
 
 def test_match_pair__window_is_the_crop_of_the_whole(pair, tmp_path):
@@ -235,93 +230,12 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
     monkeypatch.setattr(run, "match_block", fail_once)
     with pytest.raises(RunError, match=r"1 of 6 tiles failed.*\n.*tile 1_2: disk gone"):
         match_pair(left, right, tmp_path / "out", settings)
-    assert not list((tmp_path / "out").glob("*.*"))
+    assert not list((tmp_path / "out").glob("[a-z]*.*"))
     match_pair(left, right, tmp_path / "out", settings)
     assert sorted(log.read_text().split()) == sorted(
         [*(f"{row}_{column}" for row, column in np.ndindex(2, 3)), *3 * ["1_2"]]  # tried three times
     )
     assert hashes(tmp_path / "undisturbed") == hashes(tmp_path / "out")
-
-
-def test_match_pair__never_mixes_runs(pair, tmp_path):
-    left, right, settings = pair
-    out = tmp_path / "out"
-    match_pair(left, right, out, in_tiles(settings, 64), keep_tiles=True)
-    with pytest.raises(SatIntervalsError, match="already holds a run"):
-        match_pair(left, right, out, in_tiles(settings, 64))
-    for name in ("intervals.tif", "validity.tif", "run.json"):
-        (out / name).unlink()
-    with pytest.raises(SatIntervalsError, match=r"settings\.sgm\.p1 was 8, now 7"):
-        match_pair(left, right, out, in_tiles(settings, 64, sgm={"p1": 7, "p2": 32}))
-    match_pair(left, right, out, in_tiles(settings, 64, sgm={"p1": 7, "p2": 32}), overwrite=True)
-
-
-def test_match_pair__that_fails_to_overwrite_keeps_the_run_and_is_gone_on_with(pair, tmp_path, monkeypatch):
-    left, right, settings = pair
-    out, old, new = tmp_path / "out", in_tiles(settings, 64), in_tiles(settings, 64, sgm={"p1": 7, "p2": 32})
-    match_pair(left, right, out, old, keep_tiles=True)
-    before = {name: (out / name).read_bytes() for name in ("intervals.tif", "validity.tif", "run.json")}
-
-    def fail(job, tile):
-        if tile.name == "1_2":
-            raise OSError("disk gone")
-        return match_block(job, tile)
-
-    for settings in (old, new):
-        with monkeypatch.context() as patch:
-            patch.setattr(run, "match_block", fail)
-            with pytest.raises(RunError, match="tile 1_2: disk gone"):
-                match_pair(left, right, out, settings, overwrite=True)
-        assert {name: (out / name).read_bytes() for name in before} == before
-        assert open_run(out).report == unsealed(before["run.json"])
-        assert not is_complete(out)
-    done = {file: file.stat().st_mtime_ns for file in (out / "tiles" / "records").glob("[0-9]*.json")}
-    assert len(done) == 5
-    match_pair(left, right, out, new, keep_tiles=True)
-    assert {file: file.stat().st_mtime_ns for file in done} == done, "tiles done twice"
-    assert open_run(out).config.sgm.p1 == 7
-    assert is_complete(out)
-    with pytest.raises(SatIntervalsError, match="already holds a run"):
-        match_pair(left, right, out, new)
-    match_pair(left, right, tmp_path / "alone", new)
-    assert hashes(out) == hashes(tmp_path / "alone")
-
-
-def test_match_pair__ends_where_another_run_of_the_same_removes_the_tiles(pair, tmp_path):
-    left, right, settings = pair
-    store = tmp_path / "store"
-    settings = in_tiles(settings, 64) | {"cluster": {"store": str(store), "workers": 1}}
-
-    def progress(stage, done, total):
-        if (stage, done) == ("tiles", 3):
-            assert len(list(store.glob("*/records/*.json"))) >= 3
-            match_pair(left, right, tmp_path / "other", settings)
-            assert not list(store.iterdir())
-
-    with pytest.raises(RunError, match=rf"^the tiles in {store}/\w{{32}} are gone: .*: rerun the same command.*$"):
-        match_pair(left, right, tmp_path / "out", settings, progress=progress)
-    assert not list((tmp_path / "out").glob("*.*"))
-    assert not list(store.iterdir())
-    match_pair(left, right, tmp_path / "out", settings)
-    assert hashes(tmp_path / "out") == hashes(tmp_path / "other")
-
-
-def test_match_pair__names_what_differs_from_the_tiles_elsewhere_and_removes_only_its_own(pair, tmp_path):
-    left, right, settings = pair
-    store, out = tmp_path / "store", tmp_path / "out"
-    settings = in_tiles(settings, 64) | {"cluster": {"store": str(store)}}
-    match_pair(left, right, out, settings, keep_tiles=True)
-    (place,) = store.iterdir()
-    (out / "run.json").unlink()
-    other = settings | {"sgm": {"p1": 7, "p2": 32}}
-    with pytest.raises(
-        SatIntervalsError, match=rf"{place} holds the tiles of another run: settings\.sgm\.p1 was 8, now 7"
-    ):
-        match_pair(left, right, out, other)
-    assert list(store.iterdir()) == [place]
-    (place / "notes.txt").write_text("mine")
-    match_pair(left, right, out, other, overwrite=True)
-    assert [str(path.relative_to(store)) for path in store.rglob("*")] == [place.name, f"{place.name}/notes.txt"]
 
 
 def test_digest__tells_what_differences_tell(tmp_path):
@@ -336,57 +250,6 @@ def test_digest__tells_what_differences_tell(tmp_path):
     assert len(line) < 150
 
 
-@pytest.mark.parametrize("links", [True, False])
-def test_create__writes_a_file_once(tmp_path, monkeypatch, links):
-    def refuse(*places, **folders):
-        raise PermissionError(errno.EPERM, "no links here")
-
-    if not links:
-        monkeypatch.setattr(os, "link", refuse)
-    folder = LocalFolder(tmp_path)
-    with ThreadPoolExecutor(8 if links else 1) as threads:
-        created = list(threads.map(lambda number: folder.create("manifest.json", str(number)), range(8)))
-    assert created.count(True) == 1
-    assert created[int(folder.read("manifest.json"))]
-    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
-
-
-def test_match_tile__of_a_run_that_died_writes_nothing_into_the_next(pair, tmp_path):
-    left, right, settings = pair
-    before = prepare(left, right, tmp_path, in_tiles(settings, 64))
-    before.begin()
-    tile = next(iter(before.store.grid))
-    match_block(before, tile)
-    now = prepare(left, right, tmp_path, in_tiles(settings, 64, sgm={"p1": 7, "p2": 32}))
-    now.begin(overwrite=True)
-    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: settings\.sgm\.p1 was 7, now 8"):
-        match_block(before, tile)
-    assert now.store.done() == set()
-    assert not list((tmp_path / "tiles" / "arrays.zarr" / "int16").glob("c/*/*/*"))
-    now.store.remove()
-    with pytest.raises(RunError, match=r"the tiles in .*tiles are gone"):
-        match_block(before, tile)
-    assert not (tmp_path / "tiles" / "arrays.zarr").exists()
-
-
-@pytest.mark.parametrize("array", ["int16/c/0", "right/c", "histogram/c"])
-def test_match_pair__matches_a_tile_again_of_which_a_part_is_gone(pair, tmp_path, array):
-    left, right, settings = pair
-    once = match_pair(left, right, tmp_path, in_tiles(settings, 64), keep_tiles=True)
-    expected = hashes(tmp_path)
-    (tmp_path / "run.json").unlink()
-    gone = tmp_path / "tiles" / "arrays.zarr" / array / "0" / "1"
-    shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
-    other = tmp_path / "tiles" / "arrays.zarr" / "int16" / "c" / "0" / "1" / "1"  # as a power loss leaves it
-    other.write_bytes(other.read_bytes()[:-100])
-    (tmp_path / "tiles" / "records" / "1_1.json").unlink()
-    kept = (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns
-    again = match_pair(left, right, tmp_path, in_tiles(settings, 64), keep_tiles=True)
-    assert hashes(tmp_path) == expected
-    assert again["overlap_left"] == once["overlap_left"]
-    assert (tmp_path / "tiles" / "records" / "0_0.json").stat().st_mtime_ns == kept
-
-
 @pytest.mark.parametrize("store", ["elsewhere", "memory://tiles"])
 def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path, store):
     left, right, settings = pair
@@ -395,7 +258,7 @@ def test_match_pair__gives_the_same_bytes_wherever_its_tiles_lie(pair, tmp_path,
     store = store if "://" in store else f"file://{tmp_path}/{store}"
     match_pair(left, right, tmp_path / "out", settings | {"cluster": {"store": store}})
     assert hashes(tmp_path / "here") == hashes(tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == OUTPUTS
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [LOCK, *OUTPUTS]
     assert not list(tmp_path.glob("elsewhere/*"))
 
 
@@ -407,7 +270,7 @@ def test_match_pair__says_which_image_is_empty(pair, tmp_path):
         file.write(np.zeros(file.shape, "uint16"), 1)
     with pytest.raises(SatIntervalsError, match=r"empty\.tif are no data"):
         match_pair(left, empty, tmp_path / "out", settings)
-    assert not list((tmp_path / "out").glob("*.*"))
+    assert not list((tmp_path / "out").glob("[a-z]*.*"))
 
 
 def test_read_window__of_an_opened_image_gives_states(pair):
@@ -429,26 +292,10 @@ def test_match_pair__tiles_equal_one_tile_on_a_real_pair(shared_data, tmp_path):
     assert interval <= 0.0025
 
 
-@pytest.mark.process
-def test_connected__asyncio_is_heard_again_afterwards(tmp_path):
-    def forget_a_wait():
-        try:
-            raise TimeoutError
-        except TimeoutError:
-            logger.exception("Task exception was never retrieved")
-
-    # Not by caplog: pytest hands its own handlers to distributed too, which silences them.
-    logger, handler, heard = logging.getLogger("asyncio"), logging.Handler(), []
-    handler.emit = lambda record: heard.append(record.getMessage())
-    logger.addHandler(handler)
-    try:
-        with connected(Cluster(kind="processes", workers=1), tmp_path):
-            with connected(Cluster(kind="processes", workers=1), tmp_path):
-                forget_a_wait()
-            forget_a_wait()
-            logger.error("news")
-            assert heard == ["news"]
-        forget_a_wait()
-        assert heard[-1] == "Task exception was never retrieved"
-    finally:
-        logger.removeHandler(handler)
+def test_match_block__of_another_version_is_refused(pair, tmp_path):
+    left, right, settings = pair
+    job = prepare(left, right, tmp_path, in_tiles(settings, 64))
+    job.begin()
+    other = replace(job, store=replace(job.store, run="another"))
+    with pytest.raises(RunError, match="this worker has another version of sat-intervals"):
+        match_block(other, next(iter(job.store.grid)))

@@ -1,12 +1,10 @@
 """Strips finished on workers: the same bytes from any of them, resumed part by part, whatever is killed or damaged."""
 
 import errno
-import os
 import shutil
 import signal
 import subprocess
 import tracemalloc
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 import rasterio
-from helpers import COMMAND, OUTPUTS, PLACE, hashes, invoke, wait_until, write_pair
+from helpers import COMMAND, LOCK, OUTPUTS, PLACE, hashes, invoke, wait_until, write_pair
 
 from sat_intervals.config import Cluster, load_config
 from sat_intervals.demo import make_scene
@@ -24,13 +22,11 @@ from sat_intervals.match.memory import strip_bytes
 from sat_intervals.products import INVALID
 from sat_intervals.raster import BLOCK, OutputError, OutputWriter, write_layer
 from sat_intervals.results import open_run
-from sat_intervals.run import copying, strips
+from sat_intervals.run import assemble, strips
 from sat_intervals.run.checks import check_tiles
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_pair
-from sat_intervals.run.status import read_status
-from sat_intervals.store.local import LocalFolder
-from sat_intervals.store.tiles import DamagedTilesError, Store
+from sat_intervals.store.tiles import DamagedTilesError
 from sat_intervals.tiling import Window
 
 # Four strips, two rows of the first overview and one of the second.
@@ -75,14 +71,14 @@ def stopped(tall):
     return out
 
 
-def parts(out: Path, kind: str = "*.json") -> dict[str, int]:
+def parts(out: Path) -> dict[str, int]:
     """Times of the parts that are done, by name."""
-    return {file.name: file.stat().st_mtime_ns for file in (out / "tiles" / "parts").glob(f"[!.]{kind}")}
+    return {file.stem: file.stat().st_mtime_ns for file in (out / "tiles" / "parts").glob("[!.]*.npz")}
 
 
 def damage(out: Path, name: str, how: str) -> None:
-    """Damage a file of the parts: ``0_1_half`` of the second strip."""
-    (file,) = (out / "tiles" / "parts").glob(f"*_{name}")
+    """Damage a part, such as ``0_1`` of the second strip."""
+    file = out / "tiles" / "parts" / f"{name}.npz"
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 4
     file.unlink() if how == "gone" else file.write_bytes(content if how == "bit" else content[:-9])
@@ -99,7 +95,7 @@ def test_finish_strips__gives_the_counts_and_overviews_of_the_whole(tall):
     for level, factor in ((0, 2), (1, 4)):
         with rasterio.open(out / "validity.tif", overview_level=level) as file:
             np.testing.assert_array_equal(file.read(1), validity[::factor, ::factor])
-    assert not parts(out, "*")  # they have the bytes of the files
+    assert not parts(out)  # they have the bytes of the files
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -111,10 +107,10 @@ def test_finish_strips__gives_the_same_bytes_for_all_workers_and_tiles(tall, tmp
 def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
 
-    def fail(job, codecs, place, *rest):
+    def fail(job, of, place, *rest):
         if place == (0, 2):
             raise OSError("disk gone")
-        return finish(job, codecs, place, *rest)
+        return finish(job, of, place, *rest)
 
     finish = strips.finish_strip
     with monkeypatch.context() as patch:
@@ -123,110 +119,65 @@ def test_finish_strips__goes_on_from_the_parts_that_are_done(tall, tmp_path, mon
             matched(tall, out)
     before = parts(out)
     assert before
-    monkeypatch.setattr(strips.Parts, "drop", lambda parts: None)
-    matched(tall, out, keep_tiles=True)
+    monkeypatch.setattr(assemble, "end_tiles", lambda job, keep_tiles: None)
+    matched(tall, out)
     after = parts(out)
     assert len(after) == PARTS
     assert {name: after[name] for name in before} == before, "done twice"
     assert hashes(out) == hashes(tall[0] / "kept")
 
 
-@pytest.mark.parametrize("by", ["workers", "workers of a store", "command"])
-def test_assemble_files__gives_the_same_bytes_whoever_copies(tall, tmp_path, monkeypatch, by):
-    threads, outcomes = [], copying.Threads.outcomes
+@pytest.mark.parametrize("store", ["", "elsewhere"])
+def test_assemble__copies_parts_with_workers_that_reach_the_folder(tall, tmp_path, monkeypatch, store):
+    threads, outcomes = [], assemble.Threads.outcomes
 
     def counted(pool, tasks):
         for outcome in outcomes(pool, tasks):
             threads.append((pool._count, outcome.label))
             yield outcome
 
-    def stop(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(copying.Threads, "outcomes", counted)
-    store = {"store": str(tmp_path / "store")} if by == "workers of a store" else {}
-    if by == "command":  # all parts are there, so no workers are started
-        with monkeypatch.context() as patch:
-            patch.setattr(OutputWriter, "assemble", stop)
-            with pytest.raises(KeyboardInterrupt):
-                matched(tall, with_tiles(tall, tmp_path / "out"))
+    monkeypatch.setattr(assemble.Threads, "outcomes", counted)
+    cluster = {"store": str(tmp_path / store)} if store else {}
     done = []
-    matched(tall, tmp_path / "out", cluster=store | {"workers": 3}, progress=lambda *how: done.append(how))
+    matched(tall, tmp_path / "out", cluster=cluster | {"workers": 3}, progress=lambda *how: done.append(how))
     copied = [count for count, label in threads if isinstance(label[-1], str)]
-    assert copied == 2 * PARTS * [2 if by == "command" else 3]
-    assert [how for how in done if how[0] == "files"][:-2] == [("files", n, 2 * PARTS) for n in range(2 * PARTS + 1)]
+    assert copied == 2 * PARTS * [2 if store else 3]
+    assert [how for how in done if how[0] == "files"] == [("files", n, 2 * PARTS) for n in range(2 * PARTS + 1)]
     assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
 
 
-@pytest.mark.parametrize("store", [None, "s3://bucket/run"])
-def test_copiers__are_workers_that_reach_the_folder(store):
-    job, workers = SimpleNamespace(store=SimpleNamespace(elsewhere=store)), SimpleNamespace()
-    with copying._copiers(job, workers) as copiers:
-        assert (copiers is workers) == (store is None), "other processes may not reach the folder of a run with a store"
-    with closing(copying.Threads(1)) as threads, copying._copiers(job, threads) as copiers:
-        assert copiers is threads
-
-
-def test_tasks__give_workers_of_other_folders_absolute_paths(tall):
-    folder, settings = tall
-    job = prepare(folder / "left.tif", folder / "right.tif", folder / "new", settings)
-    (task,) = copying._tasks(job, Path("out/strips"), [(7, copying.Part([1], 2, ((0, 0), "validity")))])
-    assert task.arguments[-1] == (Path.cwd() / "out/strips", 7)
-
-
 @pytest.mark.parametrize("how", ["gone", "bit"])
-def test_assemble_files__makes_all_damaged_parts_again_at_once(tall, tmp_path, monkeypatch, caplog, how):
-    out = with_tiles(tall, tmp_path / "out")
-    assemble_files = copying.assemble_files
+def test_assemble__makes_all_damaged_parts_again_at_once(tall, tmp_path, monkeypatch, caplog, how):
+    out, copy_parts = with_tiles(tall, tmp_path / "out"), assemble._copy_parts
 
     def damaged(*arguments):
         if not (tmp_path / "done").exists():
             (tmp_path / "done").touch()
-            for name in ("0_1_intervals", "0_3_validity", "1_0_validity"):
+            for name in ("0_1", "0_3", "1_0"):
                 damage(out, name, how)
-        assemble_files(*arguments)
+        copy_parts(*arguments)
 
-    monkeypatch.setattr("sat_intervals.run.assemble.assemble_files", damaged)
+    monkeypatch.setattr(assemble, "_copy_parts", damaged)
     matched(tall, out)
     (warning,) = [record.getMessage() for record in caplog.records if "trying this now" in record.getMessage()]
-    names, _, message = warning.partition(f" in {out}/tiles ")
-    assert sorted(names.removeprefix("parts ").split(", ")) == ["0_1_intervals", "0_3_validity", "1_0_validity"]
-    assert message == "are damaged or missing: rerun the same command: it makes them again; trying this now"
-    assert hashes(out) == hashes(tall[0] / "kept")
-
-
-@pytest.mark.parametrize("kind", ["half", "validity"])
-def test_match_pair__names_the_part_that_cannot_be_read(tall, tmp_path, monkeypatch, kind):
-    out = with_tiles(tall, tmp_path / "out")
-    read_bytes = LocalFolder.read_bytes
-
-    def failing(folder, name):
-        if name.startswith("parts/") and name.endswith(f"_0_1_{kind}"):
-            raise OSError(errno.EIO, "Input/output error", str(folder.path / name))
-        return read_bytes(folder, name)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(LocalFolder, "read_bytes", failing)
-        with pytest.raises(RunError, match=rf"^the part \w+_0_1_{kind} in \S+ cannot be read: Input/output error; rer"):
-            matched(tall, out, cluster={"retries": 0})
-    matched(tall, out)
+    assert warning == (
+        f"parts 0_1, 0_3, 1_0 in {out}/tiles are damaged or missing: rerun the same command: it makes them again; "
+        "trying this now"
+    )
     assert hashes(out) == hashes(tall[0] / "kept")
 
 
 def test_match_pair__names_the_file_that_cannot_be_written(tall, tmp_path, monkeypatch):
-    fsync = os.fsync
-
-    def full(stream):
-        if ".unpublished-" in os.readlink(f"/proc/self/fd/{stream}"):  # not a mark of the tiles
-            raise OSError(errno.ENOSPC, "No space left on device")
-        fsync(stream)
+    def full(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     out = with_tiles(tall, tmp_path / "out")
     with monkeypatch.context() as patch:
-        patch.setattr(copying.os, "fsync", full)
+        patch.setattr(assemble, "copy_part", full)
         message = r"out/intervals.tif cannot be written: No space left on device: .*; rerun the same command"
         with pytest.raises(RunError, match=message):
             matched(tall, out, cluster={"retries": 0})
+    assert not list(out.glob("*.tif*"))
     matched(tall, out)
     assert hashes(out) == hashes(tall[0] / "kept")
 
@@ -247,37 +198,33 @@ def test_finish_strips__names_the_rows_that_could_not_be_finished(tall, tmp_path
         matched(tall, with_tiles(tall, tmp_path / "out"))
 
 
-@pytest.mark.parametrize("kind", ["0_1_half", "1_0_intervals", "0_3_validity", "0_1.json"])
+@pytest.mark.parametrize("name", ["0_1", "1_0", "2_0"])
 @pytest.mark.parametrize("how", ["gone", "cut short", "bit"])
-def test_finish_strips__makes_damaged_parts_again(tall, stopped, tmp_path, kind, how):
+def test_finish_strips__makes_damaged_parts_again(tall, stopped, tmp_path, name, how):
     out = shutil.copytree(stopped, tmp_path / "out")
-    if kind.endswith("half"):  # so that it is needed again
-        next((out / "tiles" / "parts").glob("*_1_0.json")).unlink()
-    damage(out, kind, how)
+    if name == "0_1":  # so that it is needed again
+        damage(out, "1_0", "gone")
+    damage(out, name, how)
     matched(tall, out)
     assert hashes(out) == hashes(tall[0] / "kept")
-    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+    assert sorted(path.name for path in out.iterdir()) == [LOCK, *OUTPUTS]
 
 
 def test_finish_strips__names_all_missing_parts_in_one_line(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
     for name in ("finish_strip", "reduce_rows"):
         monkeypatch.setattr(strips, name, lambda *arguments: None)
-    message = rf"^parts 0_0, 0_1, 0_2, 0_3, 1_0, 1_1, 2_0 in {out}/tiles are damaged or missing: rerun the same command"
+    message = rf"^parts 2_0, 1_0, 1_1, 0_0, 0_1, 0_2, 0_3 in {out}/tiles are damaged or missing: rerun the same command"
     with pytest.raises(DamagedTilesError, match=message):
         matched(tall, out)
 
 
-def test_finish_strips__takes_no_parts_of_other_settings(tall, tmp_path, monkeypatch):
-    out = with_tiles(tall, tmp_path / "out")
-    other = with_tiles(tall, tmp_path / "other")
-    monkeypatch.setattr(strips.Parts, "drop", lambda parts: None)
-    matched(tall, out, keep_tiles=True)
-    shutil.copytree(out / "tiles" / "parts", other / "tiles" / "parts", dirs_exist_ok=True)
-    matched(tall, other, keep_tiles=True, median=None)
-    assert len(parts(other)) == 2 * PARTS
+def test_finish_strips__takes_no_parts_of_other_settings(tall, stopped, tmp_path):
+    out = shutil.copytree(stopped, tmp_path / "out")
+    assert len(parts(out)) == PARTS
+    matched(tall, out, median=None)
     matched(tall, with_tiles(tall, tmp_path / "alone"), median=None)
-    assert hashes(other) == hashes(tmp_path / "alone") != hashes(out)
+    assert hashes(out) == hashes(tmp_path / "alone") != hashes(tall[0] / "kept")
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lerc", "none"])
@@ -297,7 +244,7 @@ def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkey
     def of_another(*arguments):
         made = task(*arguments)
         job, _, *rest = made.arguments
-        return strips.Task(made.label, made.function, (job, {"gdal": "3.9"}, *rest), 0)
+        return strips.Task(made.label, made.function, (job, "another", *rest), 0)
 
     monkeypatch.setattr(strips, "_task", of_another)
     with pytest.raises(RunError, match=r"this worker compresses with .*'gdal'.*install the same version of rasterio"):
@@ -317,14 +264,12 @@ def wide_job(folder: Path, compression: str):
 def test_strip_bytes__bounds_what_writing_a_strip_takes(tmp_path, compression):
     job = wide_job(tmp_path, compression)
     noise = np.random.default_rng(0).integers(0, 1 << 10, (4, BLOCK, 5000))
-    rasters = noise.astype(np.float32) / 8, noise[:1].astype(np.uint16)
+    rasters = [noise.astype(np.float32) / 8, noise[:1].astype(np.uint16)]
     bands = sum(raster.nbytes for raster in rasters)
     del noise
     job.begin()
-    parts = job.parts()
-    parts.folder.make("parts")
     tracemalloc.start()
-    strips._write(job, parts, (0, 0), rasters, {})
+    strips._write(job, strips.parts_of(job), (0, 0), rasters)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     most = strip_bytes(BLOCK, 5000, compression)
@@ -350,88 +295,13 @@ def test_check_tiles__refuses_strips_that_do_not_fit(monkeypatch):
         check_tiles(config.model_copy(update={"cluster": jobs}), wide)
 
 
-@pytest.mark.parametrize(("compression", "needed"), [("deflate", "126.0"), ("none", "198.0")])
+@pytest.mark.parametrize(("compression", "needed"), [("deflate", "150.0"), ("none", "222.0")])
 def test_begin__refuses_a_disk_without_room_for_tiles_parts_and_files(tmp_path, monkeypatch, compression, needed):
     job = wide_job(tmp_path, compression)
     monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=80 * 10**6))
     with pytest.raises(OutputError, match=f"has 80.0 MB free, tiles, files and their parts may need {needed} MB"):
         job.begin()
-    replace(job, has_files=False).begin()  # tiles check their own space
-
-
-def test_check_space__counts_missing_parts_only(tall, tmp_path, monkeypatch):
-    def stop(*arguments):
-        raise KeyboardInterrupt
-
-    def room(out: Path, free: float, **sections) -> None:
-        with monkeypatch.context() as patch:
-            patch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=round(free)))
-            matched(tall, out, **sections)
-
-    out, pixels = with_tiles(tall, tmp_path / "out"), HEIGHT * WIDTH
-    # for each pixel 12 bytes of files, 18 of parts
-    with pytest.raises(OutputError, match=r"has 5.7 MB free, tiles, files and their parts may need 5.8 MB"):
-        room(out, 29.9 * pixels)
-    with monkeypatch.context() as patch:
-        patch.setattr(OutputWriter, "assemble", stop)
-        with pytest.raises(KeyboardInterrupt):
-            room(out, 30.1 * pixels)
-    (out / "tiles" / "parts" / next(iter(parts(out, "*_2_0.json")))).unlink()
-    with pytest.raises(OutputError, match=r"has 2.4 MB free, tiles, files and their parts may need 2.8 MB"):
-        room(out, 12.5 * pixels)
-    room(out, 15 * pixels)
-    assert hashes(out) == hashes(tall[0] / "kept")
-
-
-def test_match_pair__cleans_up_on_a_full_disk(tall, tmp_path, monkeypatch):
-    def stop(store):
-        raise KeyboardInterrupt
-
-    out = with_tiles(tall, tmp_path / "out")
-    with monkeypatch.context() as patch:
-        patch.setattr(Store, "remove", stop)
-        with pytest.raises(KeyboardInterrupt):
-            matched(tall, out)
-    assert (out / "tiles").exists()
-    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=0))
-    matched(tall, out)
-    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
-
-
-# ---- What stays -------------------------------------------------------------------------------------------------
-def test_drop__that_fails_does_not_fail_the_run(tall, tmp_path, monkeypatch, caplog):
-    def unreachable(parts):
-        raise OSError(errno.EIO, "unreachable")
-
-    monkeypatch.setattr(strips.Parts, "drop", unreachable)
-    matched(tall, tmp_path / "out", keep_tiles=True)
-    assert "parts of the files stay in" in caplog.text
-    assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
-
-
-def test_drop__leaves_tiles_only_and_the_parts_of_other_runs(tall, tmp_path, monkeypatch):
-    store = {"store": str(tmp_path / "store")}
-
-    def stop(*arguments):
-        raise KeyboardInterrupt
-
-    for name, median in (("one", None), ("two", {"size": 3})):
-        with monkeypatch.context() as patch:
-            patch.setattr(OutputWriter, "assemble", stop)
-            with pytest.raises(KeyboardInterrupt):
-                matched(tall, tmp_path / name, cluster=store, median=median)
-    there = {file.name for file in tmp_path.glob("store/*/parts/*")}
-    assert len({name[:8] for name in there}) == 2
-    mine = [file.with_name(f"{file.name}.bak") for file in tmp_path.glob("store/*/parts/*.json")]
-    for file in mine:
-        file.write_text("mine")
-    matched(tall, tmp_path / "one", cluster=store, keep_tiles=True)  # with another median than before
-    assert all(file.read_text() == "mine" for file in mine)
-    left = {file.name for file in tmp_path.glob("store/*/parts/*")} - {file.name for file in mine}
-    assert left < there
-    assert len(left) == len(there) / 2
-    assert read_status(tmp_path / "two" / "tiles", store["store"]).strips_done == 4
-    assert read_status(tmp_path / "one" / "tiles", store["store"]).strips_done == 0
+    replace(job, has_files=False).begin()
 
 
 def test_status__counts_strips(tall, tmp_path, monkeypatch):
@@ -446,10 +316,6 @@ def test_status__counts_strips(tall, tmp_path, monkeypatch):
         matched(tall, out)
     result = invoke("status", out)
     assert "5 of 5 tiles done, 0 failed, 0 left, 1 of 4 strips done; no run is active" in result.output
-    monkeypatch.setattr(strips, "finish_strip", lambda *arguments: "not made")
-    with pytest.raises(DamagedTilesError):
-        matched(tall, out, median=None)
-    assert read_status(out / "tiles").strips_done == 0, "strips of other settings"
 
 
 class Second:
@@ -475,12 +341,9 @@ def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp
     out = with_tiles(tall, tmp_path / "out")
     seen: dict[str, int] = {}
     for count in (1, 4, PARTS, "file"):
-        if count == "file":  # one part is missing, so that workers copy them
-            (out / "tiles" / "parts" / next(name for name in seen if name.endswith("_2_0.json"))).unlink()
-            seen = parts(out)
 
         def reached(count=count):
-            return list(out.glob(".*/files/strips-*")) if count == "file" else len(parts(out)) >= count
+            return list(out.glob(".validity.tif.part")) if count == "file" else len(parts(out)) >= count
 
         with Second(tall, out, "--cluster", cluster) as process:
             wait_until(lambda: reached() or process.poll() is not None, f"{count}")
@@ -497,7 +360,7 @@ def test_match__goes_on_after_kill_9_in_every_stage_of_its_second_half(tall, tmp
     with Second(tall, out, "--cluster", cluster) as process:
         assert process.wait(60) == 0
     assert hashes(out) == hashes(tall[0] / "kept")
-    assert sorted(path.name for path in out.iterdir()) == OUTPUTS
+    assert sorted(path.name for path in out.iterdir()) == [LOCK, *OUTPUTS]
 
 
 @pytest.mark.process
