@@ -115,7 +115,7 @@ def calibrate(
     from sat_intervals.run.measure import measure_subjects
 
     subjects = _subjects(pairs, truth, _Judging(settings, **judging))
-    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file], [output])
+    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file, *named_by(settings.file)], [output])
     check_output(output, overwrite=overwrite)
     folder = output.absolute().parent
     check_subjects(subjects)

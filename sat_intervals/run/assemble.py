@@ -32,7 +32,7 @@ from sat_intervals.run.strips import (
 from sat_intervals.run.workers import Task, Threads, Workers, picklable_errors, reason
 from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.folder import folder_at
-from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PARTS, PIXELS, Tables, home_of
+from sat_intervals.store.tiles import COSTS, FAILURES, PARTS, PIXELS, Tables, home_of
 
 # Threads of this process that copy parts which workers cannot copy: one reads while another writes.
 _THREADS = 2
@@ -123,7 +123,7 @@ def end_tiles(job: Job, *, keep_tiles: bool) -> None:
     """Remove the tiles of a complete run, or what is beside them if they are kept."""
     try:
         if keep_tiles:
-            job.store.remove([BORDERS, PIXELS, COSTS, PARTS, FAILURES])
+            job.store.remove([PIXELS, COSTS, PARTS, FAILURES])
         else:
             remove_tiles(job.out)
     except OSError as error:  # the run is complete

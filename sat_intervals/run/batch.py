@@ -16,7 +16,7 @@ from sat_intervals.config.pairs import REPORT, PairOfBatch
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
-from sat_intervals.raster import Image, OutputError, open_image
+from sat_intervals.raster import Image, OutputError, files_of, open_image
 from sat_intervals.raster.identity import check_not_replaced, identifiers
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.run.job import Job, Search, prepare
@@ -143,8 +143,16 @@ def _check_not_replaced(pairs: Sequence[PairOfBatch], others: Sequence[str | Pat
                 raise SatIntervalsError(f"{other} and {folder} are the same folder: remove the link")
     images = [name for pair in pairs for name in (pair.left, pair.right, pair.left_mask, pair.right_mask)]
     named = [name for pair in pairs for name in (*(pair.sensors or ()), *named_files(pair.settings))]
+    read = [file for name in {str(name) for name in (*others, *images, *named) if name} for file in _files(name)]
     outputs = [out / REPORT, *(folder / name for folder in folders.values() for name in OUTPUTS)]
-    check_not_replaced([*others, *images, *named], outputs, [folder / "tiles" for folder in folders.values()])
+    check_not_replaced(read, outputs, [folder / "tiles" for folder in folders.values()])
+
+
+def _files(name: str) -> list[str]:
+    """Return a file and, of a raster, all others that it is read from."""
+    with suppress(OSError, SatIntervalsError):  # no raster, or its pair will fail
+        return files_of(name)
+    return [name]
 
 
 def _prepared(pair: PairOfBatch, out: Path, settings: Config, *, overwrite: bool, find: Search) -> Job:

@@ -83,11 +83,16 @@ class Job:
     @property
     def name(self) -> str:
         """Return the name of the run: a digest of all that decides the bytes of its files."""
-        return digest(self.manifest | {"all": self.config.model_dump(mode="json", exclude={"cluster", "preset"})})
+        return digest(self.manifest | {"all": self.settings})
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that decide the bytes of the files."""
+        return self.config.model_dump(mode="json", exclude={"cluster", "preset"})
 
     def begin(self, *, overwrite: bool = False) -> bool:
         """Open the store and return True; False if the run is complete. Call it while the folder is locked."""
-        step = next_step(self.out, self.manifest, self.name, overwrite=overwrite)
+        step = next_step(self.out, self.manifest, self.name, self.settings, overwrite=overwrite)
         if step == "complete":
             return False
         if step == "start anew":

@@ -1,12 +1,12 @@
 """Match pairs with truth at a ladder of levels, tile by tile, and measure their intervals."""
 
+import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
 from sat_intervals.run.workers import Workers, connected
+from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
 
 FEWEST = 1000  # pixels with truth, of all pairs
@@ -126,10 +127,7 @@ def measure_subjects(
     found: list[Measured] = []
     key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))
-    with (
-        TemporaryDirectory(prefix=".calibrate-", dir=folder) as name,
-        connected(subjects[0].config.cluster, scratch := Path(name)) as client,
-    ):
+    with _scratch(folder) as scratch, connected(subjects[0].config.cluster, scratch) as client:
         for number, subject in enumerate(subjects):
             one = progress if len(subjects) == 1 else partial(_of_all, progress, "subjects", number, len(subjects))
             one("subjects", 0, 1)
@@ -137,6 +135,19 @@ def measure_subjects(
     progress("subjects", len(subjects), len(subjects))
     check_enough(sum(part.kept for part in found), subjects, "kept pixels have a truth")
     return found, key
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """Yield a hidden folder for tiles, without what a killed calibration left there; delete it at the end."""
+    scratch = folder / ".calibrate"
+    with locked(scratch):
+        for left in (file for file in scratch.iterdir() if file.is_dir()):
+            shutil.rmtree(left)
+        try:
+            yield scratch
+        finally:
+            shutil.rmtree(scratch)
 
 
 def _of_all(progress: Progress, stage: str, number: int, total: int, *_: object) -> None:

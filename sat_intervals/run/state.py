@@ -52,7 +52,9 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
         )
 
 
-def next_step(out: Path, manifest: Mapping[str, Any], run: str, *, overwrite: bool) -> NextStep:
+def next_step(
+    out: Path, manifest: Mapping[str, Any], run: str, settings: Mapping[str, Any], *, overwrite: bool
+) -> NextStep:
     """Return what to do in the folder of a run.
 
     Parameters
@@ -63,6 +65,8 @@ def next_step(out: Path, manifest: Mapping[str, Any], run: str, *, overwrite: bo
         That of the run that is wanted.
     run
         Its name, see `Job.name`.
+    settings
+        All its settings that decide the bytes of its files.
     overwrite
         Whether tiles and files of another run may be replaced.
 
@@ -91,17 +95,16 @@ def next_step(out: Path, manifest: Mapping[str, Any], run: str, *, overwrite: bo
         )
     if report is not None:
         raise SatIntervalsError(
-            f"{out} already holds {_other_run(report, manifest)}: choose another folder or --overwrite"
+            f"{out} already holds {_other_run(report, manifest, settings)}: choose another folder or --overwrite"
         )
     check_folder(out, overwrite=False)
     return "resume" if there else "start"
 
 
-def _other_run(report: Mapping[str, Any], manifest: Mapping[str, Any]) -> str:
+def _other_run(report: Mapping[str, Any], manifest: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """Return in what the run of a report differs from the one that is wanted."""
-    before = {"settings": report["settings"], "inputs": report["inputs"], "region": report["tiles"].get("region")}
-    now = {name: manifest[name] for name in before}
-    before["settings"] = {name: before["settings"].get(name) for name in now["settings"] if name != "interval"}
-    now["settings"] = {name: value for name, value in now["settings"].items() if name != "interval"}
+    kept = {name: report["settings"].get(name) for name in settings}
+    before = {"settings": kept, "inputs": report["inputs"], "region": report["tiles"].get("region")}
+    now = {"settings": settings, "inputs": manifest["inputs"], "region": manifest["region"]}
     changes = list(differences(before, json.loads(json.dumps(now))))
-    return f"another run: {'; '.join(changes)}" if changes else "a run of other settings or of another version"
+    return f"another run: {'; '.join(changes)}" if changes else "a run of another version"
