@@ -52,18 +52,10 @@ class CalibrationFile(StrictModel):
 class Levels(StrictModel):
     """Levels that intervals are cut at, and the quantile of their regularisation.
 
-    Attributes
-    ----------
-    coverage
-        Share of true disparities to be inside; None for levels that come from alpha.
-    high, low
-        Levels of pixels of high and low confidence: excess ``S(d) - min S`` of the aggregated cost, real numbers in the
-        unit of the kernels' integer costs. That is the sum over the 8 paths of SGM (one cost without SGM), times the
-        `steps` of the matching cost: 1 for Census, 125 for MC-CNN.
-    quantile
-        Of the regularisation of low-confidence segments; None leaves them as they are.
-    reached
-        False if the pairs of the calibration did not reach the coverage in a class, at any level.
+    ``high`` and ``low``, of pixels of high and low confidence, are the excess ``S(d) - min S`` of the aggregated cost,
+    in the unit of the kernels' integer costs: the sum over the 8 paths of SGM (one cost without SGM), times the `steps`
+    of the matching cost (1 for Census, 125 for MC-CNN). ``quantile`` None leaves low-confidence segments as they are.
+    ``reached`` is False if the pairs of the calibration did not reach the coverage at any level.
     """
 
     coverage: float | None
@@ -74,19 +66,9 @@ class Levels(StrictModel):
 
 
 class Calibration(CalibrationFile):
-    """Levels for each of COVERAGES, and what they belong to.
+    """Levels for each of COVERAGES, in this order, and the settings that they belong to, see `key_of`.
 
-    Attributes
-    ----------
-    name
-        Shown to the user, not used.
-    key
-        All settings that the levels belong to, see `key_of`.
-    levels
-        One row for each coverage, in this order. Levels do not fall as the coverage rises, except ``low`` where the
-        quantile changes.
-    provenance
-        Scenes, date, version, figures to expect; shown to the user, not used.
+    Levels do not fall as the coverage rises, except ``low`` where the quantile changes. Name and provenance are shown.
     """
 
     name: str

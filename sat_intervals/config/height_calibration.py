@@ -21,16 +21,9 @@ _LARGEST = 10_000.0
 
 
 class WidthClass(StrictModel):
-    """Intervals of similar width.
+    """Intervals narrower than ``below`` (metres, None: all others), whose bounds move outwards by ``margin`` metres.
 
-    Attributes
-    ----------
-    below
-        Metres: the class has intervals narrower than this, down to the end of the class before. None: all others.
-    margin
-        Metres by which both bounds move outwards; inwards if negative.
-    cells
-        Cells that it was found from.
+    ``cells`` is the number of cells that it was found from.
     """
 
     below: float | None = Field(gt=0)
@@ -39,23 +32,10 @@ class WidthClass(StrictModel):
 
 
 class HeightCalibration(CalibrationFile):
-    """Margins of the intervals of a surface model, by class of width.
+    """Margins of the intervals of a surface model, by class of width from narrow to wide.
 
-    Attributes
-    ----------
-    name
-        Shown to the user, not used.
-    coverage
-        Share of true heights inside the widened intervals.
-    registered
-        Whether the reference was moved to the surface first. Then the margins do not include a constant shift, such as
-        an error of the models' position.
-    surface
-        What surfaces the margins belong to, see `surface_key`.
-    classes
-        From narrow to wide.
-    provenance
-        Files, registration, figures to expect; shown to the user, not used.
+    ``coverage`` is the share of true heights inside. If the reference was ``registered`` to the surface, the margins do
+    not include a constant shift. ``surface`` says what surfaces they belong to, see `surface_key`.
     """
 
     name: str

@@ -37,21 +37,12 @@ _STRIP_PIXELS = 1 << 18
 def ablate_pair(pair: Pair, config: Any = None, *, tolerance: float = 0.0) -> dict[str, Any]:
     """Evaluate the paper's baseline, and the method at several levels and with regularisation, on one pair.
 
-    All results come from one aggregated cost volume, which must fit in memory. All are evaluated on the pixels that
-    pass cross-checking.
+    All results come from one aggregated cost volume, which must fit in memory, and are evaluated on the pixels that
+    pass cross-checking. The pair's search range and the method's alpha override those of ``config``. ``tolerance`` is
+    the distance in pixels up to which a truth outside an interval counts as inside.
 
-    Parameters
-    ----------
-    pair
-        Images, truth and search range.
-    config
-        Settings, or an argument of `load_config`. The pair's search range and the method's alpha override them.
-    tolerance
-        Distance in pixels up to which a truth outside an interval counts as inside.
-
-    Returns
-    -------
-    ``cost``, and for each of METHODS ``count``, ``accuracy``, ``relative_size`` and ``mean_width`` as `evaluate_run`.
+    Returns ``cost``, and for each of METHODS ``count``, ``accuracy``, ``relative_size`` and ``mean_width`` as
+    `evaluate_run`.
     """
     config = load_config(
         config, {"interval": {"alpha": 0.9}, "disparity": {"minimum": pair.minimum, "maximum": pair.maximum}}

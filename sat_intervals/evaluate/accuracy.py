@@ -20,7 +20,7 @@ _NORMAL = 1.4826
 class Errors(NamedTuple):
     """Errors (height - reference), interval widths, and distances of a missed reference from the interval, in metres.
 
-    Widths and distances are NaN for a cell without an interval.
+    Widths and distances are NaN without an interval.
     """
 
     error: np.ndarray
@@ -33,13 +33,7 @@ class Errors(NamedTuple):
 
 
 class Accuracy:
-    """Figures of a class of cells.
-
-    Parameters
-    ----------
-    nominal
-        The coverage that intervals are to reach; None if unknown.
-    """
+    """Figures of a class of cells; ``nominal`` is the coverage that intervals are to reach, None if unknown."""
 
     def __init__(self, nominal: float | None) -> None:
         self._nominal = nominal

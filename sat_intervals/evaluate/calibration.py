@@ -1,8 +1,7 @@
 """Calibrate the intervals of a surface model in metres, against reference heights.
 
-Pixel intervals do not contain every error of a height: cells mix several points, walls are vertical, and models and
-grids have errors. The margins are those of split-conformal prediction, by class of width. Expected figures are those of
-blocks of ground that were held out.
+The margins are those of split-conformal prediction, by class of width. Expected figures are those of blocks of ground
+that were held out.
 """
 
 from collections.abc import Mapping
@@ -68,26 +67,10 @@ def calibrate_surface(
 ) -> HeightCalibration:
     """Find the margins with which the intervals of a surface model contain a share of reference heights.
 
-    Parameters
-    ----------
-    surface, reference, registers
-        As in `evaluate_surface`. The surface has intervals and was made without a calibration or largest width.
-    name
-        Shown to the user, not used.
-    coverage
-        The share; by default the coverage of the surface's runs.
-
-    Returns
-    -------
-    Its provenance has the files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks
-    of ground with the margins of the other blocks (None with too few cells): coverage, median and mean width in metres;
-    ``lowest``, the smallest coverage of a block (None with too few cells in each); ``warnings``, lines for the user.
-
-    Raises
-    ------
-    SatIntervalsError
-        A file cannot be used, both do not overlap or have too few cells in common; or seem to have different datums,
-        and the reference was not moved.
+    Arguments are those of `evaluate_surface`; ``coverage`` is by default that of the surface's runs. The provenance has
+    the files, the shift of the reference, and figures: ``before`` and ``expected``, those of blocks of ground with the
+    margins of the other blocks (None with too few cells): coverage, median and mean width in metres; ``lowest``, the
+    smallest coverage of a block; ``warnings``, lines for the user.
     """
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)
@@ -178,10 +161,7 @@ def _part(place: np.ndarray) -> np.ndarray:
 
 
 def _datum_warnings(given: Comparison, sample: Sample, up: float, *, is_registered: bool) -> list[str]:
-    """Return a warning if the heights differ by as much as two datums do; raise if the reference was not moved.
-
-    Raises without a common height, too.
-    """
+    """Return a warning if the heights differ by as much as two datums do; raise if the reference was not moved."""
     median = float(np.median(sample.height - sample.reference)) + up if sample.height.size else None
     check_common(given, sample.height.size, median)
     if median is None or abs(median) <= _DATUM:

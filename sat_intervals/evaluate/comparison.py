@@ -33,20 +33,9 @@ _BLOCKS, _SMALLEST, _LARGEST_BLOCK, _POINTS = 8, 16, 256, 1000
 
 @dataclass(frozen=True)
 class Comparison:
-    """A surface model and its reference.
+    """A surface model and its reference, moved by ``shift`` (metres: easting, northing, height).
 
-    Attributes
-    ----------
-    surface, reference
-        The files.
-    shape, place
-        Size and georeferencing of the surface.
-    resolution
-        Size of the reference's pixels in metres.
-    finer
-        Heights of the reference along a cell.
-    shift
-        Metres by which the reference is moved: easting, northing, height.
+    ``resolution`` is the size of the reference's pixels in metres, ``finer`` the number of its heights along a cell.
     """
 
     surface: Path
@@ -135,14 +124,9 @@ def tiles(given: Comparison) -> Iterator[Window]:
 
 
 class ComparedCells(NamedTuple):
-    """Heights of a tile that both the surface and its reference have, in metres.
+    """Heights of a tile that both surface and reference have, ``(n,)`` metres; NaN bounds without an interval.
 
-    Attributes
-    ----------
-    height, lower, upper, reference
-        ``(n,)`` heights, NaN bounds for a cell without an interval; a cell counts once for each reference height.
-    known
-        Mask of the reference heights of the tile that they are.
+    A cell counts once for each reference height; ``known`` is the mask of those of the tile.
     """
 
     height: np.ndarray

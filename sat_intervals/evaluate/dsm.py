@@ -44,25 +44,18 @@ def evaluate_surface(
 ) -> dict[str, Any]:
     """Evaluate the heights and intervals of a surface model.
 
-    Parameters
-    ----------
-    surface
-        A file that `make_surface` wrote.
-    reference
-        Heights above the same datum in any CRS. If it is n times finer than the cells, each cell is compared with n x n
-        heights; else with the one nearest to its centre, or interpolated there if the reference was moved.
-    classes
-        A raster of whole numbers, such as land cover, in any CRS.
-    registers
-        Whether to move the reference by its constant shift from the surface.
+    The reference has heights above the same datum in any CRS. If it is n times finer than the cells, each cell is
+    compared with n x n heights; else with the one nearest to its centre, or interpolated there if the reference was
+    moved. ``classes`` is a raster of whole numbers, such as land cover. With ``registers`` the reference is moved by
+    its constant shift from the surface first.
 
     Returns
     -------
     For ``all`` heights, by ``slope`` of the reference (degrees), by ``width`` of the interval (metres) and by
     ``classes``: the figures of `Accuracy.report`. ``before``: those of all heights with the reference in its place.
     ``from`` and ``to`` are the limits of a class, ``class`` its number. ``registration``, see `Registration.report`;
-    None without, or with too few heights (see ``warnings``). ``nominal``: coverage or alpha of the surface;
-    None if unknown.
+    None without, or with too few heights (see ``warnings``). ``nominal``: coverage or alpha of the surface; None if
+    unknown.
     """
     given = open_comparison(surface, reference)
     nominal = nominal_of(given.surface)

@@ -19,18 +19,9 @@ _LARGEST_RATIO = 100
 class Criteria:
     """Parameters of an evaluation.
 
-    Attributes
-    ----------
-    minimum, maximum
-        The search range.
-    threshold, kernel, depth
-        Definition of low confidence and of its areas: the settings of regularisation.
-    tolerance
-        Distance in pixels up to which a truth outside an interval counts as inside.
-    bias
-        Pixels added to the truth before any comparison.
-    nominal
-        Coverage that the intervals are to reach: that of the settings, or alpha. None: unknown, no interval scores.
+    Low confidence and its areas are defined by ``threshold``, ``kernel`` and ``depth`` of regularisation. A truth up to
+    ``tolerance`` pixels outside an interval counts as inside; ``bias`` is added to the truth first. ``nominal`` is the
+    coverage, or alpha, that the intervals are to reach; None: no interval scores.
     """
 
     minimum: int
@@ -44,16 +35,10 @@ class Criteria:
 
 
 class Evaluated(NamedTuple):
-    """Pixels with an interval and a known truth, one element per pixel.
+    """Pixels with an interval and a known truth, one element per pixel; bands are float64 but the flags.
 
-    Attributes
-    ----------
-    bands
-        float64 except the flags.
-    low
-        Whether the pixel is of low confidence (paper eq. 13).
-    area_error
-        The largest ``|truth - disparity|`` over the evaluated pixels of its low-confidence area; NaN if not low.
+    ``low`` is low confidence (paper eq. 13), ``area_error`` the largest ``|truth - disparity|`` over the evaluated
+    pixels of its area, NaN if not low.
     """
 
     bands: Bands

@@ -1,7 +1,6 @@
 """Make the paper's tables: means over scenes, with the figures of the paper and of its implementation, Pandora.
 
-Pandora was measured with penalties 8 and 32, on pixels that pass its accurate cross-checking; overestimation also on
-all pixels with an interval. Figures that were not measured are None.
+Pandora was measured with penalties 8 and 32, on pixels that pass its accurate cross-checking. None was not measured.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,4 @@
-"""Compute the cells of a surface model strip by strip, each tile from the points near it, and count them.
-
-Memory depends on the tile only.
-"""
+"""Compute the cells of a surface model strip by strip, each tile from the points near it, and count them."""
 
 import math
 import threading

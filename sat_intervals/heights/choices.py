@@ -21,17 +21,15 @@ class SurfaceChoices:
         Interval of a cell: ``envelope`` contains those of all its points; ``mean`` is the weighted mean of their
         bounds, ``median`` the median; ``nearest`` is that of the point nearest to the cell's height; ``agreeing`` is
         the intersection of the largest number of intervals that meet. The last three are widened to the cell's height.
-        None means ``median`` for runs with a coverage, else ``envelope``.
+        None: ``median`` for runs with a coverage, else ``envelope``.
     keeps_open
         Whether points whose interval is open at an end of the search range contribute. None: not with a coverage.
-    outliers
-        Leave out points more than so many metres from the median of the points within 2 pixels; None: none.
-    max_width
-        Leave out cells with a wider interval (metres).
+    outliers, max_width
+        Metres: leave out points farther from the median of the points within 2 pixels, and cells with a wider interval.
     min_confidence
         Leave out cells of lower confidence, 0 to 1.
     calibration
-        Margins that widen or narrow the intervals, before wide ones are left out; None: none.
+        Margins that move the bounds, before wide intervals are left out.
     """
 
     bounds: Bounds | None = None

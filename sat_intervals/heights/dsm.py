@@ -1,8 +1,4 @@
-"""Make a surface model with height intervals from the points of one or several runs.
-
-A point contributes to the cell that contains it and to all cells whose centre is within a radius. Other cells are no
-data; they are never filled.
-"""
+"""Make a surface model with height intervals from the points of runs; cells without a point are no data."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -22,14 +22,9 @@ _SCALES = 0.4, 40.0
 def read_grid(path: Path, left: Georeferencing) -> RectificationGrid:
     """Read a grid as sensor positions at epipolar positions; pixel centres of the left epipolar image are integers.
 
-    Parameters
-    ----------
-    path
-        GeoTIFF: columns in band 1, rows in band 2, no positions where there is no data. Files tagged by OTB have
-        displacements from epipolar coordinates to sensor positions, all others sensor positions.
-    left
-        Georeferencing of the whole left epipolar image. OTB takes it as the position of its pixels in epipolar
-        coordinates, for the right image, too.
+    Columns are in band 1, rows in band 2; no data means no position. Grids of OTB have displacements from epipolar
+    coordinates, which are the positions of pixels in the georeferencing ``left`` of the whole left epipolar image, also
+    for the right one.
     """
     grid = RectificationGrid(str(path))
     has_displacements = read_tags(path).get(_TAG) == _OTB

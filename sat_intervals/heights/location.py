@@ -24,26 +24,24 @@ class Location:
     """Positions of ground points in both epipolar images."""
 
     def __init__(self, sensors: Sensors) -> None:
-        self._left = sensors.left_model, _Inverse(sensors.left_grid)
-        self._right = sensors.right_model, _Inverse(sensors.right_grid)
+        self._views = (
+            (sensors.left_model, _Inverse(sensors.left_grid)),
+            (sensors.right_model, _Inverse(sensors.right_grid)),
+        )
 
     def positions(self, longitude: np.ndarray, latitude: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """Return ``(n, 4)``: row and column in the left image, row and column in the right one; NaN where none.
+        """Return ``(n, 4)`` row and column in the left, then in the right image, NaN where none, of points ``(n,)``.
 
-        Points are ``(n,)``, in degrees (WGS 84) and metres above its ellipsoid. Pixel centres are integers.
+        Degrees (WGS 84) and metres above its ellipsoid; pixel centres are integers.
         """
-        found = [_positions(model, grid, longitude, latitude, height) for model, grid in (self._left, self._right)]
+        found = []
+        for model, grid in self._views:
+            with warnings.catch_warnings(action="ignore"):
+                row, column, _ = model.inverse_loc(longitude, latitude, height)
+            if row is None:
+                raise SatIntervalsError("a sensor model has no inverse coefficients: give a model with both ways")
+            found.append(grid.positions(np.column_stack([column, row])))
         return np.concatenate(found, axis=1)
-
-
-def _positions(
-    model: Any, grid: "_Inverse", longitude: np.ndarray, latitude: np.ndarray, height: np.ndarray
-) -> np.ndarray:
-    with warnings.catch_warnings(action="ignore"):
-        row, column, _ = model.inverse_loc(longitude, latitude, height)
-    if row is None:
-        raise SatIntervalsError("a sensor model has no inverse coefficients: give a model with both ways")
-    return grid.positions(np.column_stack([column, row]))
 
 
 class _Inverse:
@@ -73,18 +71,8 @@ class _Inverse:
 class GroundLattice:
     """Interpolate the positions of ground points in both images between the nodes of a lattice on the map.
 
-    shareloc and the inverse of the grids need a minute for a million points.
-
-    Parameters
-    ----------
-    location
-        Inverse location.
-    projection
-        The map of easting and northing.
-    lowest, highest
-        Corners of a box: easting, northing and ellipsoidal height in metres.
-    pixel
-        Size of a pixel on the ground in metres.
+    ``lowest`` and ``highest`` are corners of a box: easting, northing, ellipsoidal height in metres, the unit of
+    ``pixel``, too. shareloc and the inverse of the grids need a minute for a million points.
     """
 
     def __init__(

@@ -88,12 +88,8 @@ class Cells:
 class PointCloud:
     """The points of one run that contribute, read by windows, and the map extent of each window.
 
-    Attributes
-    ----------
-    points
-        Number of points that contribute.
-    outliers, open
-        Numbers of points left out: outliers, and others whose interval is open at an end of the search range.
+    ``points``, ``outliers`` and ``open`` count points that contribute, outliers, and other points that are left out
+    because their interval is open at an end of the search range.
     """
 
     def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices | None = None) -> None:
@@ -162,10 +158,7 @@ class PointCloud:
         return max(self.points * resolution**2 / max(sum(areas), resolution**2), 1e-9)
 
     def splat(self, cells: Cells, window: Window, radius: float, ended: threading.Event) -> np.ndarray:
-        """Accumulate the points in a window of the cells, see `kernels.splat`; ``radius`` in metres.
-
-        Of bounds in LISTED, the layers LEAST and MOST get the bounds of each cell. Stops early once ``ended`` is set.
-        """
+        """Accumulate the points in a window of cells, see `kernels.splat`; ``radius`` in metres; ``ended`` stops it."""
         gathered = empty_cells(window.height, window.width)
         how = LISTED.get(str(self._choices.bounds))
         near = []

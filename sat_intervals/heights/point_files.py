@@ -2,8 +2,8 @@
 
 import csv
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,22 +16,14 @@ _PART = 500_000
 _DEGREES = (("longitude", "lon", "long"), ("latitude", "lat"))
 _METRES = (("x", "easting", "east"), ("y", "northing", "north"))
 _HEIGHTS = ("height", "h", "z", "elevation", "ellipsoidal_height", "h_mean", "h_te_best_fit", "h_te_median", "h_ph")
-_EXTRA = "pip install 'sat-intervals[reference]'"
 # Classes of LAS points that are noise.
 _NOISE = 7, 18
 
 
 class PointFile:
-    """Points of a file, and the frame of their coordinates.
+    """Points of a CSV file with a header, LAS, LAZ, or vectors that GDAL reads; ``crs`` replaces that of the file.
 
-    Parameters
-    ----------
-    path
-        ``.csv`` with a header, ``.las``, ``.laz``, or a file that GDAL reads as vectors, such as ``.gpkg``.
-    crs
-        Replaces the CRS of the file. Longitude and latitude of a CSV file are on the WGS 84 ellipsoid without it.
-    vertical
-        What its heights refer to.
+    Longitude and latitude of a CSV file are on the WGS 84 ellipsoid without ``crs``.
     """
 
     def __init__(self, path: Path, crs: str | None, vertical: Vertical) -> None:
@@ -39,25 +31,31 @@ class PointFile:
         self._path, ending = path, path.suffix.lower()
         readers = {".csv": (_crs_of_table, _table), ".las": (_crs_of_las, _las), ".laz": (_crs_of_las, _las)}
         crs_of, self._parts = readers.get(ending, (_crs_of_vectors, _vectors))
-        own = crs_of(path)
+        with _reading(path):
+            own = crs_of(path)
         self.frame = Frame(str(path), crs or own, vertical)
 
     def parts(self) -> Iterator[np.ndarray]:
         """Yield ``(n, 3)`` float64 x, y and height in the frame, of points that have all and are on the ground."""
-        try:
+        with _reading(self._path):
             for part in self._parts(self._path):
                 metres = part[:, 2] * self.frame.unit
                 is_ground = (metres >= GROUND[0]) & (metres <= GROUND[1])  # others are no-data values
                 yield part[np.isfinite(part).all(axis=1) & is_ground]
-        except SatIntervalsError:
-            raise
-        except Exception as error:  # the libraries raise many types
-            raise _unreadable(self._path, error) from error
 
 
-def _unreadable(path: Path, error: Exception) -> SatIntervalsError:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return SatIntervalsError(f"{path} cannot be read as points: {reason}")
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn the errors of the libraries, which are of many types, into one with the name of the file."""
+    try:
+        yield
+    except SatIntervalsError:
+        raise
+    except ModuleNotFoundError as error:
+        raise SatIntervalsError(f"{path} needs {error.name}: pip install 'sat-intervals[reference]'") from error
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SatIntervalsError(f"{path} cannot be read as points: {reason}") from error
 
 
 def _columns(path: Path, names: list[str]) -> tuple[list[int], bool]:
@@ -79,16 +77,12 @@ def _columns(path: Path, names: list[str]) -> tuple[list[int], bool]:
 
 
 def _header(path: Path) -> list[str]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            return next(csv.reader(stream), [])
-    except (UnicodeDecodeError, csv.Error, OSError) as error:
-        raise _unreadable(path, error) from error
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        return next(csv.reader(stream), [])
 
 
 def _crs_of_table(path: Path) -> str | None:
-    _, is_degrees = _columns(path, _header(path))
-    return "EPSG:4326" if is_degrees else None
+    return "EPSG:4326" if _columns(path, _header(path))[1] else None
 
 
 def _table(path: Path) -> Iterator[np.ndarray]:
@@ -115,55 +109,36 @@ def _number(path: Path, line: int, cells: list[str], place: int) -> float:
         raise SatIntervalsError(f"{path}, line {line}: {cell!r} is not a number: fix this line") from error
 
 
-def _opened_las(path: Path) -> Any:
-    try:
-        import laspy
-    except ModuleNotFoundError as error:
-        raise SatIntervalsError(f"LAS and LAZ files need laspy: {_EXTRA}") from error
-    try:
-        return laspy.open(path)
-    except Exception as error:  # laspy and its decoders raise many types
-        raise _unreadable(path, error) from error
-
-
 def _crs_of_las(path: Path) -> str | None:
-    with _opened_las(path) as file:
-        try:
-            crs = file.header.parse_crs()
-        except Exception as error:
-            raise _unreadable(path, error) from error
-        return None if crs is None else str(crs.to_wkt())
+    import laspy
+
+    with laspy.open(path) as file:
+        crs = file.header.parse_crs()
+    return None if crs is None else str(crs.to_wkt())
 
 
 def _las(path: Path) -> Iterator[np.ndarray]:
     """Yield points but those marked as noise or withheld."""
-    with _opened_las(path) as file:
+    import laspy
+
+    with laspy.open(path) as file:
         for points in file.chunk_iterator(_PART):
             kept = ~np.isin(np.asarray(points.classification), _NOISE) & (np.asarray(points.withheld) == 0)
             yield np.column_stack([points.x, points.y, points.z])[kept]
 
 
-def _vector_library() -> tuple[Any, Any]:
-    try:
-        import pyogrio
-        import shapely
-    except ModuleNotFoundError as error:
-        raise SatIntervalsError(f"GeoPackage and other vector files need pyogrio and shapely: {_EXTRA}") from error
-    return pyogrio, shapely
-
-
 def _crs_of_vectors(path: Path) -> str | None:
-    pyogrio, _ = _vector_library()
-    try:
-        crs = pyogrio.read_info(path)["crs"]
-    except Exception as error:
-        raise _unreadable(path, error) from error
+    import pyogrio
+
+    crs = pyogrio.read_info(path)["crs"]
     return None if crs is None else str(crs)
 
 
 def _vectors(path: Path) -> Iterator[np.ndarray]:
     """Yield points of the first layer; the height is that of the geometry, else a column."""
-    pyogrio, shapely = _vector_library()
+    import pyogrio
+    import shapely
+
     fields = [str(name) for name in pyogrio.read_info(path)["fields"]]
     column = next((name for choice in _HEIGHTS for name in fields if name.lower() == choice), None)
     skipped = 0

@@ -18,16 +18,9 @@ _STEEPEST, _CLEAR = np.tan(np.radians(60.0)), 1.0
 
 
 class PointSight:
-    """Points in the pixels of a region, gathered in a file by strips of rows.
+    """Points in the pixels of a region, gathered by strips of rows in an empty file that is open for both ways.
 
-    Parameters
-    ----------
-    file
-        An empty file, open for writing and reading.
-    region
-        The pixels.
-    rise
-        Change of disparity for a height of one pixel's size on the ground; signed.
+    ``rise`` is the signed change of disparity for a height of one pixel's size on the ground.
     """
 
     def __init__(self, file: BinaryIO, region: Window, rise: float) -> None:

@@ -1,8 +1,4 @@
-"""Disparities of a raster of heights: each pixel's line of sight is followed down to the first height that it meets.
-
-Lines of sight are those of the lattice of `triangulate`, in cells of the raster. So the disparity of a height is the
-one that `triangulate` turns into this height.
-"""
+"""Disparities of a raster of heights: the first height that each pixel's line of sight, of `Lattice`, meets."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -50,19 +46,7 @@ class _FarError(Exception):
 
 
 class RasterSight:
-    """Disparities of a raster of heights, strip by strip.
-
-    Parameters
-    ----------
-    scene
-        Sensors and pixels.
-    raster
-        The heights.
-    shift
-        Added to the reference.
-    search
-        Range of disparities to begin with.
-    """
+    """Disparities of a raster of heights, moved by ``shift``, strip by strip; ``search`` is a range to begin with."""
 
     def __init__(self, scene: Scene, raster: HeightRaster, shift: Shift, search: tuple[int, int]) -> None:
         self._scene, self._raster, self._shift = scene, raster, shift
@@ -72,10 +56,7 @@ class RasterSight:
         self._steepest = np.tan(np.radians(_STEEPEST)) * raster.cell / raster.frame.unit
 
     def strips(self, pixel: float) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the first row and the disparities ``(rows, columns)``, NaN if unknown, of strips from the top.
-
-        ``pixel`` is the size of a pixel on the ground in metres.
-        """
+        """Yield first row and disparities ``(rows, columns)``, NaN if unknown; ``pixel`` is metres on the ground."""
         side = int(_CELLS * self._raster.cell / pixel) // _LEAST * _LEAST
         side = min(_TILE, max(_LEAST, side))
         height, width = self._scene.region.height, self._scene.region.width
@@ -134,10 +115,7 @@ class RasterSight:
         )
 
     def _below(self, sights: np.ndarray, column: int) -> tuple[Window, np.ndarray] | None:
-        """Read the heights that lines of sight can meet; None if there are none.
-
-        The window follows from the range of heights and the other way round: it grows until both agree.
-        """
+        """Read the heights that lines of sight can meet, in a window that grows to hold them; None without any."""
         ends = float(np.nanmin(sights[..., 2])), float(np.nanmax(sights[..., 2]))
         begin = self._heights.get(column, (sum(ends) / 2,) * 2)  # those of the tile above
         found = self._grown(sights, begin)

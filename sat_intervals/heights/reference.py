@@ -1,7 +1,6 @@
 """Turn reference heights into true disparities of a run: ``truth.tif``, for `calibrate` and `evaluate`.
 
-Rasters are seen pixel by pixel, see `raster_sight`; points go through inverse location, see `location`. Both are
-registered to the points of the run first.
+Rasters are seen pixel by pixel; points go through inverse location. Both are registered to the points of the run.
 """
 
 from collections.abc import Iterator
@@ -58,19 +57,7 @@ class SensorFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference heights: a raster, or points (CSV, LAS, LAZ, vector files).
-
-    Attributes
-    ----------
-    path
-        The file.
-    is_points
-        Whether it has points.
-    crs
-        Replaces the CRS of the file.
-    vertical
-        What its heights refer to.
-    """
+    """Reference heights: a raster, or points (CSV, LAS, LAZ, vector files); ``crs`` replaces that of the file."""
 
     path: Path
     is_points: bool
@@ -87,22 +74,9 @@ def make_truth(
     registers: bool = True,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
-    """Write the disparities that reference heights have in a run.
+    """Write the disparities that reference heights have in a run, by default to ``truth.tif`` in its folder.
 
-    Parameters
-    ----------
-    out
-        Folder of the run; with ``points.tif`` if the reference is to be registered.
-    files
-        Sensor models and grids.
-    reference
-        The heights.
-    path
-        The file to write, an existing one is replaced; by default ``truth.tif`` in ``out``.
-    registers
-        Whether to move the reference by its constant shift from the points of the run.
-    progress
-        Callback, see `Progress`.
+    With ``registers`` the reference is moved by its constant shift from the points of the run first.
 
     Returns
     -------
@@ -171,16 +145,13 @@ class _Work:
 
     def _scale(self) -> tuple[float, float]:
         """Return metres of a pixel on the ground, and the change of disparity for a height of as many metres."""
-        row, column = (first + size / 2 for first, size in self._middle())
+        region = self.run.region
+        row, column = region.row + region.height / 2, region.column + region.width / 2
         middle = sum(self._search) / 2
         ends = self._sensors.triangulate(np.full(3, row), column + np.array([0, 1, 0]), middle + np.array([0, 0, 1]))
         x, y = self._projection.place(ends[:, 0], ends[:, 1])
         pixel = float(np.hypot(x[1] - x[0], y[1] - y[0]))
         return pixel, pixel / float(ends[2, 2] - ends[0, 2])
-
-    def _middle(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        region = self.run.region
-        return (region.row, region.height), (region.column, region.width)
 
     def check_points(self) -> None:
         """Raise if the points of the run were made with other models or grids."""

@@ -19,10 +19,7 @@ _BLOCKS, _SMALLEST, _LARGEST, _POINTS = 8, 24, 256, 1000
 
 
 def blocks_of_raster(run: Run, raster: HeightRaster, projection: Projection, pixel: float) -> Blocks | None:
-    """Return points of a run on surfaces of a raster; None if nothing is in common.
-
-    ``pixel`` is the size of a pixel on the ground in metres. Heights are above the ellipsoid.
-    """
+    """Return points of a run on surfaces of a raster; None if nothing is common. ``pixel`` is metres on the ground."""
     cell = max(pixel, raster.cell)
     parts, surfaces = [], []
     for tile in _spread(Grid(Window(0, 0, *run.shape), _side(run))):
@@ -74,10 +71,7 @@ def _in_cells(cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _on_cells(raster: HeightRaster, projection: Projection, cells: Cells) -> np.ndarray | None:
-    """Return heights above the ellipsoid at the centres of cells; None if the raster has none there.
-
-    Positions are interpolated between the corners: over some hundred cells a map is a parallelogram.
-    """
+    """Return heights above the ellipsoid at centres of cells, interpolated between the corners; None without any."""
     across, down = (np.array([0.5, size - 0.5]) * cells.resolution for size in (cells.columns, cells.rows))
     x, y = np.meshgrid(cells.left + across, cells.top - down)
     column, row, level = raster.positions(*projection.degrees(x, y), np.zeros(x.shape))

@@ -37,14 +37,7 @@ _FOREIGN_RESIDUAL = 10.0
 class Points(NamedTuple):
     """Points of some pixels, all ``(rows, columns)`` float64, NaN where there is no disparity.
 
-    Attributes
-    ----------
-    longitude, latitude
-        Degrees, WGS 84.
-    height
-        Metres above its ellipsoid.
-    residual
-        Metres from the point to either line of sight.
+    Degrees (WGS 84), metres above its ellipsoid, and metres from the point to either line of sight.
     """
 
     longitude: np.ndarray
@@ -72,24 +65,16 @@ class Sensors:
         *,
         left: Georeferencing | None = None,
     ) -> "Sensors":
-        """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`.
-
-        ``left`` is the georeferencing of the whole left epipolar image, which grids of OTB refer to.
-        """
+        """Read RPC models (GeoTIFF tags, ``.geom``, DIMAP XML) and epipolar grids, see `grids.read_grid`."""
         models = (_read(path, "RPC model", GeoModel) for path in (left_model, right_model))
         read = partial(read_grid, left=left or Georeferencing())
         grids = (_read(path, "epipolar grid", read) for path in (left_grid, right_grid))
         return cls(*models, *grids)
 
     def triangulate(self, row: np.ndarray, column: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-        """Return ``(n, 4)`` longitude, latitude, height and residual of epipolar positions, see `Points`.
+        """Return ``(n, 4)`` longitude, latitude, height and residual, see `Points`, of epipolar positions ``(n,)``.
 
-        Parameters
-        ----------
-        row, column
-            ``(n,)`` positions in the whole left epipolar image; pixel centres are integers.
-        disparity
-            ``(n,)`` pixels; the right pixel is at ``column + disparity`` of the same row.
+        Pixel centres are integers; the right pixel is at ``column + disparity`` of the same row.
         """
         matches = np.column_stack([column, row, column + disparity, row]).astype(np.float64)
         found = [self._triangulate(matches[first : first + _AT_ONCE]) for first in range(0, len(matches), _AT_ONCE)]
@@ -117,20 +102,9 @@ def _read(path: Path, kind: str, reader: Any) -> Any:
 class Lattice:
     """Triangulate the nodes of a lattice over rows, columns and disparities, and interpolate points between them.
 
-    shareloc needs seconds for a million points, and each pixel has three. Between nodes 32 pixels apart, linear
-    interpolation is accurate to less than 1 mm. Windows must come from the top: nodes are triangulated row by row when
-    needed, and dropped above the window.
-
-    Parameters
-    ----------
-    sensors
-        Models and grids.
-    region
-        The pixels of the left image to cover.
-    right_width
-        Columns of the right image.
-    minimum, maximum
-        The search range.
+    shareloc needs seconds for a million points. Between nodes 32 pixels apart, interpolation is accurate to less than
+    1 mm. Windows must come from the top: nodes are triangulated row by row, and dropped above the window. ``region`` is
+    the pixels of the left image to cover, ``right_width`` the columns of the right one.
     """
 
     def __init__(self, sensors: Sensors, region: Window, right_width: int, minimum: int, maximum: int) -> None:
@@ -154,10 +128,9 @@ class Lattice:
         ]
 
     def nodes(self, window: Window) -> tuple[np.ndarray, tuple[float, float, float]]:
-        """Return the rows of nodes around a window, all columns, and the place of their first from its first pixel.
+        """Return rows of nodes around a window, ``(rows, columns, disparities, 4)``, see `Sensors.triangulate`.
 
-        Nodes are ``(rows, columns, disparities, 4)``, see `Sensors.triangulate`, ``spacing`` apart. The place is row,
-        column and disparity.
+        With row, column and disparity of their first from the window's first pixel; nodes are ``spacing`` apart.
         """
         step = self.spacing[0]
         first = min(int(window.row / step), len(self._rows) - 2)

@@ -1,8 +1,4 @@
-"""Triangulate the disparities and bounds of a run: points and heights in its geometry.
-
-Points are interpolated from a lattice at about three seconds of processor time per megapixel, so a single process
-without resuming is enough. Rows are read, computed and written strip by strip, so memory does not depend on the size.
-"""
+"""Triangulate disparities and bounds of a run, strip by strip: three seconds of processor time a megapixel."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -113,10 +109,7 @@ class _Tally:
 
 
 def _strips(run: Run) -> Iterator[tuple[Window, np.ndarray]]:
-    """Yield windows of whole rows from the top with disparity, lower and upper ``(3, rows, columns)``, NaN if invalid.
-
-    Files are read by rows of blocks, which are then cut.
-    """
+    """Yield windows of whole rows with disparity, lower and upper ``(3, rows, columns)``, NaN if invalid."""
     height = max(1, _PIXELS // run.region.width)
     for block in run.windows():
         bands = run.read_bands(block)

@@ -1,7 +1,6 @@
 """Provide the matcher as a method of CARS: ``dense_matching: {method: sat_intervals}``.
 
-CARS chooses tiles, margins and the dataset of a tile. The method writes disparity, interval and confidence under the
-names that CARS' triangulation reads.
+It writes disparity, interval and confidence under the names that CARS' triangulation reads.
 """
 
 from collections.abc import Mapping
@@ -30,19 +29,9 @@ _INDICATORS = {
 class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore[call-arg, misc]
     """Match the tiles of CARS: disparities with intervals.
 
-    Parameters
-    ----------
-    conf
-        The section ``dense_matching`` of CARS' configuration. ``settings`` contains the settings of this package by
-        sections, without the search range, which CARS provides. Other keys belong to Pandora and are ignored.
-
-    By default, confidence is relative to the whole search range (``ambiguity: {normalization: range}``): percentiles of
-    one tile would make adjacent tiles differ.
-
-    Raises
-    ------
-    SatIntervalsError
-        Settings that cannot be used.
+    ``conf`` is the section ``dense_matching`` of CARS' configuration; its ``settings`` are those of this package,
+    without the search range. By default, confidence is relative to the whole search range: percentiles of one tile
+    would make adjacent tiles differ.
     """
 
     def __init__(self, conf: Mapping[str, Any] | None) -> None:
@@ -106,8 +95,7 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
     ) -> xr.Dataset:
         """Match one tile with its margins; parameters and result are those of CARS' abstract method.
 
-        Each pixel is searched over the range of the whole tile. If CARS limits memory, the range is cropped around zero
-        as CARS does.
+        Each pixel is searched over the range of the whole tile, cropped around zero if CARS limits memory.
         """
         from sat_intervals.match.in_memory import match_arrays  # `import cars` must not load numba
 

@@ -1,8 +1,7 @@
 """Export a run to the file formats of other photogrammetry tools.
 
-All of them define disparity as ``x_right - x_left`` of the epipolar pair, as here, and none uses a CRS. The files have
-the size of the left image; pixels outside the matched region are invalid. Those for OTB keep the transform of the left
-image, which gives the position of its pixels in OTB's grids.
+All define disparity as ``x_right - x_left``, as here, and none uses a CRS. The files have the size of the left image;
+pixels outside the matched region are invalid. Those for OTB keep the transform of the left image.
 """
 
 from collections.abc import Callable
@@ -84,22 +83,9 @@ FORMATS: dict[str, Callable[[str, Config], list[Raster]]] = {"cars": _cars, "otb
 
 
 def export(out: str | Path, form: str, target: str | Path, *, overwrite: bool = False) -> list[Path]:
-    """Write a run in the format of another tool.
+    """Write a run in one of FORMATS to a folder, and return the files; a band that the run lacks has no file.
 
-    Parameters
-    ----------
-    out
-        Folder of the finished run.
-    form
-        One of FORMATS.
-    target
-        The folder to write to; for ``asp`` the prefix of the file, such as ``stereo/run`` of ``stereo/run-F.tif``.
-    overwrite
-        Whether to replace existing files.
-
-    Returns
-    -------
-    The files written. A band that the run lacks, such as bounds without intervals, has no file.
+    For ``asp`` the target is the prefix of the file, such as ``stereo/run`` of ``stereo/run-F.tif``.
     """
     run, target = open_run(out), Path(target)
     left = run.report["inputs"]["left"]

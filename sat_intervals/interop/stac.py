@@ -39,18 +39,8 @@ _LOG = logging.getLogger(__name__)
 def write_item(out: str | Path, *, taken: str | None = None, identifier: str | None = None) -> Path:
     """Write ``stac.json`` to the folder of a finished run: a STAC 1.1 item with its rasters as assets.
 
-    The item has the footprint, the projection of each raster, statistics of its bands, sizes and SHA-256 of all files,
-    versions and settings of the run, and links to its images. ``points.tif``, ``dsm.tif`` and ``overview.png`` are
-    assets if they belong to this run.
-
-    Parameters
-    ----------
-    out
-        Folder of the finished run.
-    taken
-        When the left image was taken, ISO 8601 with a time zone; by default, when the run ended.
-    identifier
-        Of the item; by default the name of the folder.
+    ``taken`` is when the left image was taken, ISO 8601 with a time zone; by default, when the run ended.
+    ``points.tif``, ``dsm.tif`` and ``overview.png`` are assets if they belong to this run.
     """
     run = open_run(out)
     file = run.out / "stac.json"

@@ -1,7 +1,4 @@
-"""Provide what all pictures share: page, style, colours, value ranges, histogram of widths.
-
-Every picture imports this module, so it reports a missing matplotlib (the extra ``plot``).
-"""
+"""Provide what all pictures share: page, style, colours, value ranges, histogram of widths."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -21,22 +21,9 @@ from sat_intervals.tiling import Window
 class Curve(NamedTuple):
     """The cost curve of a pixel, its disparity and interval before median filter and regularisation.
 
-    Attributes
-    ----------
-    disparities
-        Integers searched, in pixels.
-    costs
-        Float64, aggregated by SGM if the run uses it; NaN where a candidate is impossible.
-    possibilities
-        0 to 1, 1 at the lowest cost; NaN where a candidate is impossible.
-    level
-        Possibility at which the curve is cut, None if the run has no intervals.
-    cut
-        Whether a disparity belongs to the cut; all false if the run has no intervals.
-    disparity
-        The disparity of lowest cost, refined if the run refines, in pixels.
-    lower, upper
-        The interval in pixels, None if the run has no intervals.
+    ``costs`` (float64, aggregated by SGM if the run uses it) and ``possibilities`` (0 to 1) belong to the integers
+    ``disparities``, NaN where a candidate is impossible; those of ``cut`` reach ``level``. Disparity and bounds are in
+    pixels. Without intervals, level and bounds are None, and the cut is empty.
     """
 
     disparities: np.ndarray
@@ -50,10 +37,9 @@ class Curve(NamedTuple):
 
 
 def read_curve(results: Results, row: int, column: int) -> Curve:
-    """Match a pixel again with the pixels around it that support it.
+    """Match a pixel of the results again, with the pixels around it that support it.
 
     SGM's aggregation reaches beyond the overlap, so the curve may differ slightly from that of the run.
-    ``row`` and ``column`` count from 0 at the first pixel of the results.
     """
     results.check_pixel(row, column)
     config = results.config

@@ -26,10 +26,9 @@ def check_one_pair(runs: Sequence[Path]) -> None:
 
 
 def draw_coverage(runs: Sequence[Path], target: Path, dpi: int = DPI, **judging: Any) -> None:
-    """Draw nominal against measured coverage, and mean width against measured coverage.
+    """Draw nominal against measured coverage, and mean width against it, of runs of one pair at several coverages.
 
-    ``runs`` are folders of runs of one pair at several coverages, or one; ``judging`` are the arguments of
-    `evaluate_run`: truth, mask, tolerance and bias. Small dots are deciles of confidence.
+    ``judging`` are the arguments of `evaluate_run`. Small dots are deciles of confidence.
     """
     reports = sorted((evaluate_run(run, **judging) for run in runs), key=lambda report: float(report["nominal"]))
     with page(target, (9.0, 4.2), dpi, f"{', '.join(run.name for run in runs)}: intervals and truth") as figure:

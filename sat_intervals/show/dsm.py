@@ -35,10 +35,7 @@ _BAND = {band.name: index for index, band in enumerate(SURFACE)}
 
 
 def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
-    """Draw hillshade, height, interval width and confidence of a surface model, read from its overviews.
-
-    If several runs overlap, their agreement replaces confidence.
-    """
+    """Draw hillshade, height, interval width and confidence, or agreement of runs, from the overviews."""
     shape, place = read_place(surface)
     if not is_surface(surface):
         raise SatIntervalsError(f"{surface} is not a surface model of sat-intervals dsm: move it or make it again")
@@ -103,10 +100,7 @@ def _end_of_scale(halves: np.ndarray) -> float:
 
 
 def _relief(height: np.ndarray, across: float, down: float) -> np.ndarray:
-    """Return the hillshade of a surface, 0 to 1, NaN beside holes.
-
-    ``across`` and ``down`` are the width and height of a cell in metres. Slopes are central differences.
-    """
+    """Return the hillshade, 0 to 1, NaN beside holes, by central differences; cells of ``across`` x ``down`` m."""
     if min(height.shape) < 2:
         return np.full(height.shape, np.nan)
     down_slope, across_slope = np.gradient(_FLATTENED * height, down, across)

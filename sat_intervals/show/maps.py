@@ -144,10 +144,7 @@ def _draw_map(
     shown: tuple[float, float],
     power: float = 1.0,
 ) -> Colorbar:
-    """Draw a layer titled ``name[0]`` with unit ``name[1]``; returns its colour bar.
-
-    A ``power`` of 1/2 brightens small values.
-    """
+    """Draw a layer titled ``name[0]`` with unit ``name[1]``; a ``power`` of 1/2 brightens small values."""
     drawn = _show(panel, results, values, cmap=colours, norm=PowerNorm(power, *shown))
     panel.set_title(name[0])
     assert panel.figure is not None

@@ -23,12 +23,7 @@ def draw_profile(
 ) -> None:
     """Draw interval, disparity and truth along a row, low-confidence sections in grey (the paper's figures 5, 7, 8).
 
-    Parameters
-    ----------
-    row
-        Counted from 0 at the first row of the results.
-    columns
-        First and last column drawn; by default all.
+    ``row`` counts from 0 at the first row of the results; ``columns`` are the first and last one drawn.
     """
     first, last = results.check_part(row, columns)
     bands = results.read(Window(row, 0, 1, results.region.width))
@@ -60,9 +55,9 @@ def draw_profile(
 
 
 def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int = DPI) -> None:
-    """Draw a pixel's cost curve, its possibility distribution, the cut and the interval (the paper's figures 2 and 3).
+    """Draw a pixel's cost curve, its possibility distribution, the cut and the interval (the paper's figures 2, 3).
 
-    The pixel is matched again. The interval that the run wrote, after median filter and regularisation, is shown below.
+    The pixel is matched again. The interval that the run wrote is shown below.
     """
     curve = read_curve(results, row, column)
     pixel = results.read_pixel(row, column)

@@ -39,24 +39,9 @@ _STYLED = "intervals", "width", "validity", "points", "dsm", "dsm_half_width"
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of the project.
+    """A layer of the project: group, name and meaning in the list, a file or GDAL name, place and size, and colours.
 
-    Attributes
-    ----------
-    group, name, meaning
-        Where it is in the list of layers, and what it shows.
-    source
-        A file, or any name that GDAL opens.
-    place, shape
-        Georeferencing, rows and columns.
-    renderer
-        Colours, see `styles`.
-    is_default
-        Whether QGIS gets this style also when the raster is opened alone.
-    is_shown
-        Whether the layer is switched on.
-    blend
-        Blend mode of QGIS over the layers below.
+    ``is_default``: the raster alone gets this style, too; ``blend`` is QGIS' mode over the layers below.
     """
 
     group: str
@@ -161,10 +146,7 @@ def _surface(run: Run, written: Written) -> Iterator[Layer]:
 
 
 def _images(run: Run, written: Written) -> Iterator[Layer]:
-    """Yield truth and images; those that cannot be opened, or were changed since the run, are left out.
-
-    So is the truth beside a left image that was changed.
-    """
+    """Yield truth and images; those that cannot be opened, or were changed since the run, are left out."""
     names = ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right")
     for name in names:
         try:

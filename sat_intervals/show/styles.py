@@ -1,7 +1,4 @@
-"""Styles of rasters for QGIS: renderers, default styles (``.qml``), and virtual rasters of widths (``.vrt``).
-
-QGIS reads ``name.qml`` when it loads ``name.tif``. All XML is written by the standard library; QGIS is not needed.
-"""
+"""Styles of rasters for QGIS: renderers, default styles (``.qml``), and virtual rasters of widths (``.vrt``)."""
 
 from collections.abc import Sequence
 from xml.etree import ElementTree
@@ -72,13 +69,7 @@ def hillshade(band: int) -> Element:
 
 
 def validity_classes(counts: np.ndarray) -> Element:
-    """Return a renderer of validity flags: a colour and a label for each value that occurs.
-
-    Parameters
-    ----------
-    counts
-        Number of pixels of each value of the band, 65536 integers.
-    """
+    """Return a renderer of validity flags, with a label for each value that occurs; ``counts`` of all 65536 values."""
     renderer = _renderer("paletted", band=1)
     palette = SubElement(renderer, "colorPalette")
     present = np.flatnonzero(counts)
@@ -124,16 +115,9 @@ def default_style(renderer: Element) -> bytes:
 def difference(
     source: tuple[str, int, int], place: Georeferencing, shape: tuple[int, int], factor: float = 1.0
 ) -> bytes:
-    """Return a virtual raster of the difference of two bands, which GDAL computes when it is read.
+    """Return a virtual raster of the difference of two bands, times a factor, which GDAL computes when it is read.
 
-    Parameters
-    ----------
-    source
-        Name of a raster beside it, the band to subtract from, and the band to subtract, counted from 1.
-    place, shape
-        Georeferencing, rows and columns of the source.
-    factor
-        Factor of the difference.
+    ``source`` is the name of a raster beside it, the band to subtract from, and that to subtract, counted from 1.
     """
     name, upper, lower = source
     root = Element("VRTDataset", rasterXSize=str(shape[1]), rasterYSize=str(shape[0]))

@@ -24,7 +24,6 @@ from sat_intervals import match_pair
 from sat_intervals.cli.console import Console
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.match.statistics import Tally
 from sat_intervals.products import (
     FLAGS,
     INVALID,
@@ -39,6 +38,7 @@ from sat_intervals.products import (
 )
 from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, stamps, surface_file, write_layer
 from sat_intervals.results import open_results, open_run
+from sat_intervals.run.statistics import Tally
 from sat_intervals.show import maps
 from sat_intervals.show.canvas import widest
 from sat_intervals.show.cost_curve import read_curve
@@ -321,7 +321,7 @@ def test_plot__without_intervals_claims_none(tmp_path, words, unrendered):
     [((40, 60), np.nan, "Confidence"), ((1, 5), 1.0, "Agreement of runs")],
 )
 def test_plot__draws_the_surface_of_a_run(tmp_path, monkeypatch, words, shape, agreement, last):
-    monkeypatch.setattr(maps, "draw_overview", lambda results, stream, dpi: stream.write(b"picture"))
+    monkeypatch.setattr(maps, "draw_overview", lambda results, path, dpi: path.write_bytes(b"drawn"))
     out = write_run(tmp_path, *random_bands(20, 20)[:2])
     height = np.add.outer(np.arange(shape[0]), np.arange(shape[1])) / 10
     height[:, 3] = np.nan
