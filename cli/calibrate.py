@@ -10,7 +10,7 @@ import click
 from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
 from sat_intervals.cli.calibration_files import check_output, write
 from sat_intervals.cli.judging import tolerance_option
-from sat_intervals.cli.matching import SettingsArguments, settings_options
+from sat_intervals.cli.matching import SettingsArguments, named_by, settings_options
 from sat_intervals.cli.options import (
     FILE,
     SurfaceAndReference,

@@ -10,7 +10,6 @@ from rich.console import Console as Terminal
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
-from sat_intervals.cli import signals
 from sat_intervals.cli.options import PICTURES
 
 STAGES = {
@@ -44,22 +43,13 @@ def _is_older(file: Path, other: Path) -> bool:
     return file.exists() and other.exists() and file.stat().st_mtime_ns < other.stat().st_mtime_ns
 
 
-class _Terminal(Terminal):
-    """A terminal that raises BrokenPipeError; rich would end the process with status 1."""
-
-    def on_broken_pipe(self) -> None:
-        """Raise again; rich calls this in the handler of a BrokenPipeError."""
-        self.quiet = True
-        raise BrokenPipeError
-
-
 class Console:
     """Shows progress: a bar on a terminal, plain lines elsewhere, nothing with ``--quiet``."""
 
     def __init__(self, quiet: bool) -> None:
         self.quiet = quiet
         # Paths may have square brackets and colons, which are not markup.
-        self._terminal = _Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
+        self._terminal = Terminal(quiet=quiet, highlight=False, markup=False, emoji=False)
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -83,7 +73,6 @@ class Console:
 
     def progress(self, stage: str, done: int, total: int) -> None:
         """Show the progress of a stage; a stage of one step has no figures."""
-        signals.check()
         began, before = self._began.setdefault(stage, (time.monotonic(), done))
         elapsed = time.monotonic() - began
         rate = (done - before) / elapsed if elapsed > 0 else 0.0

@@ -1,6 +1,5 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
@@ -66,13 +65,6 @@ class SettingsArguments:
         from sat_intervals.config import load_config
 
         return load_config(self.file, self.sections | sections)
-
-
-def named_by(settings: Path | None) -> list[str]:
-    """Return the files that a file of settings names, which are read with it or later."""
-    from sat_intervals.config import named_files, read_yaml
-
-    return named_files(read_yaml(settings)) if settings and os.path.isfile(settings) else []
 
 
 @dataclass(frozen=True)

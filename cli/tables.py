@@ -1,4 +1,4 @@
-"""Print tables: formatted on a terminal, plain aligned text elsewhere."""
+"""Print tables."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,31 +14,24 @@ if TYPE_CHECKING:
     from sat_intervals.config import Calibration
     from sat_intervals.run.tune import Tuned
 
+# Characters of a line in a file or a pipe: lines are not wrapped.
+_WIDEST = 10_000
 _EXPECTED = ("all", "high", "low", "lowest", "mean width", "median width", "score")
 
 
 def show(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
     """Print a table with labels in the first column and figures in the others."""
-    terminal = Console(highlight=False)
+    terminal = Console(highlight=False, markup=False, emoji=False)
     if not terminal.is_terminal:
-        _show_plainly(header, rows, title)
-        return
-    table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
+        terminal.width = _WIDEST
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     table.add_column(header[0], overflow="fold")
     for name in header[1:]:
-        table.add_column(name.replace(" ", "\n"), justify="right", no_wrap=True)
+        table.add_column(name.replace(" ", "\n") if terminal.is_terminal else name, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
+    terminal.print(title, soft_wrap=True)
     terminal.print(table)
-
-
-def _show_plainly(header: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
-    lines = [header, *rows]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    click.echo(title)
-    for label, *cells in lines:
-        figures = (cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True))
-        click.echo("  ".join([label.ljust(widths[0]), *figures]))
 
 
 def show_groups(rows: Sequence[Row], title: str) -> None:
@@ -87,15 +80,9 @@ def show_scene(scene: SceneMetrics) -> None:
     if report["with_rejected"]:
         rows += _areas(report["with_rejected"], ", with rejected")
     header = [
-        "",
-        "pixels",
-        "accuracy",
-        "relative size",
-        "mean width (px)",
-        "overestimation",
-        "median width (px)",
+        "", "pixels", "accuracy", "relative size", "mean width (px)", "overestimation", "median width (px)",
         "interval score (px)",
-    ]
+    ]  # fmt: skip
     show(header, rows, scene.name)
     if not report["all"]["count"]:
         click.echo("no valid pixel has a known truth: check truth and mask")

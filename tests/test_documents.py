@@ -151,11 +151,14 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+_REPLACES = r"sat-intervals (match .*(?<!--dry-run)$|surface|batch|export|(range|dsm|calibrate) .*--output)"
+
+
 def in_documents(line: str) -> str:
-    """Return a command of a document for the files of `place`; a run replaces that of the command before."""
+    """Return a command of a document for the files of `place`; a command replaces the files of those before."""
     line = re.sub(r"(left|right)\.geom", r"\1_model.tif", line)
     line = line.replace("--row 640", "--row 64").replace("--disparity -60 0", "--disparity -12 40")
-    return f"{line} --overwrite" if re.match(r"sat-intervals (match .*(?<!--dry-run)$|surface|batch)", line) else line
+    return f"{line} --overwrite" if re.match(_REPLACES, line) else line
 
 
 @pytest.mark.process

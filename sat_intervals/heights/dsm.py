@@ -92,10 +92,7 @@ def make_surface(
     tags = surface_tags([run.report["finished"] for run in runs], intervals, choices, resolution, radius)
     tags["HEIGHTS"] = f"above {geoid or 'the WGS 84 ellipsoid'}"
     projection = _projection(runs, crs, geoid)
-    clouds = []
-    for done, run in enumerate(runs):
-        progress("extent", done, len(runs))
-        clouds.append(PointCloud(run, projection, choices))
+    clouds = _clouds(runs, projection, choices, progress)
     cells = _cells(clouds, resolution, radius, grid)
     place = north_up(projection.crs, cells.left, cells.top, cells.resolution)
     writer = OutputWriter(path.parent, [surface_file(path.name)], cells.rows, cells.columns, place, tags)
@@ -108,12 +105,11 @@ def make_surface(
         progress("files", 0, 1)
         writer.publish()
         progress("files", 1, 1)
-    counts = {name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")}
     return {
         "crs": projection.crs,
         "rows": cells.rows,
         "columns": cells.columns,
-        **counts,
+        **{name: sum(getattr(cloud, name) for cloud in clouds) for name in ("points", "outliers", "open")},
         **tally.report(cells.rows * cells.columns),
         "bounds": choices.bounds,
         "calibration": choices.calibration and choices.calibration.name,
@@ -189,6 +185,16 @@ def _grid_of(path: Path, given: str | None) -> tuple[Cells, str]:
     code = place.crs.to_epsg()
     crs = f"EPSG:{code}" if code else place.crs.to_wkt()
     return Cells(place.transform.c, place.transform.f, across, rows, columns), crs
+
+
+def _clouds(
+    runs: Sequence[Run], projection: Projection, choices: SurfaceChoices, progress: Progress
+) -> list[PointCloud]:
+    clouds = []
+    for done, run in enumerate(runs):
+        progress("extent", done, len(runs))
+        clouds.append(PointCloud(run, projection, choices))
+    return clouds
 
 
 def _cells(clouds: Sequence[PointCloud], resolution: float, radius: float, grid: Cells | None) -> Cells:

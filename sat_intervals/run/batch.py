@@ -19,6 +19,7 @@ from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, OutputError, files_of, open_image
 from sat_intervals.raster.identity import check_not_replaced, identifiers
 from sat_intervals.raster.publishing import write_file
+from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, Search, prepare
 from sat_intervals.run.pair import (
     Matched,
@@ -31,7 +32,7 @@ from sat_intervals.run.pair import (
 )
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.run.status import read_report
-from sat_intervals.run.workers import Connection, Workers
+from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
 

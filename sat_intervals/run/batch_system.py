@@ -2,29 +2,19 @@
 
 import logging
 import os
-import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, Status
+from distributed import Status
 
 from sat_intervals.config import Cluster
-from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.run.workers import readers
-
-# Seconds after the last worker of a batch system left, at which a run ends.
-WORKERS_GONE = 300.0
-# Seconds between warnings while a run waits for its first worker.
-_WARN_EVERY = 60.0
 
 # Batch systems with projects instead of accounts.
 _CHARGE_PROJECTS = "lsf", "sge"
-
-LOOPBACK = "127.0.0.1"
-
-_LOG = logging.getLogger(__name__)
 
 
 def batch_system(settings: Cluster, logs: Path) -> Any:
@@ -41,9 +31,8 @@ def batch_system(settings: Cluster, logs: Path) -> Any:
     logged = given.get("log_directory") or own_logs or os.getcwd()
     submitted: set[str] = set()
     refusals: list[str] = []
-    own = {"job_cls": _job_class(base.job_cls, submitted, refusals), "logged": logged}
-    # State of `current_workers`: jobs, errors, and times of the last worker and of the last warning.
-    own |= {"submitted": submitted, "refusals": refusals, "seen": None, "warned": time.monotonic()}
+    own = {"submitted": submitted, "refusals": refusals, "logged": logged}
+    own["job_cls"] = _job_class(base.job_cls, submitted, refusals)
     try:
         return type(base.__name__, (base,), own)(**given, silence_logs=logging.CRITICAL)
     except ValueError as error:  # a setting is neither in the section nor in dask's configuration
@@ -71,7 +60,7 @@ def _given(settings: Cluster, own_logs: str | None, logs: Path) -> dict[str, Any
         options["worker_extra_args"] = [*own, "--nthreads", str(settings.cores + more)]
     given: dict[str, Any] = {name: value for name, value in options.items() if value not in (None, [])}
     if not dask.config.get(f"jobqueue.{settings.kind}.scheduler-options", {}):
-        given["scheduler_options"] = {"dashboard_address": f"{LOOPBACK}:0"}
+        given["scheduler_options"] = {"dashboard_address": "127.0.0.1:0"}
     # With an external store, jobs may not see the folder of the run. Job scripts cannot have spaces.
     if own_logs is None and settings.store is None and not any(map(str.isspace, str(logs.absolute()))):
         given["log_directory"] = str(logs.absolute())
@@ -104,13 +93,7 @@ def _without_seconds(walltime: str | None) -> str | None:
 
 
 def job_script(settings: Cluster, out: Path) -> str:
-    """Return the script of one job of a batch system, without submitting it.
-
-    Raises
-    ------
-    SatIntervalsError
-        The cluster is not a batch system.
-    """
+    """Return the script of one job of a batch system, without submitting it."""
     if settings.kind in ("threads", "processes", "address"):
         raise SatIntervalsError(f"cluster {settings.kind} submits no jobs: give slurm, pbs, lsf or sge")
     new = [folder for folder in (out / "logs", out) if not folder.exists()]  # dask-jobqueue creates them
@@ -122,40 +105,14 @@ def job_script(settings: Cluster, out: Path) -> str:
     return script
 
 
-def current_workers(client: Client) -> dict[str, int]:
-    """Return the addresses and cores of a client's workers.
-
-    Call it every few seconds while waiting: it raises if waiting is useless. There is no time limit for the first
-    worker of a batch system, but a warning every minute.
-
-    Raises
-    ------
-    SatIntervalsError
-        The batch system refused all jobs.
-    RunError
-        The last worker left more than WORKERS_GONE seconds ago.
-    """
-    cores: dict[str, int] = client.nthreads()
-    cluster: Any = client.cluster
-    if not hasattr(cluster, "refusals"):
-        return cores
-    now = time.monotonic()
-    if cores:
-        cluster.seen = now
-    elif cluster.refusals and not cluster.submitted:
+def check_accepted(cluster: Any) -> None:
+    """Raise if the batch system refused all jobs."""
+    if getattr(cluster, "refusals", None) and not cluster.submitted:
         raise SatIntervalsError(
             f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
         )
-    elif cluster.seen is None and now - cluster.warned >= _WARN_EVERY:
-        cluster.warned = now
-        _LOG.warning(
-            "no worker has started yet: jobs wait in the queue of the batch system, or ended early, see their logs in "
-            "%s",
-            cluster.logged,
-        )
-    elif cluster.seen is not None and now - cluster.seen > WORKERS_GONE:
-        raise RunError(
-            f"the last worker ended and none has started for {WORKERS_GONE:.0f} s: see the logs of the jobs in "
-            f"{cluster.logged}; rerun the same command: it resumes"
-        )
-    return cores
+
+
+def logs_of(cluster: Any) -> str:
+    """Return where jobs write their logs, as the end of a message; empty for other clusters."""
+    return f": see the queue, and the logs of the jobs in {cluster.logged}" if hasattr(cluster, "logged") else ""

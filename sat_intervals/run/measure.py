@@ -31,10 +31,11 @@ from sat_intervals.products import INVALID
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, Layer, open_image
 from sat_intervals.run.assemble import scale_of
+from sat_intervals.run.connection import connected
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.pair import check_failures, match_jobs, measure_images
-from sat_intervals.run.workers import Workers, connected
+from sat_intervals.run.workers import Workers
 from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
 

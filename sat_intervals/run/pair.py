@@ -16,11 +16,12 @@ from sat_intervals.progress import Progress, add_seconds, logged_stage
 from sat_intervals.raster import Image
 from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
+from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, prepare
 from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.search_range import search_range
 from sat_intervals.run.tile import match_block, measure_block, trace_block
-from sat_intervals.run.workers import Connection, Task, Workers, check_not_full, reason
+from sat_intervals.run.workers import Task, Workers, check_not_full, reason
 from sat_intervals.store.lock import locked
 from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError, home_of
 from sat_intervals.tiling import Tile, Window

@@ -25,8 +25,9 @@ from sat_intervals.match.search_range import (
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import Image, read_window
+from sat_intervals.run.connection import Connection
 from sat_intervals.run.quality import COLLAR, is_plain
-from sat_intervals.run.workers import Connection, Task, Workers, picklable_errors, reason
+from sat_intervals.run.workers import Task, Workers, picklable_errors, reason
 from sat_intervals.tiling import Grid, Window
 
 _RETRIES = 2

@@ -1,21 +1,19 @@
-"""What runs tasks, behind one small interface: threads of this process, or a dask cluster, imported if needed."""
+"""What runs tasks, behind one small interface: threads of this process, or the workers of a dask cluster."""
 
 import errno
 import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import BoundedSemaphore
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol
 
 from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
-from sat_intervals.store.folder import folder_at
 
 # Seconds after which the caller is asked for more tasks, if no task has ended.
 CHECK_EVERY = 2.0
@@ -26,22 +24,12 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Task:
-    """A call that any worker may make, and may repeat.
+    """A call that any worker may make, and may repeat."""
 
-    Attributes
-    ----------
-    label
-        Identifies the task in its `Outcome`.
-    function, arguments
-        The call.
-    retries
-        How often it is tried again if it raises.
-    """
-
-    label: Any
+    label: Any  # identifies it in its outcome
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
-    retries: int
+    retries: int  # how often it is tried again if it raises
 
 
 class Outcome(NamedTuple):
@@ -53,10 +41,10 @@ class Outcome(NamedTuple):
 
 
 class Workers(Protocol):
-    """Interface of what runs tasks: threads of this process or a dask cluster."""
+    """Interface of what runs tasks."""
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
-        """Run tasks with two in flight per core; yield their outcomes, and None every few seconds without one.
+        """Run tasks, two in flight per core; yield their outcomes, and None every few seconds without one.
 
         None among the tasks means that more are ready once others have ended.
         """
@@ -73,7 +61,7 @@ def readers(settings: Cluster) -> int:
 
 def is_remote(settings: Cluster) -> bool:
     """Return whether tiles are in a bucket or the like."""
-    return settings.store is not None and not folder_at(settings.store).is_local
+    return settings.store is not None and "://" in settings.store and not settings.store.startswith("file://")
 
 
 def computing(settings: Cluster) -> AbstractContextManager[Any]:
@@ -93,6 +81,35 @@ def cores_of_process(settings: Cluster) -> int:
     return 1 if settings.kind in ("processes", "address") else settings.cores
 
 
+def in_flight(
+    tasks: Iterator[Task | None], submit: Callable[[Task], Future[Outcome]], limit: Callable[[], int]
+) -> Iterator[Outcome | None]:
+    """Submit tasks, ``limit()`` at once; yield their outcomes, and None every few seconds without one."""
+    ended: SimpleQueue[Future[Outcome]] = SimpleQueue()
+    futures: set[Future[Outcome]] = set()
+
+    def fill() -> None:
+        while len(futures) < limit() and (task := next(tasks, None)) is not None:
+            future = submit(task)
+            futures.add(future)
+            future.add_done_callback(ended.put)
+
+    try:
+        fill()
+        while futures:
+            try:
+                future = ended.get(timeout=CHECK_EVERY)
+            except Empty:
+                yield None
+            else:
+                futures.remove(future)
+                yield future.result()  # before the next tasks, since it may make others ready
+            fill()
+    finally:
+        for future in futures:
+            future.cancel()
+
+
 class Threads:
     """Threads of this process; kernels and GDAL release Python's lock."""
 
@@ -102,101 +119,34 @@ class Threads:
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
         """See `Workers`."""
-        ended: SimpleQueue[tuple[Task, Future[Any]]] = SimpleQueue()
-        in_flight: set[Future[Any]] = set()
-
-        def fill() -> None:
-            while len(in_flight) < 2 * self._count and (task := next(tasks, None)) is not None:
-                future = self._pool.submit(_tried, task)
-                in_flight.add(future)
-                future.add_done_callback(lambda future, task=task: ended.put((task, future)))  # type: ignore[misc]
-
-        try:
-            fill()
-            while in_flight:
-                try:
-                    task, future = ended.get(timeout=CHECK_EVERY)
-                except Empty:
-                    fill()
-                    yield None
-                    continue
-                in_flight.discard(future)
-                error = future.exception()
-                yield Outcome(task.label, None if error else future.result(), error)
-                fill()
-        finally:
-            for future in in_flight:
-                future.cancel()
+        return in_flight(tasks, lambda task: self._pool.submit(_tried, task), lambda: 2 * self._count)
 
     def close(self) -> None:
         """Wait for the tasks under way; those that have not begun are dropped."""
         self._pool.shutdown(cancel_futures=True)
 
 
-def _tried(task: Task) -> Any:
-    for _ in range(task.retries):
+def _tried(task: Task) -> Outcome:
+    tries = 0
+    while True:
         try:
-            return task.function(*task.arguments)
-        except Exception:
+            return Outcome(task.label, task.function(*task.arguments), None)
+        except Exception as error:
+            tries += 1
+            if tries > task.retries:
+                return Outcome(task.label, None, error)
             _LOG.debug("%s of %s is tried again", task.function.__name__, task.label)
-    return task.function(*task.arguments)
-
-
-@contextmanager
-def connected(settings: Cluster, out: Path) -> Iterator[Workers]:
-    """Start or connect to the workers of the settings; close what was started at the end; see `cluster.connected`."""
-    if settings.kind == "threads":
-        threads = Threads(cores_of_process(settings), readers(settings))
-        try:
-            yield threads
-        finally:
-            threads.close()
-    else:
-        from sat_intervals.run import cluster
-        from sat_intervals.run.submit import DaskWorkers
-
-        with cluster.connected(settings, out) as client:
-            yield DaskWorkers(client)
-
-
-class Connection:
-    """Workers that are started or connected when they are first needed; see `connected`. A context manager."""
-
-    def __init__(self, settings: Cluster, out: Path) -> None:
-        self._settings, self._out = settings, out
-        self._stack = ExitStack()
-        self._workers: Workers | None = None
-
-    def client(self) -> Workers:
-        """Return the workers."""
-        if self._workers is None:
-            self._workers = self._stack.enter_context(connected(self._settings, self._out))
-        return self._workers
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        """Close the workers; `client` connects again."""
-        self._workers = None
-        self._stack.__exit__(*error)
 
 
 def parse_memory(text: str) -> int:
-    """Parse a memory size such as ``4GB``, ``512 MiB`` or ``3e9`` with dask; return bytes.
-
-    Raises
-    ------
-    ConfigError
-        It is not a size, or less than a megabyte: a unit is missing.
-    """
+    """Return the bytes of a memory size such as ``4GB``, ``512 MiB`` or ``3e9``."""
     from dask.utils import parse_bytes
 
     try:
         size = parse_bytes(text) if any(map(str.isdigit, text)) else 0  # dask reads "GB" as 1 GB
     except (ValueError, OverflowError):
         size = 0
-    if size < 1_000_000:
+    if size < 1_000_000:  # a unit is missing
         raise ConfigError(f"memory {text!r}: give a figure with a unit, such as 4GB or 512MiB")
     return size
 

@@ -26,11 +26,12 @@ from sat_intervals.results import open_run
 from sat_intervals.run import batch
 from sat_intervals.run.batch import match_batch
 from sat_intervals.run.checks import fitted_to_jobs
+from sat_intervals.run.connection import connected
 from sat_intervals.run.job import prepare
 from sat_intervals.run.pair import match_jobs, match_pair
 from sat_intervals.run.plan import plan
 from sat_intervals.run.tile import match_block
-from sat_intervals.run.workers import Outcome, connected, parse_memory
+from sat_intervals.run.workers import Outcome, parse_memory
 from sat_intervals.store.lock import locked
 
 
