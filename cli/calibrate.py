@@ -10,7 +10,7 @@ import click
 from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
 from sat_intervals.cli.calibration_files import check_output, write
 from sat_intervals.cli.judging import tolerance_option
-from sat_intervals.cli.matching import SettingsArguments, named_by, settings_options
+from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
     SurfaceAndReference,
@@ -110,12 +110,14 @@ def calibrate(
         raise click.UsageError(_OPTIONS_OF_OTHERS)
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
+    from sat_intervals.config import named_files, read_yaml
     from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.calibrate import calibration_from, check_subjects
     from sat_intervals.run.measure import measure_subjects
 
     subjects = _subjects(pairs, truth, _Judging(settings, **judging))
-    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file, *named_by(settings.file)], [output])
+    named = named_files(read_yaml(settings.file)) if settings.file else []
+    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file, *named], [output])
     check_output(output, overwrite=overwrite)
     folder = output.absolute().parent
     check_subjects(subjects)

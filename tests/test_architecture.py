@@ -41,7 +41,6 @@ HOMES = {
     "scipy": "heights",
     "shapely": "heights",
     "shareloc": "heights",
-    "zarr": "store",
 }
 
 # Without docstrings. Callbacks of click commands are exempt from the limit of parameters: they have one per option.
@@ -54,7 +53,7 @@ OVER_THE_LIMITS = {
 LAWS = {
     "./architecture", "./documents", "./package", "./release", "cli/commands", "cli/coverage", "cli/messages",
     "interop/otb", "match/accuracy", "match/pandora", "raster/raster", "run/damage", "run/kept_files", "run/survival",
-    "run/waits", "show/pictures",
+    "run/waits", "show/pictures", "store/remote",
 }  # fmt: skip
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())

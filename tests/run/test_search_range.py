@@ -7,17 +7,16 @@ import json
 import numpy as np
 import pytest
 import rasterio
-from helpers import PLACE, bands, flip_bit, invoke, write_pair
+from helpers import PLACE, bands, invoke, write_pair
 from matplotlib.image import imread
 from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
-from sat_intervals.products import BANDS
-from sat_intervals.raster import MARK, File, OutputWriter, write_layer
+from sat_intervals.raster import write_layer
 from sat_intervals.results import open_results
-from sat_intervals.run import local_ranges, schedule, search_range
 from sat_intervals.run import pair as run_pair
+from sat_intervals.run import schedule
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.run.pair import prepare
 from sat_intervals.show.report.contents import Pixels
@@ -116,63 +115,12 @@ def test_read_ranges__takes_the_hull_of_a_cell_rounded_outwards(folder, tmp_path
         read_ranges(str(file), left)
 
 
-def test_read_ranges__ends_where_the_raster_is_replaced_meanwhile(folder, tmp_path, monkeypatch):
-    left, file = open_image(folder / "left.tif"), tmp_path / "ranges.tif"
-    write_bands(file, np.full((130, 300), -3), np.full((130, 300), 4))
-    row_of_cells = local_ranges._row_of_cells
-
-    def replaced_before(images, window):
-        write_bands(tmp_path / "new.tif", np.full((130, 300), -9), np.full((130, 300), -4))
-        (tmp_path / "new.tif").replace(file)
-        return row_of_cells(images, window)
-
-    monkeypatch.setattr(local_ranges, "_row_of_cells", replaced_before)
-    with pytest.raises(RunError, match=r"ranges.tif was replaced or changed while it was read"):
-        read_ranges(str(file), left)
-
-
-def test_range__keeps_a_raster_of_another_pair_that_appears_meanwhile(folder, tmp_path, monkeypatch):
-    images, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "ranges.tif"
-    assert invoke("range", *images[::-1], "--output", tmp_path / "other.tif").exit_code == 0
-    there, find = (tmp_path / "other.tif").read_bytes(), search_range.find_here
-
-    def appears_before(*arguments):
-        (tmp_path / "other.tif").rename(file)
-        return find(*arguments)
-
-    monkeypatch.setattr(search_range, "find_here", appears_before)
-    result = invoke("range", *images, "--output", file)
-    assert "ranges.tif is not of this run, or was changed since it started: move it away" in result.stderr
-    assert (result.exit_code, file.read_bytes()) == (2, there)
-
-
-def test_range__writes_a_raster_whose_damage_is_noticed(folder, tmp_path):
+def test_range__writes_a_cloud_optimized_raster(folder, tmp_path):
     pair, file = (folder / "left.tif", folder / "right.tif"), tmp_path / "ranges.tif"
     assert invoke("range", *pair, "--output", file).exit_code == 0
     assert cog_validate(file, strict=True) == (True, [], [])
     with rasterio.open(file) as dataset:
         assert dataset.descriptions == ("minimum", "maximum")
-    assert invoke("range", *pair, "--output", file).exit_code == 0  # replaces its own
-    flip_bit(file)
-    damaged = file.read_bytes()
-    written = invoke("range", *pair, "--output", file)
-    assert f"{file} was changed since sat-intervals made it" in written.stderr
-    read = invoke("match", *pair, tmp_path / "out", "--range-grid", file)
-    assert f"{file} is damaged or was changed: its CRC-32 is" in read.stderr
-    assert (written.exit_code, read.exit_code, file.read_bytes()) == (2, 2, damaged)
-
-
-def test_range__writes_no_raster_beside_a_mask_that_appears_meanwhile(folder, tmp_path, monkeypatch):
-    find = search_range.find_here
-
-    def appears_before(*arguments):
-        (tmp_path / "ranges.tif.msk").write_text("mine")
-        return find(*arguments)
-
-    monkeypatch.setattr(search_range, "find_here", appears_before)
-    result = invoke("range", folder / "left.tif", folder / "right.tif", "--output", tmp_path / "ranges.tif")
-    assert "ranges.tif.msk changes what is read from" in result.stderr
-    assert (result.exit_code, [file.name for file in tmp_path.iterdir()]) == (2, ["ranges.tif.msk"])
 
 
 def test_match__warns_of_ranges_of_another_left_image(folder, tmp_path):
@@ -218,26 +166,8 @@ def test_range__keeps_inputs_and_files_of_others(folder, tmp_path):
     assert images[1].read_bytes() == before
     write_bands(tmp_path / "other.tif", *np.zeros((2, 130, 300)))
     result = invoke("range", *images, "--output", tmp_path / "other.tif")
-    assert result.exit_code == 2
-    assert "was not made by sat-intervals" in result.stderr
-    with OutputWriter(tmp_path, [File("disparity.tif", "float32", None, BANDS[:2])], 9, 9, PLACE, MARK) as writer:
-        writer.write(0, np.zeros((2, 9, 9)))
-        writer.publish()  # as export --to otb
-    before = (tmp_path / "disparity.tif").read_bytes()
-    result = invoke("range", *images, "--output", tmp_path / "disparity.tif")
-    assert result.exit_code == 2
-    assert "disparity.tif exists and was not made by sat-intervals range, or by an earlier version" in result.stderr
-    assert (tmp_path / "disparity.tif").read_bytes() == before
-    for _ in range(2):
-        assert invoke("range", *images, "--output", tmp_path / "range.tif").exit_code == 0
-
-
-def test_range__writes_nothing_beside_a_file_that_would_change_its_ranges(folder, tmp_path):
-    beside = tmp_path / "range.tif.aux.xml"
-    beside.write_text('<PAMDataset><PAMRasterBand band="1"><NoDataValue>-8</NoDataValue></PAMRasterBand></PAMDataset>')
-    result = invoke("range", folder / "left.tif", folder / "right.tif", "--output", tmp_path / "range.tif")
-    assert (result.exit_code, "range.tif.aux.xml changes what is read from" in result.stderr) == (2, True)
-    assert list(tmp_path.iterdir()) == [beside]
+    assert (result.exit_code, "other.tif exists: choose another name" in result.stderr) == (2, True)
+    assert invoke("range", *images, "--output", tmp_path / "other.tif", "--overwrite").exit_code == 0
 
 
 def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
