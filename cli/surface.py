@@ -57,8 +57,8 @@ def surface(
     with Console(run.quiet or as_json) as console:
         from sat_intervals.config import resolved
 
-        _check_kept(out, cells, [*sensor_files, *pair.files], settings.file)
         _check(cells, sensor_files, resolved(config).interval)
+        _check_kept(out, cells, [*sensor_files, *pair.files], settings.file)
         left, right = pair.open()
         report = run.match(left, right, out, config, window=pair.window, progress=console.progress)
         points, made = _points_and_surface(out, sensor_files, cells, console)
@@ -80,8 +80,8 @@ def _check_kept(
     from sat_intervals.run.state import OUTPUTS
 
     results = [out / name for name in (*OUTPUTS, *_FILES)]
-    rasters = [str(name) for name in (cells["geoid"], cells["resolution"]) if isinstance(name, (str, Path))]
-    read = [file for name in rasters for file in files_of(name)]
+    grid = cells["resolution"]
+    read = [cells["geoid"], *(files_of(str(grid)) if isinstance(grid, (str, Path)) else ())]
     check_not_replaced([config, *sensor_files, *read], results, [out / "tiles"])
 
 

@@ -20,7 +20,8 @@ from helpers import COMMAND, hashes, wait_until
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError
-from sat_intervals.run.batch_system import current_workers, job_script
+from sat_intervals.run.batch_system import job_script
+from sat_intervals.run.submit import DaskWorkers
 
 
 @contextmanager
@@ -36,7 +37,7 @@ def submitted(
 ):
     """``match --cluster slurm`` with one job, under a user's ``own`` dask configuration; ``programs`` come first.
 
-    ``constants`` are those of `run.batch_system`; where it ends well and ``is_quiet`` it must say nothing.
+    ``constants`` are those of `run.submit`; where it ends well and ``is_quiet`` it must say nothing.
     """
     settings = yaml.safe_load((pair / "settings.yaml").read_text())
     folder.mkdir(exist_ok=True)
@@ -47,8 +48,8 @@ def submitted(
         "JOBQUEUE__SLURM__LOCAL_DIRECTORY": str(folder),
         "DISTRIBUTED__DEPLOY__LOST_WORKER_TIMEOUT": "2s",
     } | (own or {})
-    code = "from sat_intervals import cli; from sat_intervals.run import batch_system; "
-    code += f"vars(batch_system).update({constants or {}}); cli.main()"
+    code = "from sat_intervals import cli; from sat_intervals.run import submit; "
+    code += f"vars(submit).update({constants or {}}); cli.main()"
     command = [sys.executable, "-c", code, "match", pair / "left.tif", pair / "right.tif", folder / "out"]
     command += ["--config", folder / "settings.yaml", "--cluster", "slurm", "--quiet"]
     with (folder / "log").open("w") as log:
@@ -191,7 +192,7 @@ def test_match__waits_for_the_first_worker_and_says_so(slurm, pair, tmp_path):
         pass
     lines = (tmp_path / "log").read_text().splitlines()
     assert 1 <= len(lines) <= 20
-    assert all("no worker has started yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
+    assert all("there is no worker yet" in line and str(tmp_path / "out" / "logs") in line for line in lines)
     assert_complete(pair, tmp_path / "out")
 
 
@@ -210,26 +211,24 @@ def test_match__ends_when_the_last_worker_has_gone_and_goes_on_after(slurm, pair
     assert_complete(pair, tmp_path / "out")
 
 
-def test_current_workers__says_once_a_minute_that_no_worker_has_come_and_ends_minutes_after_the_last(
-    monkeypatch, caplog
-):
+def test_outcomes__warn_once_a_minute_while_there_is_no_worker_and_end_minutes_after_the_last(monkeypatch, caplog):
     seconds, cores = [0.0], {}
     monkeypatch.setattr(time, "monotonic", lambda: seconds[0])
-    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs", seen=None, warned=0.0)
-    client = SimpleNamespace(cluster=system, nthreads=lambda: cores)
-    for seconds[0] in range(0, 3600, 2):
-        assert current_workers(client) == {}
-    assert len(caplog.messages) == 59
+    system = SimpleNamespace(refusals=[], submitted={"1"}, logged="/logs")
+    workers = DaskWorkers(SimpleNamespace(cluster=system, nthreads=lambda: dict(cores)))
+    for seconds[0] in range(0, 3600, 4):
+        assert workers._limit() == 2
+    assert 55 <= len(caplog.messages) <= 60
     assert "/logs" in caplog.messages[0]
     cores["one"] = 2
-    assert sum(current_workers(client).values()) == 2
+    seconds[0] += 4
+    assert workers._limit() == 4
     cores.clear()
-    seconds[0] += 300
-    assert current_workers(client) == {}
-    seconds[0] += 1
+    seconds[0] += 299
+    workers._limit()
+    seconds[0] += 4
     with pytest.raises(RunError, match=r"none has started for 300 s: .* /logs; rerun the same command"):
-        current_workers(client)
-    assert len(caplog.messages) == 59
+        workers._limit()
 
 
 def test_match__ends_when_the_batch_system_takes_no_job(slurm, pair, tmp_path):

@@ -48,12 +48,13 @@ def test_match_pair__an_interrupted_run_keeps_its_range(folder, tmp_path, monkey
     monkeypatch.setattr(run_pair, "match_jobs", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         run(folder, tmp_path)
-    stored = json.loads((tmp_path / "tiles/range.json").read_text())["found"]
+    with np.load(tmp_path / "tiles/once/range.npz") as file:
+        stored = json.loads(file["meta"])["found"]
     monkeypatch.undo()
     monkeypatch.setattr(run_pair, "search_range", lambda *_: pytest.fail("searched again"))
     report = run(folder, tmp_path)
     assert report["search"]["minimum"] == stored["minimum"]
-    assert not (tmp_path / "tiles").exists() or not list((tmp_path / "tiles").glob("*.json"))
+    assert not (tmp_path / "tiles").exists()
 
 
 def test_prepare__a_range_to_be_found_needs_a_search(folder, tmp_path):

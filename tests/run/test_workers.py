@@ -13,7 +13,8 @@ from sat_intervals import match_pair
 from sat_intervals.config import Cluster
 from sat_intervals.demo import make_scene
 from sat_intervals.run import cluster, source, tile, workers
-from sat_intervals.run.workers import Task, Threads, connected
+from sat_intervals.run.connection import connected
+from sat_intervals.run.workers import Task, Threads
 
 
 def test_threads__yield_every_outcome_and_try_again():
