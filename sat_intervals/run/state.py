@@ -107,4 +107,4 @@ def _other_run(report: Mapping[str, Any], manifest: Mapping[str, Any], settings:
     before = {"settings": kept, "inputs": report["inputs"], "region": report["tiles"].get("region")}
     now = {"settings": settings, "inputs": manifest["inputs"], "region": manifest["region"]}
     changes = list(differences(before, json.loads(json.dumps(now))))
-    return f"another run: {'; '.join(changes)}" if changes else "a run of another version"
+    return f"another run: {'; '.join(changes)}" if changes else "a run of other local ranges or of another version"
