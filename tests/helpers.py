@@ -32,7 +32,6 @@ PLACE = north_up(32631, 300_000, 4_800_000, 0.5)
 PATIENCE = 150.0
 VRT = """<VRTDataset rasterXSize="100" rasterYSize="80"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
 <SourceFilename relativeToVRT="1">mask.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
-NODATA = '<PAMDataset><PAMRasterBand band="1"><NoDataValue>7</NoDataValue></PAMRasterBand></PAMDataset>'
 STATISTICS = (
     '<PAMDataset><PAMRasterBand band="1"><Metadata><MDI key="STATISTICS_MEAN">7</MDI></Metadata></PAMRasterBand>'
     "</PAMDataset>"
@@ -97,13 +96,6 @@ def shares_that_differ(one, other):
     either_valid = (flags & INVALID == 0) | (other_flags & INVALID == 0)
     differs = (first != second) & ~(np.isnan(first) & np.isnan(second)) & either_valid
     return differs[0].sum() / either_valid.sum(), (differs[1] | differs[2]).sum() / either_valid.sum()
-
-
-def flip_bit(path):
-    """Flip a bit in the middle of a file."""
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
 
 
 def refused(arguments, *parts):

@@ -209,7 +209,12 @@ def test_match_batch__does_not_take_a_result_for_that_of_other_ranges(images, tm
         return match_batch(pairs, tmp_path / "out", {"disparity": {"grid": str(file)}})["pair1"]
 
     assert [states(minimum)["state"] for minimum in (-4, -4, -6)] == ["done", "done before", "failed"]
-    assert "already holds" in states(-6)["error"]
+    assert "already holds another run: settings.disparity.minimum was -4, now -6" in states(-6)["error"]
+    write_ranges(file, images / "left1.tif", -4)
+    with rasterio.open(file, "r+") as dataset:
+        dataset.write(np.full((1, 64, 64), -2, np.int16), [1], window=((0, 64), (0, 64)))  # the hull is the same
+    report = match_batch(pairs, tmp_path / "out", {"disparity": {"grid": str(file)}})
+    assert "already holds a run of other local ranges or of another version" in report["pair1"]["error"]
 
 
 def test_match_batch__knows_its_results_again_where_tiles_had_to_be_smaller(images, tmp_path):
@@ -308,6 +313,23 @@ def test_match_batch__goes_on_with_the_others_where_a_store_is_damaged(images, t
         assert (tiles / "tiles" / "0_1.npz").stat().st_mtime_ns == kept
     assert states == {"pair1": "done", "pair2": "done"}
     assert hashes(tmp_path / "pair1") == before
+
+
+def test_match_batch__on_an_unfinished_folder_does_only_what_is_missing(images, tmp_path):
+    def tiles():
+        return {file: file.stat().st_mtime_ns for file in tmp_path.glob("*/tiles/tiles/*.npz")}
+
+    pairs, settings = read_batch(rows(images)), {"tiles": {"size": 64, "overlap": 20}}
+    first = match_batch(pairs, tmp_path, settings, keep_tiles=True)
+    before, done = hashes(tmp_path / "pair2"), tiles()
+    (tmp_path / "pair2" / "run.json").unlink()
+    again = match_batch(pairs, tmp_path, settings, keep_tiles=True)
+    assert {name: end["state"] for name, end in again.items()} == {"pair1": "done before", "pair2": "done"}
+    assert (tiles(), hashes(tmp_path / "pair2")) == (done, before)
+    last = match_batch(pairs, tmp_path, settings)
+    assert {end["state"] for end in last.values()} == {"done before"}
+    assert [end["counts"] for end in last.values()] == [end["counts"] for end in first.values()]
+    assert not list(tmp_path.glob("*/tiles"))
 
 
 def test_status__of_a_batch_goes_on_after_a_pair_without_a_run(images, tmp_path):

@@ -17,6 +17,7 @@ from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.demo import make_scene
+from sat_intervals.errors import ChangedInputError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.match import measurement
 from sat_intervals.raster import OutputError, write_layer
@@ -26,6 +27,7 @@ from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
 from sat_intervals.run.tune import Tuned, best_of, candidates
 from sat_intervals.store.manifest import StoreError
+from sat_intervals.store.tiles import Store
 
 
 @pytest.fixture(scope="module")
@@ -79,11 +81,11 @@ def test_calibrate__the_file_says_what_to_expect(scene):
 @pytest.mark.process
 def test_calibrate__workers_do_not_change_a_byte(scene, tmp_path):
     one = calibrated(scene, tmp_path / "one.yaml", "--tile-size", 64, "--workers", 1)
-    said = invoke("calibrate", scene, "--output", tmp_path / "one.yaml", "--name", "one", "--tile-size", 64).output
+    said = invoke("calibrate", scene, "--output", tmp_path / "four.yaml", "--name", "one", "--tile-size", 64).output
     assert (begun(said, "matching at levels"), begun(said, "matching tiles")) == (1, 0)
     assert one == calibrated(scene, tmp_path / "two.yaml", "--tile-size", 64, "--workers", 2)
     assert one == calibrated(scene, tmp_path / "processes.yaml", "--tile-size", 64, "--cluster", "processes")
-    assert len(list(tmp_path.iterdir())) == 3  # no tiles are left
+    assert len(list(tmp_path.iterdir())) == 4  # no tiles are left
 
 
 def test_calibrate__a_finished_run_equals_its_pair(scene, tmp_path):
@@ -173,6 +175,34 @@ def test_measure_subjects__deletes_the_tiles_of_a_killed_calibration(scene, tmp_
     left.rename(tmp_path / ".calibrate")
     measure_subjects(subjects, tmp_path, lambda stage, done, total: None)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_measure_subjects__ends_where_an_image_changes(scene, tmp_path):
+    pair = copytree(scene, tmp_path / "pair")
+    subjects = _subjects((pair,), (), _Judging(SettingsArguments(None, {}), 0.0, False, False))
+
+    def change(stage, done, total):
+        if stage == "tiles":
+            with rasterio.open(pair / "left.tif", "r+") as file:
+                file.write(np.ones(file.shape, file.dtypes[0]), 1)
+
+    with pytest.raises(ChangedInputError, match=r"left\.tif was changed during the run \(left\.\w+ was"):
+        measure_subjects(subjects, tmp_path, change)
+    assert list(tmp_path.iterdir()) == [pair]
+
+
+def test_calibrate__takes_over_tiles_that_a_killed_one_left_in_a_store(scene, tmp_path, monkeypatch):
+    store = "--store", tmp_path / "store"
+    whole = calibrated(scene, tmp_path / "whole.yaml", *store)
+    with monkeypatch.context() as killed:
+        killed.setattr(Store, "remove", lambda store, kinds=(): None)
+        assert calibrated(scene, tmp_path / "killed.yaml", *store) == whole
+    damaged = next((tmp_path / "store").glob("*/tiles/*.npz"))
+    damaged.write_bytes(damaged.read_bytes()[:-9])
+    result = invoke("calibrate", scene, "--output", tmp_path / "again.yaml", "--name", "one", *store, "-q")
+    assert (result.exit_code, "are damaged or missing: rerun the same command" in result.stderr) == (1, True)
+    assert calibrated(scene, tmp_path / "again.yaml", *store) == whole
+    assert not list((tmp_path / "store").iterdir())
 
 
 def off(folder):

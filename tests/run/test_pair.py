@@ -238,6 +238,21 @@ def test_match_pair__goes_on_from_the_tiles_that_are_done(pair, tmp_path, monkey
     assert hashes(tmp_path / "undisturbed") == hashes(tmp_path / "out")
 
 
+def test_match_pair__names_what_differs_from_the_tiles_elsewhere_and_removes_them(pair, tmp_path):
+    left, right, settings = pair
+    store, out = tmp_path / "store", tmp_path / "out"
+    settings = in_tiles(settings, 64) | {"cluster": {"store": str(store)}}
+    match_pair(left, right, out, settings, keep_tiles=True)
+    (place,) = store.iterdir()
+    (out / "run.json").unlink()
+    other = settings | {"sgm": {"p1": 7, "p2": 32}}
+    with pytest.raises(SatIntervalsError, match=r"holds the tiles of another run: .*settings\.sgm\.p1 was 8, now 7"):
+        match_pair(left, right, out, other)
+    assert list(store.iterdir()) == [place]
+    match_pair(left, right, out, other, overwrite=True)
+    assert not list(store.iterdir())
+
+
 def test_digest__tells_what_differences_tell(tmp_path):
     manifest = {"settings": {"p": 1}, "inputs": {"left": {"sha256": "a", "modified": "today"}, "files": [{"bytes": 3}]}}
     later = {"inputs": {"files": [{"bytes": 3}], "left": {"modified": "now", "sha256": "a"}}, "settings": {"p": 1}}

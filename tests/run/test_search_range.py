@@ -48,8 +48,8 @@ def test_match_pair__an_interrupted_run_keeps_its_range(folder, tmp_path, monkey
     monkeypatch.setattr(run_pair, "match_jobs", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         run(folder, tmp_path)
-    with np.load(tmp_path / "tiles/once/range.npz") as file:
-        stored = json.loads(file["meta"])["found"]
+    with np.load(tmp_path / "tiles/once/range.npz") as kept:
+        stored = json.loads(kept["meta"])["found"]
     monkeypatch.undo()
     monkeypatch.setattr(run_pair, "search_range", lambda *_: pytest.fail("searched again"))
     report = run(folder, tmp_path)

@@ -304,6 +304,47 @@ def test_begin__refuses_a_disk_without_room_for_tiles_parts_and_files(tmp_path, 
     replace(job, has_files=False).begin()
 
 
+def test_begin__counts_missing_tiles_only(tall, tmp_path, monkeypatch):
+    folder, settings = tall
+    job = prepare(folder / "left.tif", folder / "right.tif", with_tiles(tall, tmp_path / "out"), settings)
+    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=0))
+    assert job.begin()
+    needed = []
+    for tile in job.store.grid:
+        job.store.delete("tiles", [tile.name])
+        with pytest.raises(OutputError, match=r"has 0\.0 MB free, tiles, files and their parts may need") as refused:
+            job.begin()
+        needed.append(float(str(refused.value).partition("may need ")[2].partition(" MB")[0]))
+    assert len(needed) == 5
+    np.testing.assert_allclose(np.diff(needed), (needed[-1] - needed[0]) / 4, atol=0.1)
+    assert needed[0] < 0.6 * needed[-1]
+
+
+def test_match_pair__cleans_up_on_a_full_disk(tall, tmp_path, monkeypatch):
+    def stop(*arguments, **options):
+        raise KeyboardInterrupt
+
+    out = with_tiles(tall, tmp_path / "out")
+    with monkeypatch.context() as patch:
+        patch.setattr(assemble, "end_tiles", stop)
+        with pytest.raises(KeyboardInterrupt):
+            matched(tall, out)
+    assert (out / "tiles").exists()
+    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=0))
+    matched(tall, out)
+    assert sorted(path.name for path in out.iterdir()) == [LOCK, *OUTPUTS]
+
+
+def test_end_tiles__that_fails_does_not_fail_the_run(tall, tmp_path, monkeypatch, caplog):
+    def unreachable(out):
+        raise OSError(errno.EIO, "unreachable")
+
+    monkeypatch.setattr(assemble, "remove_tiles", unreachable)
+    matched(tall, tmp_path / "out")
+    assert "tiles of the complete run stay: [Errno 5] unreachable" in caplog.text
+    assert hashes(tmp_path / "out") == hashes(tall[0] / "kept")
+
+
 def test_status__counts_strips(tall, tmp_path, monkeypatch):
     out = with_tiles(tall, tmp_path / "out")
     finish = strips.finish_strip
