@@ -1,5 +1,6 @@
 """``sat-intervals calibrate``: find the levels that reach a coverage, on pairs with known truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -110,14 +111,11 @@ def calibrate(
         raise click.UsageError(_OPTIONS_OF_OTHERS)
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
-    from sat_intervals.config import named_files, read_yaml
-    from sat_intervals.raster.identity import check_not_replaced
     from sat_intervals.run.calibrate import calibration_from, check_subjects
     from sat_intervals.run.measure import measure_subjects
 
     subjects = _subjects(pairs, truth, _Judging(settings, **judging))
-    named = named_files(read_yaml(settings.file)) if settings.file else []
-    check_not_replaced([*_inputs(subjects, pairs), *truth, settings.file, *named], [output])
+    _check_kept(settings, [*_inputs(subjects, pairs), *truth], output)
     check_output(output, overwrite=overwrite)
     folder = output.absolute().parent
     check_subjects(subjects)
@@ -133,6 +131,15 @@ def calibrate(
     elif not quiet:
         show_calibration(calibration, expected)
         click.echo(str(output))
+
+
+def _check_kept(settings: SettingsArguments, read: Sequence[str | Path], output: Path) -> None:
+    """Raise if the output is an input, or a file that the settings name."""
+    from sat_intervals.config import named_files, read_yaml
+    from sat_intervals.raster.identity import check_not_replaced
+
+    named = named_files(read_yaml(settings.file)) if settings.file else []
+    check_not_replaced([*read, settings.file, *named], [output])
 
 
 @dataclass(frozen=True)

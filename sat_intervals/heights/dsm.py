@@ -82,9 +82,8 @@ def make_surface(
         A run has no points, the CRS or the grid cannot be used, or the file cannot be written.
     """
     path, geoid = Path(path), None if geoid is None else Path(geoid)
-    like = resolution
+    given = [geoid, *(files_of(str(resolution)) if isinstance(resolution, Path) and resolution.exists() else ())]
     grid, resolution, crs, radius = checked_cells(resolution, crs, radius, geoid)
-    given = [geoid, *(files_of(str(like)) if isinstance(like, Path) else ())]
     runs = triangulated(outs)
     for run in runs:
         run.check_kept([path], [run.out / "points.tif", *given])

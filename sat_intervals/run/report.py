@@ -67,6 +67,13 @@ def _counts(config: Config, parts: Iterable[Mapping[str, Any]]) -> dict[str, Any
     return tally.report()
 
 
+def _add_seconds(seconds: dict[str, float], tables: Tables) -> None:
+    """Add the seconds of all tiles by stage, and the total."""
+    for stage in ("read", "match", "write"):
+        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in tables.records.values())
+    seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
+
+
 def report_of(
     job: Job,
     tables: Tables,
@@ -77,9 +84,7 @@ def report_of(
     """Return the content of run.json."""
     grid = job.store.grid
     config = job.config
-    for stage in ("read", "match", "write"):
-        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in tables.records.values())
-    seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
+    _add_seconds(seconds, tables)
     statistics = job.statistics()
     counts = _counts(config, parts)
     quality = quality_of(job, tables.records)

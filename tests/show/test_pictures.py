@@ -1,7 +1,6 @@
 """Pictures are written for any results: of the right size, not blank, with the right content."""
 
 import json
-import os
 import re
 import shutil
 import sys
@@ -37,7 +36,7 @@ from sat_intervals.products import (
     REGULARIZED,
     Bands,
 )
-from sat_intervals.raster import RUN_FILES, OutputWriter, open_image, read_layers, surface_file, write_layer
+from sat_intervals.raster import RUN_FILES, OutputWriter, read_layers, surface_file, write_layer
 from sat_intervals.results import open_results
 from sat_intervals.show import maps
 from sat_intervals.show.canvas import widest
@@ -482,10 +481,6 @@ def test_open_results__says_what_is_not_a_finished_run(tmp_path):
         (["inputs"], None),
         (["inputs"], {}),
         (["inputs"], []),
-        (["inputs", "left", "mask"], {}),
-        (["inputs", "left", "nodata"], "x"),
-        (["inputs", "right", "height"], "x"),
-        (["inputs", "right", "path"], 3),
         (["tiles", "region", "height"], "x"),
         (["tiles", "region", "row"], 0.5),
         (["settings"], 3),
@@ -507,7 +502,7 @@ def test_open_results__refuses_what_is_no_report(tmp_path):
     out = write_run(tmp_path, *random_bands(4, 5))
     for content in (b'{"\xff": 1}', b"[]", b"3", b"{"):
         (out / "run.json").write_bytes(content)
-        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: move it away and"):
+        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: match again"):
             open_results(out)
 
 
@@ -517,15 +512,17 @@ def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
     report = json.loads((out / "run.json").read_text())
     report["tiles"]["region"]["height"] = 99999
     (out / "run.json").write_text(json.dumps(report))
-    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 of 99999 x 5: move"):
+    with pytest.raises(
+        SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 bands of 99999 x 5: match"
+    ):
         open_results(out)
     write_run(tmp_path, bands, validity)
     write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)
-    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of .* run.json says 4 of 4 x 5"):
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 1 bands of .* run.json says 4 bands of 4 x 5"):
         open_results(out)
     write_run(tmp_path, bands, validity)
     (out / "validity.tif").unlink()
-    with pytest.raises(SatIntervalsError, match=r"validity.tif is missing: "):
+    with pytest.raises(SatIntervalsError, match=r"validity.tif: no such file: give"):
         open_results(out)
 
 
@@ -538,24 +535,6 @@ def test_open_results__refuses_other_images_than_those_of_the_run(tmp_path):
     write_layer(tmp_path / "left.tif", np.ones((41, 50), np.uint16), 0, PLACE)
     with pytest.raises(SatIntervalsError, match="41 x 50 pixels, but had 40 x 50 when it was matched"):
         open_results(out)
-
-
-@pytest.mark.parametrize("name", ["right.tif", "mask.tif"])
-def test_open_results__refuses_other_pixels_than_those_of_the_run(tmp_path, name):
-    random = np.random.default_rng(0)
-    for image, largest in (("left", 99), ("right", 99), ("mask", 1)):
-        write_layer(tmp_path / f"{image}.tif", random.integers(0, largest, (40, 50)).astype(np.uint16), 99, PLACE)
-    right = open_image(tmp_path / "right.tif", mask=tmp_path / "mask.tif")
-    match_pair(tmp_path / "left.tif", right, tmp_path / "out", {"disparity": {"minimum": -3, "maximum": 3}})
-    file, kept = tmp_path / name, (tmp_path / name).read_bytes()
-    os.utime(file, (0, 0))
-    open_results(tmp_path / "out")  # the same file, copied
-    write_layer(file, np.ones((40, 50), np.uint16), 0, PLACE)
-    with pytest.raises(SatIntervalsError, match=f"{name} has changed since it was matched: restore it"):
-        open_results(tmp_path / "out")
-    file.write_bytes(kept[:-1] + b"x")  # of the same size
-    with pytest.raises(SatIntervalsError, match=f"{name} has changed since it was matched: restore it"):
-        open_results(tmp_path / "out")
 
 
 def test_classify__takes_the_first_reason():
