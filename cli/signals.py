@@ -52,7 +52,7 @@ def armed() -> Iterator[None]:
 def _end(number: int, frame: Any) -> None:
     for other in _WORDS:
         signal.signal(other, signal.SIG_DFL)
-    logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # about unfinished tasks of zarr and dask
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # about unfinished tasks of dask
     _received.append(Ended(number))
     raise _received[0]
 

@@ -872,7 +872,7 @@ def test_help__tells_every_option(name):
 
 def test_help__waits_for_no_library():
     """What makes a command slow to start: none of it is imported for help, or to refuse an argument."""
-    slow = {"numba", "dask", "distributed", "rasterio", "xarray", "zarr", "pydantic", "numpy", "rich"}
+    slow = {"numba", "dask", "distributed", "rasterio", "xarray", "pydantic", "numpy", "rich"}
     code = (
         "import sys\nfrom sat_intervals.cli import main\n"
         "for arguments in (['--help'], ['match', '--help'], ['match', 'left']):\n"

@@ -502,7 +502,7 @@ def test_open_results__refuses_what_is_no_report(tmp_path):
     out = write_run(tmp_path, *random_bands(4, 5))
     for content in (b'{"\xff": 1}', b"[]", b"3", b"{"):
         (out / "run.json").write_bytes(content)
-        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run: match again"):
+        with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run.*: match again"):
             open_results(out)
 
 
@@ -513,7 +513,7 @@ def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
     report["tiles"]["region"]["height"] = 99999
     (out / "run.json").write_text(json.dumps(report))
     with pytest.raises(
-        SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 bands of 99999 x 5: match"
+        SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 bands of 99999 x 5"
     ):
         open_results(out)
     write_run(tmp_path, bands, validity)
