@@ -5,7 +5,7 @@ import sys
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 
-from sat_intervals.run.schedule import Schedule, Step
+from sat_intervals.match.schedule import Schedule, Step
 from sat_intervals.tiling import Grid, Window
 
 mpl.use("Agg")

@@ -49,32 +49,7 @@ def assemble(
     overwrite: bool,
     keep_tiles: bool,
 ) -> dict[str, Any]:
-    """Write and publish the files of a run whose tiles are done; return the content of ``run.json``.
-
-    Parameters
-    ----------
-    job
-        The pair.
-    client
-        Returns the workers.
-    seconds
-        Times of earlier stages; those of this one are added.
-    progress
-        Called after each strip.
-    overwrite
-        Whether files of another run may be replaced.
-    keep_tiles
-        Whether the tiles are kept.
-
-    Raises
-    ------
-    DamagedTilesError
-        Tiles must be matched, or strips finished again.
-    RunError
-        A strip failed, a file cannot be written, or an input has changed.
-    SatIntervalsError
-        No pixel could be matched, or a file would be replaced.
-    """
+    """Write and publish the files of a run whose tiles are done; return the content of ``run.json``."""
     region, tables = job.store.grid.region, job.store.tables()
     scale = scale_of(job, tables)
     with logged_stage(seconds, "bands"):

@@ -53,34 +53,12 @@ def match_batch(
     progress: Progress = lambda stage, done, total: None,
     finish: Finish = lambda pair, ended: {},
 ) -> dict[str, dict[str, Any]]:
-    """Match many pairs; a failed pair does not stop the others.
+    """Match many pairs on one cluster; a failed pair does not stop the others.
 
-    Parameters
-    ----------
-    pairs
-        See `sat_intervals.config.pairs.read_batch`.
-    out
-        Folder with a subfolder for each pair, and ``batch.json`` with their states.
-    config, overrides
-        Settings of all pairs, see `load_config`; a pair's own settings win. ``cluster`` is shared by all.
-    overwrite, keep_tiles, progress
-        See `match_pair`.
-    finish
-        What to do with each complete pair at the end, such as its surface model; it gets the time at which the run
-        ended. What it returns is added to the pair's state.
-
-    Returns
-    -------
-    By name: ``state`` ("done", "done before", "failed"), and ``error`` or ``finished``, ``counts`` and ``seconds``, or
-    all of them if ``finish`` failed. ``batch.json`` has the same during the batch, with "waiting" for pairs that have
-    not ended.
-
-    Raises
-    ------
-    SatIntervalsError
-        Settings or the folder cannot be used.
-    RunError
-        An error that stops all pairs, such as a full disk.
+    Each pair has a folder in ``out``. ``config`` and ``overrides`` are for all pairs; a pair's own settings win.
+    ``finish`` is called with each complete pair and the time at which its run ended; what it returns is added to its
+    state. Returns, as ``batch.json`` has it, by name: ``state`` ("waiting", "done", "done before", "failed"), and
+    ``error`` or ``finished``, ``counts``, ``seconds`` and ``warnings``.
     """
     file = Path(config) if isinstance(config, (str, Path)) else None
     sections = read_yaml(Path(config)) if isinstance(config, (str, Path)) else config  # once for all pairs

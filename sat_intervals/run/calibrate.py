@@ -73,12 +73,7 @@ def _checked_truths(subject: Subject) -> tuple[int, int]:
 def calibration_from(
     parts: Sequence[Measured], subjects: Sequence[Subject], name: str, key: dict[str, Any] | None = None
 ) -> tuple[Calibration, list[dict[str, float]]]:
-    """Return the calibration of measured subjects, and what to expect of it.
-
-    Expected figures are means over the groups, each with the levels chosen on the others, see `left_out`: a row for
-    each coverage. The calibration's provenance has them too. The ``key`` is that of `measure_subjects`, by default that
-    of the settings now.
-    """
+    """Return the calibration of measured subjects, and what to expect of it: a row for each coverage."""
     config = subjects[0].config
     rungs, pool, expected, notes = ladder(config), pooled(parts), [], []
     chosen: list[Levels] = []

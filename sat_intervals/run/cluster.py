@@ -31,11 +31,7 @@ _LOG = logging.getLogger(__name__)
 
 @contextmanager
 def connected(settings: Cluster, out: Path) -> Iterator[Client]:
-    """Connect a client to the cluster of the settings; close it, and what it started, at the end.
-
-    Jobs write their logs to ``out/logs`` if their tiles are in ``out`` too, unless the user's dask configuration names
-    another folder.
-    """
+    """Connect a client to the cluster of the settings; close it, and what it started, at the end."""
     with dask.config.set(DASK), _client(settings, out) as client:
         _LOG.info("connected to %s", client)
         if settings.kind == "processes":

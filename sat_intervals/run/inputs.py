@@ -16,10 +16,7 @@ _Identities = Mapping[str, Mapping[str, Any]]
 
 
 def describe_inputs(left: Image, right: Image, config: Config, known: _Identities) -> dict[str, Any]:
-    """Return what identifies the images of a pair, their files and masks, and the weights of MC-CNN.
-
-    ``known`` are earlier identities by path: a file of the same size and time is not hashed again.
-    """
+    """Return what identifies images and weights; see `identity` for ``known``."""
     inputs = {"left": describe(left, known), "right": describe(right, known)}
     if isinstance(config.cost, Mccnn):
         weights = identity(str(weights_file(config.cost.weights)), known)

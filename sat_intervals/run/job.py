@@ -12,6 +12,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
+from sat_intervals.match.schedule import blocks_of
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import (
     Image,
@@ -22,10 +23,9 @@ from sat_intervals.raster import (
     run_files,
 )
 from sat_intervals.raster.identity import check_not_replaced
-from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs, handed_bytes
 from sat_intervals.run.inputs import describe_inputs, identities
 from sat_intervals.run.local_ranges import searched
-from sat_intervals.run.schedule import blocks_of, handed_bytes
 from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest

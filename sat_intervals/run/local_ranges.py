@@ -31,10 +31,7 @@ _STRIP = 256
 
 
 def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
-    """Return settings with the search range as numbers, what was found, if anything, and the local ranges, if any.
-
-    ``find`` searches the images; it is called if the range or local ranges are wanted that are not given.
-    """
+    """Return settings with the search range as numbers, what ``find`` found if needed, and local ranges, if any."""
     search = config.disparity
     raster = read_ranges(search.grid, left) if search.grid else None
     if search.grid:

@@ -48,24 +48,9 @@ _BLOCKS = 4
 class Subject:
     """A pair with truth to calibrate with.
 
-    Attributes
-    ----------
-    name
-        Shown to the user, not used.
-    group
-        Subjects of one group are left out together.
-    left, right
-        The images.
-    truth
-        True disparity of the region.
-    config
-        Settings, with the search range of the pair.
-    window
-        Region of the left image; None: all of it.
-    tolerance
-        Distance in pixels up to which a truth outside an interval counts as inside.
-    remove_bias
-        Whether to add the median of disparity - truth over kept pixels to the truth.
+    Subjects of one ``group`` are left out together. Without ``window`` the region is the whole left image. A truth
+    outside an interval counts as inside up to ``tolerance`` pixels. With ``remove_bias`` the median of disparity -
+    truth over kept pixels is added to the truth.
     """
 
     name: str
@@ -102,29 +87,7 @@ def check_enough(pixels: int, subjects: Sequence[Subject], what: str) -> None:
 def measure_subjects(
     subjects: Sequence[Subject], folder: Path, progress: Progress
 ) -> tuple[list[Measured], dict[str, Any]]:
-    """Match subjects at every level of the ladder, in ``folder``, and measure their intervals.
-
-    Parameters
-    ----------
-    subjects
-        See `check_subjects`.
-    folder
-        Where tiles are kept meanwhile; all workers must see it.
-    progress
-        Called with the stages of `match_pair`, or ``levels``, of one subject, and ``subjects`` of several.
-
-    Returns
-    -------
-    One measurement for each subject, or one for each of 16 blocks of a single one; and the key that they hold for, see
-    `key_of`.
-
-    Raises
-    ------
-    SatIntervalsError
-        Fewer than 1000 kept pixels have a truth, or a pair cannot be matched.
-    RunError
-        Tiles failed.
-    """
+    """Match subjects at every level of the ladder, in ``folder``; return measurements, and the `key_of` settings."""
     found: list[Measured] = []
     key, levels = key_of(subjects[0].config), ladder(subjects[0].config)
     compile_kernels(_at_levels(subjects[0].config, 0.0, 0.0, QUANTILES[-1]))

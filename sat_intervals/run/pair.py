@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from sat_intervals.config import load_config
 from sat_intervals.errors import RunError
 from sat_intervals.match.normalization import ImageStatistics, Moments, PairStatistics, blocks, statistics_of
+from sat_intervals.match.schedule import Schedule
 from sat_intervals.match.search_range import Found
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress, add_seconds, logged_stage
@@ -18,7 +19,6 @@ from sat_intervals.results import open_run
 from sat_intervals.run.assemble import assemble, end_tiles
 from sat_intervals.run.connection import Connection
 from sat_intervals.run.job import Job, prepare
-from sat_intervals.run.schedule import Schedule
 from sat_intervals.run.search_range import search_range
 from sat_intervals.run.tile import match_block, measure_block, trace_block
 from sat_intervals.run.workers import Task, Workers, check_not_full, reason
@@ -140,13 +140,7 @@ def _match_tiles(job: Job, client: Callable[[], Workers], seconds: dict[str, flo
 
 
 def measure_images(client: Workers, job: Job, progress: Progress) -> None:
-    """Measure mean and standard deviation of both images and keep them, if the cost needs them and they are missing.
-
-    Raises
-    ------
-    RunError
-        An image cannot be read.
-    """
+    """Measure mean and standard deviation of both images and keep them, if the cost needs them and they are missing."""
     if not job.has_statistics():
         images = job.left, job.right
         job.write_statistics(PairStatistics(*(_measured(client, image, job, progress) for image in images)))
@@ -185,11 +179,7 @@ class Matched(NamedTuple):
 
 
 def match_jobs(client: Workers, jobs: Sequence[Job], progress: Progress) -> Iterator[Matched]:
-    """Match the unfinished tiles of jobs; yield each job after its last tile.
-
-    Two tiles per core are in flight, possibly of several jobs, so that the scheduler's memory does not grow with the
-    number of tiles. Workers write the products to the store and return nothing.
-    """
+    """Match the unfinished tiles of jobs, a bounded number at a time; yield each job after its last tile."""
     waiting = [job.waiting() for job in jobs]
     schedules = [_schedule(job, tiles) for job, tiles in zip(jobs, waiting, strict=True)]
     matched = [Matched(job, {}, {}) for job in jobs]

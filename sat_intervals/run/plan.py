@@ -15,14 +15,14 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores, usable_memory
 from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
 from sat_intervals.match.patch import Frame, path_window
+from sat_intervals.match.schedule import blocks_of, time_of
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes, run_files
 from sat_intervals.run import assemble
-from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs, handed_bytes
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
-from sat_intervals.run.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.run.search_range import find_here
 from sat_intervals.run.workers import cores_of_process, readers, reason, tiles_at_once
 from sat_intervals.store.tiles import store_bytes
@@ -34,26 +34,10 @@ SAMPLE = 512
 
 @dataclass(frozen=True)
 class Plan:
-    """Resources that a run needs.
+    """Resources that a run needs: pixels, bytes, and seconds that are estimated from a sample.
 
-    Attributes
-    ----------
-    search_range
-        Smallest and largest disparity in pixels.
-    tile_size, tiles
-        Side of a core in pixels, reduced to fit in memory, and number of tiles.
-    workers
-        Tiles at once.
-    extra_work
-        Work on overlaps or, with exact seams, on the path states that tiles hand on, relative to that on cores.
-    worker_bytes
-        Memory of a process with one tile at once.
-    together, together_bytes
-        Tiles at once in one process (all with threads, one per core in a job of a batch system), and its memory.
-    disk_bytes
-        Temporary and final files in the folder of the run.
-    seconds
-        Time estimated from the sample.
+    ``workers`` is the number of tiles at once, ``extra_work`` that on overlaps or path states, relative to that on
+    cores. ``worker_bytes`` is the memory of a process with one tile, ``together_bytes`` of one with ``together`` tiles.
     """
 
     search_range: tuple[int, int]
@@ -78,25 +62,10 @@ def plan(
     workers: int | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Plan:
-    """Estimate tiles, memory, disk and time of matching a pair.
+    """Estimate tiles, memory, disk and time of matching a pair; parameters as in `match_pair`.
 
-    Parameters
-    ----------
-    left, right, config, window
-        See `match_pair`.
-    memory
-        Memory of a worker in bytes; tiles are made smaller to fit. By default the memory of a job in the settings.
-    workers
-        Tiles at once; by default those of the settings (all cores of all jobs with batch systems), or one per core of
-        this machine.
-    progress
-        Called before kernels are compiled, and during the search for a range that is not given. The estimate contains
-        only the time to load kernels.
-
-    Raises
-    ------
-    SatIntervalsError
-        The pair cannot be matched, or not even the smallest tile fits in the memory.
+    ``memory`` is that of a worker in bytes, by default of a job in the settings; tiles are made smaller to fit.
+    ``workers`` is the number of tiles at once, by default that of the settings.
     """
     config = resolved(load_config(config))
     left, right = checked_pair(left, right, config)
@@ -136,10 +105,7 @@ def plan(
 
 
 def _traced(grid: Grid, whole: Window, config: Config) -> int:
-    """Return the pixels of the tiles that hand on path states, summed over the wavefronts but the last.
-
-    Tiles hand on the last one when they are matched. The tile in the corner where a wavefront ends hands nothing on.
-    """
+    """Return the pixels of the tiles that hand on path states, summed over the wavefronts but the last."""
     ends = (grid.rows - 1, grid.columns - 1), (grid.rows - 1, 0), (0, 0)
     corners = sum(_path_pixels(grid.tile(*end).core, grid.region, whole, config) for end in ends)
     return len(ends) * _work(grid, whole, config) - corners
@@ -175,10 +141,7 @@ def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
 
 
 def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:
-    """Estimate the seconds of a run from a sample, and its extra work: tiles scaled by work, the rest by pixels.
-
-    It runs as many samples at once as this machine runs workers, so that they slow each other down as the workers will.
-    """
+    """Estimate the seconds of a run from samples, as many at once as there are workers, and its extra work."""
     one = config.model_copy(update={"cluster": Cluster(workers=1)})  # also without the store of the run
     shape = SAMPLE, SAMPLE
     if config.hands_states_on:  # two tiles, since the sample needs a seam; whole ones, since each takes time of its own

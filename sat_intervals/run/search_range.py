@@ -58,26 +58,7 @@ def look_at(left: Image, right: Image, sample: Sample) -> Look | None:
 
 
 def search_range(client: Workers, left: Image, right: Image, progress: Progress) -> Found:
-    """Find the search range of a pair from the whole images, with its evidence.
-
-    Parameters
-    ----------
-    client
-        Of the cluster.
-    left, right
-        The images.
-    progress
-        Called after each block.
-
-    Raises
-    ------
-    NoRangeError
-        The images have too few consistent matches.
-    RunError
-        An image cannot be read.
-    SatIntervalsError
-        An image is too large for a list of its blocks.
-    """
+    """Find the search range of a pair from the whole images, with its evidence; NoRangeError without enough matches."""
     for image in (left, right):
         _check_size(image)
     progress("kernels", 0, 1)
@@ -134,13 +115,7 @@ def _reduced(client: Workers, image: Image, step: Step, progress: Progress) -> t
 def _outcomes(
     client: Workers, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], progress: Progress
 ) -> Iterator[tuple[int, Any]]:
-    """Results of a function on workers, by the number of the task.
-
-    Raises
-    ------
-    RunError
-        A task failed.
-    """
+    """Yield results of a function on workers, by the number of the task."""
     done = 0
     for outcome in client.outcomes((Task(i, function, arguments, _RETRIES) for i, arguments in enumerate(tasks))):
         if outcome is not None and outcome.error is not None:

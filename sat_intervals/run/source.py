@@ -44,11 +44,7 @@ def read_source(job: Job, block: Tile, ranges: LocalRanges | None, seconds: dict
 
 
 def _views(job: Job, block: Tile, windows: tuple[Window, Window]) -> Views:
-    """Read windows of both images.
-
-    The first of the block's steps keeps them for the others, in the file's type and uncompressed. A bucket would be no
-    faster than the images.
-    """
+    """Read windows of both images; the first of a block's steps keeps them on the disk, in the type of the file."""
     images = job.left, job.right
     are_kept = job.hands_states_on and not is_remote(job.config.cluster)
     if are_kept and (kept := job.store.read(PIXELS, block.name)) is not None:
@@ -71,11 +67,7 @@ def _areas(job: Job, tile: Tile, ranges: LocalRanges | None) -> list[Area]:
 def costed(
     job: Job, tile: Tile, source: Source, ranges: LocalRanges | None, seconds: dict[str, float]
 ) -> tuple[Views, list[MatchingCost]]:
-    """Crop both images to a tile, and compute the costs of its areas.
-
-    Precomputed costs take longer than SGM: the first of the tile's steps keeps them for the others, uncompressed, since
-    those of noisy images hardly shrink.
-    """
+    """Crop both images to a tile, and compute the costs of its areas; precomputed ones are kept for other steps."""
     areas, config, name = _areas(job, tile, ranges), job.config, tile.name
     of_pair = source.statistics, source.network
     left, right = zip(source.views, view_windows(areas, config), strict=True)

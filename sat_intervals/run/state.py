@@ -55,26 +55,7 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 def next_step(
     out: Path, manifest: Mapping[str, Any], run: str, settings: Mapping[str, Any], *, overwrite: bool
 ) -> NextStep:
-    """Return what to do in the folder of a run.
-
-    Parameters
-    ----------
-    out
-        The folder.
-    manifest
-        That of the run that is wanted.
-    run
-        Its name, see `Job.name`.
-    settings
-        All its settings that decide the bytes of its files.
-    overwrite
-        Whether tiles and files of another run may be replaced.
-
-    Raises
-    ------
-    SatIntervalsError
-        The folder holds another run, or files that no run has made.
-    """
+    """Return what to do in the folder of a run with this manifest, name and settings; raise if it must be refused."""
     report, home = read_report(out), home_of(out)
     if report is not None and report.get("run") == run and not overwrite:
         return "complete"

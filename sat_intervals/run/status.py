@@ -18,21 +18,7 @@ _STATES = "waiting", "done", "done before", "failed"
 
 @dataclass(frozen=True)
 class Status:
-    """Progress of the tiles and strips of a run.
-
-    Attributes
-    ----------
-    total, done
-        Numbers of tiles.
-    handed_on
-        Number of path states that tiles handed to their neighbours, which come before the tiles.
-    strips, strips_done
-        Numbers of strips, which come after the tiles.
-    failed
-        Why tiles failed, by name, without those done since.
-    running
-        Whether a run is active.
-    """
+    """Progress of a run: numbers of tiles, of path states handed on before them, and of strips after them; failures."""
 
     total: int
     done: int
@@ -44,13 +30,7 @@ class Status:
 
 
 def read_status(out: Path) -> Status:
-    """Read the progress of a run from its tiles.
-
-    Raises
-    ------
-    StoreError
-        There are none, or their manifest is damaged.
-    """
+    """Read the progress of a run from its tiles; raise StoreError if there are none."""
     manifest = read_manifest(home_of(out))
     if manifest is None:
         raise StoreError(f"{out} has no run: give the folder that match was given")

@@ -58,26 +58,7 @@ def part_name(key: PartKey) -> str:
 def finish_strips(
     job: Job, client: Callable[[], Workers], scale: ConfidenceScale, progress: Progress
 ) -> dict[PartKey, dict[str, Any]]:
-    """Make the parts of a run that are missing; return ``meta`` of all.
-
-    Parameters
-    ----------
-    job
-        The pair, whose tiles are done.
-    client
-        Returns the workers; called if parts are missing.
-    scale
-        See `postprocess_rows`.
-    progress
-        Called after each strip.
-
-    Raises
-    ------
-    DamagedTilesError
-        Tiles must be matched, or parts made again.
-    RunError
-        A strip failed.
-    """
+    """Make the parts of a run that are missing, once its tiles are done; return ``meta`` of all parts."""
     counts, height = rows_of_levels(job.store.grid.region), job.store.grid.region.height
     keys = [(level, row) for level in reversed(range(len(counts))) for row in range(counts[level])]
     of = parts_of(job)

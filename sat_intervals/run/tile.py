@@ -21,12 +21,12 @@ from sat_intervals.match.patch import (
     path_window,
 )
 from sat_intervals.match.sampling import Look, look_in_tile
+from sat_intervals.match.schedule import Step, needs
 from sat_intervals.match.seams import seam_lines
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.progress import timed
 from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
-from sat_intervals.run.schedule import Step, needs
 from sat_intervals.run.source import Source, costed, frame_of, read_source
 from sat_intervals.run.workers import computing, picklable_errors
 from sat_intervals.store.arrays import numbered

@@ -57,10 +57,7 @@ def has_network() -> bool:
 
 
 def candidates(own: Config, *, with_network: bool) -> Iterator[tuple[str, dict[str, Any] | None]]:
-    """Yield names and settings: presets, penalties with Census and, with the network, with MC-CNN.
-
-    ``own`` settings, None, are the first if they are none of these.
-    """
+    """Yield names and settings: own ones (None) if they are none of the others, presets, and ladders of penalties."""
     changes = dict(_ladder(with_network=with_network))
     if not any(_is_same(own, one) for one in changes.values()):
         yield "own settings", None
@@ -113,13 +110,7 @@ def _changed(config: Config, changes: Mapping[str, Any] | None) -> Config:
 
 
 def best_of(found: Sequence[Tuned]) -> Tuned:
-    """Return the settings with the smallest interval score, of those with nearly as many good pixels as any.
-
-    Raises
-    ------
-    SatIntervalsError
-        None has a score.
-    """
+    """Return the settings with the smallest interval score, of those with nearly as many good pixels as any."""
     judged = [one for one in found if math.isfinite(one.figures.get("score", math.nan))]
     if not judged:
         raise SatIntervalsError("no settings leave enough pixels with truth to be compared: give more pairs")

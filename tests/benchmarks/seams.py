@@ -14,8 +14,8 @@ from pathlib import Path
 from candidates import search_range
 
 from sat_intervals.demo import make_scene
+from sat_intervals.match.schedule import time_of
 from sat_intervals.raster import north_up, write_layer
-from sat_intervals.run.schedule import time_of
 from sat_intervals.tiling import Grid, Window
 
 SIDE, COUNT, RUNS = 4000, 64, 3

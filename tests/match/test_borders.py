@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from sat_intervals import RunError, SatIntervalsError, Window, match_pair
 from sat_intervals.demo import make_scene
+from sat_intervals.match import schedule
 from sat_intervals.raster import write_layer
 from sat_intervals.run import pair as run
-from sat_intervals.run import schedule
 from sat_intervals.store.tiles import Store
 
 SETTINGS = {

@@ -13,10 +13,10 @@ from rio_cogeo.cogeo import cog_validate
 
 from sat_intervals import RunError, SatIntervalsError, match_pair, open_image
 from sat_intervals.demo import make_scene
+from sat_intervals.match import schedule
 from sat_intervals.raster import write_layer
 from sat_intervals.results import open_results
 from sat_intervals.run import pair as run_pair
-from sat_intervals.run import schedule
 from sat_intervals.run.local_ranges import read_ranges
 from sat_intervals.run.pair import prepare
 from sat_intervals.show.report.contents import Pixels

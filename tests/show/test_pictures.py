@@ -512,9 +512,7 @@ def test_open_results__refuses_files_that_are_not_those_of_the_report(tmp_path):
     report = json.loads((out / "run.json").read_text())
     report["tiles"]["region"]["height"] = 99999
     (out / "run.json").write_text(json.dumps(report))
-    with pytest.raises(
-        SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 bands of 99999 x 5"
-    ):
+    with pytest.raises(SatIntervalsError, match=r"intervals.tif has 4 bands of .* run.json says 4 bands of 99999 x 5"):
         open_results(out)
     write_run(tmp_path, bands, validity)
     write_layer(out / "intervals.tif", bands[0], np.nan, PLACE)

@@ -4,7 +4,7 @@ import pytest
 
 from sat_intervals.config import load_config
 from sat_intervals.kernels.sgm import LAST
-from sat_intervals.run.schedule import Schedule, Step, blocks_of, needs, time_of
+from sat_intervals.match.schedule import Schedule, Step, blocks_of, needs, time_of
 from sat_intervals.tiling import Grid, Window
 
 GRID = Grid(Window(10, 20, 4 * 64, 5 * 64 - 7), 64)

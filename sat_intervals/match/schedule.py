@@ -8,15 +8,10 @@ from collections.abc import Callable, Iterable
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-import numpy as np
-
 from sat_intervals.config import Config
-from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS
 from sat_intervals.match.borders import sources
 from sat_intervals.match.memory import tiles_together
-from sat_intervals.raster import Image
-from sat_intervals.run.workers import is_remote
 from sat_intervals.tiling import Grid, Tile
 
 # Blocks along each side of the grid, at least, if there are as many tiles: for several workers.
@@ -44,10 +39,7 @@ class Step(NamedTuple):
 
 
 def needs(blocks: Grid, step: Step, together: int = 1) -> list[Step]:
-    """Steps whose results a step takes over: borders of neighbours, in one wavefront or, to match, in all of them.
-
-    A block of several tiles, ``together`` along each side, also takes over those inside it, but for the last wavefront.
-    """
+    """Return the steps whose results a step takes over; of several tiles ``together`` also those inside the block."""
     found = (
         [Step(step.block, wavefront) for wavefront in range(LAST)] if together > 1 and step.wavefront is None else []
     )
@@ -69,11 +61,7 @@ class Schedule:
     def __init__(
         self, blocks: Grid, waiting: Iterable[Tile], is_done: Callable[[str], bool] | None, together: int = 1
     ) -> None:
-        """Order the steps that ``waiting`` blocks need.
-
-        ``is_done`` says whether the borders of a name are done; None: blocks are independent of each other.
-        ``together`` is the number of tiles along each side of a block.
-        """
+        """Order the steps of ``waiting`` blocks; ``is_done`` tells borders that are done, None: blocks are independent."""
         self._open: dict[Step, int] = {}  # number of unfinished steps that each needs
         self._dependents: dict[Step, list[Step]] = {}
         steps = [Step(block) for block in waiting]
@@ -127,11 +115,7 @@ class Schedule:
                         self._queue(other).append(other)
 
     def failed(self, step: Step) -> bool:
-        """Note that a step failed, and with it the steps that need it; return False if its block gives the same result.
-
-        That is so for the last wavefront of a block that is being matched. What a failed block would have given is
-        traced instead.
-        """
+        """Note that a step failed, and those that need it; return False if its block gives the same result."""
         self._under_way.discard(step)
         last = Step(step.block, LAST)
         if step == last and (step not in self._open or Step(step.block) in self._under_way):
@@ -166,23 +150,3 @@ def time_of(blocks: Grid, workers: int, trace: float, match: float) -> float:
         now, _, step = heappop(running)
         schedule.ended(step)
     return now
-
-
-def handed_bytes(grid: Grid, config: Config, images: Iterable[Image]) -> int:
-    """Return the bytes, at most, that steps hand to each other: path states on borders, pixels, precomputed costs."""
-    if not config.hands_states_on or len(grid) == 1:
-        return 0
-    height, width, count = grid.region.height, grid.region.width, config.disparity.count
-    views = 1 + config.matches_right_view
-    lines = grid.columns * height + grid.rows * width
-    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(count) * np.dtype(np.uint16).itemsize
-    costs = config.cost.precomputed * height * width * count
-    kept = 0
-    if not is_remote(config.cluster):
-        blocks, support = blocks_of(grid, config), 2 * config.tiles.support
-        around = 2 * (config.cost.window // 2 + 1)
-        for image in images:
-            rows = min(image.height, height + support) + blocks.rows * around
-            columns = min(image.width, width + support) + blocks.columns * (around + views * count)
-            kept += rows * columns * (np.dtype(image.dtype).itemsize + 1)  # with its state
-    return views * (states + costs) + kept
