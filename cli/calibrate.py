@@ -240,9 +240,10 @@ def _tune(
 ) -> None:
     """Compare settings, print their figures, and write the best."""
     from sat_intervals.cli.tables import show_tuned
+    from sat_intervals.config.candidates import candidates
     from sat_intervals.config.weights import INSTALL_MCCNN
     from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.run.tune import OF_ALL, best_of, candidates, has_network, settings_of, tuned
+    from sat_intervals.run.tune import OF_ALL, best_of, has_network, settings_of, tuned
 
     if not has_network():
         console.say(f"MC-CNN is left out: to include it, {INSTALL_MCCNN}")

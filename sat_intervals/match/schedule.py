@@ -6,9 +6,12 @@ A block is a tile, or several small ones: reading, opening files and submitting 
 from collections import deque
 from collections.abc import Callable, Iterable
 from heapq import heappop, heappush
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from sat_intervals.config import Config
+from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.sgm import LAST, WAVEFRONTS
 from sat_intervals.match.borders import sources
 from sat_intervals.match.memory import tiles_together
@@ -61,7 +64,7 @@ class Schedule:
     def __init__(
         self, blocks: Grid, waiting: Iterable[Tile], is_done: Callable[[str], bool] | None, together: int = 1
     ) -> None:
-        """Order the steps of ``waiting`` blocks; ``is_done`` tells borders that are done, None: blocks are independent."""
+        """Order the steps of ``waiting`` blocks; ``is_done`` tells borders that are done (None: no borders)."""
         self._open: dict[Step, int] = {}  # number of unfinished steps that each needs
         self._dependents: dict[Step, list[Step]] = {}
         steps = [Step(block) for block in waiting]
@@ -150,3 +153,23 @@ def time_of(blocks: Grid, workers: int, trace: float, match: float) -> float:
         now, _, step = heappop(running)
         schedule.ended(step)
     return now
+
+
+def handed_bytes(grid: Grid, config: Config, images: Iterable[Any], *, keeps_pixels: bool) -> int:
+    """Return the bytes, at most, that steps hand to each other: path states, pixels of images, precomputed costs."""
+    if not config.hands_states_on or len(grid) == 1:
+        return 0
+    height, width, count = grid.region.height, grid.region.width, config.disparity.count
+    views = 1 + config.matches_right_view
+    lines = grid.columns * height + grid.rows * width
+    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(count) * np.dtype(np.uint16).itemsize
+    costs = config.cost.precomputed * height * width * count
+    kept = 0
+    if keeps_pixels:
+        blocks, support = blocks_of(grid, config), 2 * config.tiles.support
+        around = 2 * (config.cost.window // 2 + 1)
+        for image in images:
+            rows = min(image.height, height + support) + blocks.rows * around
+            columns = min(image.width, width + support) + blocks.columns * (around + views * count)
+            kept += rows * columns * (np.dtype(image.dtype).itemsize + 1)  # with its state
+    return views * (states + costs) + kept

@@ -37,8 +37,7 @@ from sat_intervals.store.lock import locked
 from sat_intervals.tiling import Window
 
 _LOG = logging.getLogger(__name__)
-# What `batch.json` has of a run's report.
-_KEPT = "finished", "counts", "seconds", "warnings"
+_KEPT = "finished", "counts", "seconds", "warnings"  # of a run's report, in `batch.json`
 Finish = Callable[[PairOfBatch, str], Mapping[str, Any]]
 
 

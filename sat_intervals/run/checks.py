@@ -1,21 +1,15 @@
 """Check that a pair can be matched with the memory that there is, before its tiles."""
 
-from collections.abc import Iterable
 from pathlib import Path
-
-import numpy as np
 
 from sat_intervals.config import Config, Mccnn
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.kernels.cost import padded_to_lanes
-from sat_intervals.kernels.sgm import WAVEFRONTS
 from sat_intervals.machine import usable_cores
 from sat_intervals.match.mccnn import load_network
 from sat_intervals.match.memory import check_memory, check_strips, fitted, strip_bytes, volume_bytes
-from sat_intervals.match.schedule import blocks_of
 from sat_intervals.raster import BLOCK, Image, check_pair, open_image
-from sat_intervals.run.workers import is_remote, parse_memory, readers
+from sat_intervals.run.workers import parse_memory, readers
 from sat_intervals.tiling import Grid, Window
 
 
@@ -77,23 +71,3 @@ def check_tiles(config: Config, region: Window) -> None:
         f"strips of {rows} x {region.width} pixels, {strips} at once,",
         "choose fewer --workers or a narrower --window",
     )
-
-
-def handed_bytes(grid: Grid, config: Config, images: Iterable[Image]) -> int:
-    """Return the bytes, at most, that steps hand to each other: path states on borders, pixels, precomputed costs."""
-    if not config.hands_states_on or len(grid) == 1:
-        return 0
-    height, width, count = grid.region.height, grid.region.width, config.disparity.count
-    views = 1 + config.matches_right_view
-    lines = grid.columns * height + grid.rows * width
-    states = 2 * len(WAVEFRONTS) * lines * padded_to_lanes(count) * np.dtype(np.uint16).itemsize
-    costs = config.cost.precomputed * height * width * count
-    kept = 0
-    if not is_remote(config.cluster):
-        blocks, support = blocks_of(grid, config), 2 * config.tiles.support
-        around = 2 * (config.cost.window // 2 + 1)
-        for image in images:
-            rows = min(image.height, height + support) + blocks.rows * around
-            columns = min(image.width, width + support) + blocks.columns * (around + views * count)
-            kept += rows * columns * (np.dtype(image.dtype).itemsize + 1)  # with its state
-    return views * (states + costs) + kept

@@ -12,7 +12,7 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.kernels import FINGERPRINT
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.normalization import PairStatistics
-from sat_intervals.match.schedule import blocks_of
+from sat_intervals.match.schedule import blocks_of, handed_bytes
 from sat_intervals.match.search_range import Found
 from sat_intervals.raster import (
     Image,
@@ -23,10 +23,11 @@ from sat_intervals.raster import (
     run_files,
 )
 from sat_intervals.raster.identity import check_not_replaced
-from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs, handed_bytes
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.inputs import describe_inputs, identities
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_report
+from sat_intervals.run.workers import is_remote
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
 from sat_intervals.store.tiles import LAYOUT, ONCE, TILES, DamagedTilesError, Store, home_of, store_bytes
@@ -46,9 +47,8 @@ _NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 class Job:
     """All that is needed to match any tile of a pair and to assemble its files; picklable.
 
-    ``inputs`` is what `describe_inputs` returns, ``requested`` the section ``disparity`` as the user gave it, ``found``
-    what the search for the range found. ``local`` are the local search ranges, which workers read from the store;
-    ``ranges_digest`` is their digest. ``has_files`` says whether files are made of the tiles: `calibrate` makes none.
+    ``requested`` is the section ``disparity`` as given, ``found`` the result of the search for a range, ``local`` the
+    local ranges, which workers read from the store. `calibrate` makes no files of its tiles: ``has_files`` is False.
     """
 
     left: Image
@@ -114,7 +114,9 @@ class Job:
         region, files = self.store.grid.region, run_files(self.config.products.compression)
         share = len(waiting) / len(self.store.grid)
         tiles = store_bytes(self.store.grid, self.config.subpixel_levels)
-        handed = handed_bytes(self.store.grid, self.config, (self.left, self.right))
+        handed = handed_bytes(
+            self.store.grid, self.config, (self.left, self.right), keeps_pixels=not is_remote(self.config.cluster)
+        )
         before = share * (tiles + handed) + self.has_files * part_bytes(files, region.height, region.width)
         final = self.has_files * file_bytes(files, region.height, region.width)
         if self.store.folder == folder_at(home_of(self.out)):
@@ -184,11 +186,7 @@ def prepare(
     pair: str = "",
     find: Search | None = None,
 ) -> Job:
-    """Check all that can be checked before tiles are matched; parameters as in `match_pair`.
-
-    ``pair`` is a prefix of the tiles' folder in an external store. ``find`` finds a search range that is not given; one
-    that an earlier run of the same images has found is taken over.
-    """
+    """Check all that can be checked before tiles are matched; ``find`` finds a range that no earlier run has found."""
     config, out = resolved(load_config(config)), Path(out)
     requested = config.disparity.model_dump(mode="json")
     left, right = checked_pair(left, right, config)
@@ -259,12 +257,10 @@ def remove_tiles(out: Path) -> None:
 
 def _unusable(store: Store, error: OSError) -> StoreError:
     """Return the error for a store that cannot be written."""
-    way_out = "make room, check its rights or choose another folder"
-    if not store.folder.is_local:
-        way_out = (
-            "check the URL, the credentials, and whether the package of its file system is installed (pip install "
-            "'sat-intervals[remote]' for s3://)"
-        )
+    remote = (
+        "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
+    )
+    way_out = "make room, check its rights or choose another folder" if store.folder.is_local else remote
     return StoreError(f"{store.folder} cannot be used: {error.strerror or error}: {way_out}")
 
 

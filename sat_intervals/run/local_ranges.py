@@ -22,12 +22,10 @@ from sat_intervals.raster.identity import identity
 from sat_intervals.raster.published import tag_of_left, tags_beside
 from sat_intervals.tiling import Window
 
-# Side of the cells that a raster of ranges is reduced to, in pixels.
-_CELL = 64
+# Side of the cells that a raster of ranges is reduced to, in pixels, and rows that are written at a time.
+_CELL, _STRIP = 64, 256
 # Tag of the rasters of `write_ranges`: the image.
 _OF = "RANGES_OF"
-# Rows written at a time.
-_STRIP = 256
 
 
 def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
@@ -70,16 +68,7 @@ def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
 
 
 def read_ranges(path: str, left: Image) -> LocalRanges:
-    """Read a raster of two bands, minimum and maximum for each pixel of the left image; reduce it to cells.
-
-    The range of a cell is the hull of its pixels, rounded outwards. It is empty, minimum above maximum, where a pixel
-    has no data.
-
-    Raises
-    ------
-    SatIntervalsError
-        The raster does not fit the image, or a minimum is above its maximum.
-    """
+    """Read a raster of minimum and maximum of each pixel of the left image; reduce it to cells, rounded outwards."""
     bands, height, width = read_shape(path)
     if (bands, height, width) != (len(RANGES), left.height, left.width):
         raise SatIntervalsError(

@@ -46,11 +46,10 @@ _BLOCKS = 4
 
 @dataclass(frozen=True)
 class Subject:
-    """A pair with truth to calibrate with.
+    """A pair with truth to calibrate with; those of one ``group`` are left out together.
 
-    Subjects of one ``group`` are left out together. Without ``window`` the region is the whole left image. A truth
-    outside an interval counts as inside up to ``tolerance`` pixels. With ``remove_bias`` the median of disparity -
-    truth over kept pixels is added to the truth.
+    ``tolerance``: distance in pixels up to which a truth outside an interval counts as inside. ``remove_bias``: whether
+    the median of disparity - truth is added to the truth. ``window``: region of the left image, by default all.
     """
 
     name: str

@@ -15,16 +15,16 @@ from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores, usable_memory
 from sat_intervals.match.memory import PROCESS_BYTES, check_strips, fitted, strip_bytes, tile_bytes, waiting_bytes
 from sat_intervals.match.patch import Frame, path_window
-from sat_intervals.match.schedule import blocks_of, time_of
+from sat_intervals.match.schedule import blocks_of, handed_bytes, time_of
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, Image, file_bytes, part_bytes, run_files
 from sat_intervals.run import assemble
-from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs, handed_bytes
+from sat_intervals.run.checks import check_tiles, checked_pair, checked_region, fitted_to_jobs
 from sat_intervals.run.local_ranges import searched
 from sat_intervals.run.pair import match_pair
 from sat_intervals.run.search_range import find_here
-from sat_intervals.run.workers import cores_of_process, readers, reason, tiles_at_once
+from sat_intervals.run.workers import cores_of_process, is_remote, readers, reason, tiles_at_once
 from sat_intervals.store.tiles import store_bytes
 from sat_intervals.tiling import Grid, Window
 
@@ -34,11 +34,7 @@ SAMPLE = 512
 
 @dataclass(frozen=True)
 class Plan:
-    """Resources that a run needs: pixels, bytes, and seconds that are estimated from a sample.
-
-    ``workers`` is the number of tiles at once, ``extra_work`` that on overlaps or path states, relative to that on
-    cores. ``worker_bytes`` is the memory of a process with one tile, ``together_bytes`` of one with ``together`` tiles.
-    """
+    """Resources that a run needs: pixels, bytes, seconds; ``workers`` tiles at once, ``together`` in one process."""
 
     search_range: tuple[int, int]
     tile_size: int
@@ -99,7 +95,7 @@ def plan(
         disk_bytes=store_bytes(grid, config.subpixel_levels)
         + part_bytes(files, region.height, region.width)
         + file_bytes(files, region.height, region.width)
-        + handed_bytes(grid, config, (left, right)),
+        + handed_bytes(grid, config, (left, right), keeps_pixels=not is_remote(config.cluster)),
         seconds=seconds,
     )
 
@@ -171,18 +167,17 @@ def _expected(left: Image, right: Image, config: Config, workers: int, grid: Gri
     blocks = blocks_of(grid, config)
     parallel = time_of(blocks, min(workers, len(grid)), paths / max(1, 3 * len(blocks)), tiles / len(blocks))
     extra = paths / tiles if config.hands_states_on else work / pixels - 1
-    return float(seconds["start"] + seconds["kernels"] + images + parallel + max(strips, inputs) + files), extra
+    return float(seconds["start"] + seconds["kernels"] + images + parallel + strips + inputs + files), extra
 
 
 @contextmanager
 def _warned_once() -> Iterator[None]:
-    """Drop a warning that another sample has given, all being of the same window."""
-    logger, given = logging.getLogger(assemble.__name__), set[str]()
+    """Drop warnings that another sample has given, all being of the same window."""
+    logger, given = logging.getLogger(assemble.__name__), list[str]()
 
     def is_new(record: logging.LogRecord) -> bool:
-        is_given = record.getMessage() in given
-        given.add(record.getMessage())
-        return not is_given
+        given.append(record.getMessage())
+        return given.count(given[-1]) == 1
 
     logger.addFilter(is_new)
     try:

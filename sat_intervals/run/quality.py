@@ -11,10 +11,8 @@ from sat_intervals.raster import Image, read_window
 from sat_intervals.run.job import Job
 from sat_intervals.tiling import Window
 
-# Number of disparities up to which refinement alone can widen an interval to the whole search range.
-_NARROW_RANGE = 3
-# Number of disparities up to which intervals of usual width are wider than half of the search range.
-_SHORT_RANGE = 8
+# Disparities up to which refinement alone can widen an interval to all, and up to which usual ones are half of all.
+_NARROW_RANGE, _SHORT_RANGE = 3, 8
 # Share of valid pixels with the whole search range as interval above which a run warns.
 _AMBIGUOUS_SHARE = 0.1
 # Share of valid pixels at the ends of the search range above which a run warns, and at one end to search further there.

@@ -31,8 +31,7 @@ from sat_intervals.run.workers import Task, Workers, picklable_errors, reason
 from sat_intervals.tiling import Grid, Window
 
 _RETRIES = 2
-# Bytes of the window and the task of a block.
-_TASK = 500
+_TASK = 500  # bytes of the window and the task of a block
 
 
 class _Block(NamedTuple):

@@ -12,8 +12,7 @@ from sat_intervals.store.lock import is_locked
 from sat_intervals.store.manifest import StoreError, digest, grid_of, place_of, read_manifest
 from sat_intervals.store.tiles import BORDERS, PARTS, TILES, Store, home_of
 
-# States of the pairs of a batch.
-_STATES = "waiting", "done", "done before", "failed"
+_STATES = "waiting", "done", "done before", "failed"  # of the pairs of a batch
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,4 @@
-"""Finish strips of a run on workers: final bands, compressed as parts of the files, and overviews of finished parts.
-
-A strip is one row of blocks. It is computed in pieces, so memory depends on the width only. A row of blocks of an
-overview is made of two rows of the level below it, so the parts form a binary tree. A part is one file, with the
-compressed bytes of each final file, and every second row and column for the level above.
-"""
+"""Finish strips of a run on workers: final bands, compressed as parts of the files, and overviews, as a binary tree."""
 
 import zlib
 from collections.abc import Callable, Iterator, Sequence

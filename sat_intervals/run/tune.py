@@ -1,7 +1,7 @@
 """Compare settings on pairs with truth: presets and a ladder of penalties, each with its own calibration."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import PRESETS, Calibration, Config, Interval, key_of, load_config
+from sat_intervals.config import Calibration, Interval
+from sat_intervals.config.candidates import changed
 from sat_intervals.config.weights import weights_file
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.calibration import left_out, means
@@ -27,17 +28,10 @@ _GOOD_ENOUGH = 0.95
 # Errors that say nothing of the settings that are tried, such as a lost truth or a full disk.
 OF_ALL = RunError, InputError, OutputError, StoreError
 
-_CENSUS = {5: ((8, 64), (12, 64), (16, 128)), 7: ((8, 64), (32, 256)), 11: ((50, 350),)}
-_COSINE = ((0.5, 3.0, 40.0), (0.7, 4.0, 45.0), (1.0, 6.0, 60.0))
-
 
 @dataclass(frozen=True)
 class Tuned:
-    """Figures of some settings on all pairs.
-
-    ``kept`` and ``good`` are shares of the pixels with truth: kept by cross-checking, and also within 1 px of it.
-    ``figures`` are the `means` over groups at COVERAGE, each with the levels chosen on the others.
-    """
+    """Figures of some settings on all pairs: shares of pixels kept, and good within 1 px; `means` at COVERAGE."""
 
     name: str
     subjects: Sequence[Subject]
@@ -56,39 +50,11 @@ def has_network() -> bool:
     return True
 
 
-def candidates(own: Config, *, with_network: bool) -> Iterator[tuple[str, dict[str, Any] | None]]:
-    """Yield names and settings: own ones (None) if they are none of the others, presets, and ladders of penalties."""
-    changes = dict(_ladder(with_network=with_network))
-    if not any(_is_same(own, one) for one in changes.values()):
-        yield "own settings", None
-    yield from changes.items()
-
-
-def _is_same(own: Config, changes: Mapping[str, Any]) -> bool:
-    """Return whether changes leave the key of settings as it is; no, if the settings do not allow them."""
-    try:
-        return key_of(_changed(own, changes)) == key_of(own)
-    except SatIntervalsError:
-        return False
-
-
-def _ladder(*, with_network: bool) -> Iterator[tuple[str, dict[str, Any]]]:
-    for preset in PRESETS:
-        if with_network or "mccnn" not in preset:
-            yield preset, {"preset": preset}
-    for window, penalties in _CENSUS.items():
-        for p1, p2 in penalties:
-            yield f"census {window}, {p1}/{p2}", {"cost": {"window": window}, "sgm": {"p1": p1, "p2": p2}}
-    for lower, upper, span in _COSINE if with_network else ():
-        sgm = {"penalty": "constant", "p1": lower, "p2": upper, "span": span}
-        yield f"mccnn, {lower:g}/{upper:g}", {"preset": "satellite-mccnn", "sgm": sgm}
-
-
 def tuned(
     name: str, changes: Mapping[str, Any] | None, subjects: Sequence[Subject], folder: Path, progress: Progress
 ) -> Tuned:
     """Calibrate pairs with changed settings, and judge these; parameters as in `measure_subjects`."""
-    subjects = [replace(subject, config=_changed(subject.config, changes)) for subject in subjects]
+    subjects = [replace(subject, config=changed(subject.config, changes)) for subject in subjects]
     parts, key = measure_subjects(subjects, folder, progress)
     calibration, _ = calibration_from(parts, subjects, name, key)
     return Tuned(
@@ -99,14 +65,6 @@ def tuned(
         means(left_out(parts, ladder(subjects[0].config), [COVERAGE])[0].values()),
         calibration,
     )
-
-
-def _changed(config: Config, changes: Mapping[str, Any] | None) -> Config:
-    """Return the settings that are compared, with search range, cross-checking, tiles and cluster of the others."""
-    if changes is None:
-        return config
-    kept = config.model_dump(include={"disparity", "cross_check", "tiles", "cluster"})
-    return load_config(changes, kept)
 
 
 def best_of(found: Sequence[Tuned]) -> Tuned:

@@ -44,18 +44,11 @@ class Workers(Protocol):
     """Interface of what runs tasks."""
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
-        """Run tasks, two in flight per core; yield their outcomes, and None every few seconds without one.
-
-        None among the tasks means that more are ready once others have ended.
-        """
+        """Run tasks, a bounded number at once; yield outcomes, and None regularly. A task None waits for others."""
 
 
 def readers(settings: Cluster) -> int:
-    """Return how many threads of a process read and write while the others compute: one if tiles are in a bucket.
-
-    With 0.3 s for each tile read or written, this shortens the tiles of one worker from 43 s to 28 s. On a local disk
-    it saves nothing. The threads of an existing scheduler's workers are the user's.
-    """
+    """Return how many threads of a process read and write while others compute: one if tiles are in a bucket."""
     return int(settings.kind != "address" and is_remote(settings))
 
 

@@ -15,7 +15,9 @@ from sat_intervals import SatIntervalsError, match_pair, open_image
 from sat_intervals.cli.calibrate import _Judging, _subjects
 from sat_intervals.cli.matching import SettingsArguments
 from sat_intervals.config import PRESETS, Cluster, calibration_of, load_calibration, load_config
+from sat_intervals.config import candidates as compared
 from sat_intervals.config.calibration import COVERAGES
+from sat_intervals.config.candidates import candidates
 from sat_intervals.demo import make_scene
 from sat_intervals.errors import ChangedInputError
 from sat_intervals.evaluate.disparity import evaluate_run
@@ -25,7 +27,7 @@ from sat_intervals.run import tune
 from sat_intervals.run.calibrate import check_subjects
 from sat_intervals.run.job import prepare
 from sat_intervals.run.measure import Subject, measure_subjects, truth_of
-from sat_intervals.run.tune import Tuned, best_of, candidates
+from sat_intervals.run.tune import Tuned, best_of
 from sat_intervals.store.manifest import StoreError
 from sat_intervals.store.tiles import Store
 
@@ -357,7 +359,7 @@ CANDIDATES = ("few", 0.5, 3.0), ("wide", 0.8, 9.0), ("best", 0.78, 5.0)
 def test_tune__match_takes_the_file(scene, tmp_path, monkeypatch):
     """Settings that cannot be compared are left out."""
     found = [("weak", {"sgm": {"p2": 10**6}}), ("stronger", {"sgm": {"p2": 64}})]
-    monkeypatch.setattr(tune, "candidates", lambda own, with_network: found)
+    monkeypatch.setattr(compared, "candidates", lambda own, with_network: found)
     arguments = "calibrate", scene, "--tune", "--output", tmp_path / "tuned.yaml", "--tile-size", 512
     result = invoke(*arguments)
     assert result.exit_code == 0, result.output
@@ -379,7 +381,10 @@ def test_tune__ends_where_a_truth_is_lost_while_the_last_settings_are_tried(scen
     (tmp_path / "pair").mkdir()
     with rasterio.open(scene / "truth.tif") as file:
         pair = with_truth(scene, tmp_path / "pair", file.read(1))
-    monkeypatch.setattr(tune, "candidates", lambda own, with_network: [("one", None), ("last", {"sgm": {"p2": 64}})])
+    monkeypatch.setattr(
+        "sat_intervals.config.candidates.candidates",
+        lambda own, with_network: [("one", None), ("last", {"sgm": {"p2": 64}})],
+    )
     monkeypatch.setattr(measurement, "_RUNGS", 5)  # the levels do not matter here
     tuned, calls = tune.tuned, itertools.count()
 
@@ -409,7 +414,9 @@ def test_tune__ends_where_the_disk_is_full(scene, tmp_path, monkeypatch, error):
 
 
 def test_tune__a_name_and_quiet(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(tune, "candidates", lambda own, with_network: [("own settings", None)])
+    monkeypatch.setattr(
+        "sat_intervals.config.candidates.candidates", lambda own, with_network: [("own settings", None)]
+    )
     monkeypatch.setattr(measurement, "_RUNGS", 5)  # the levels do not matter here
     assert calibrated(scene, tmp_path / "tuned.yaml", "--tune", "--config", stronger(tmp_path))
     written = yaml.safe_load((tmp_path / "tuned.yaml").read_text())
