@@ -30,7 +30,7 @@ from sat_intervals.run.state import OUTPUTS, check_folder, next_step, read_repor
 from sat_intervals.run.workers import is_remote
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.manifest import MANIFEST, PLACE, StoreError, digest, place_of, read_manifest, write_manifest
-from sat_intervals.store.tiles import LAYOUT, ONCE, TILES, DamagedTilesError, Store, home_of, store_bytes
+from sat_intervals.store.tiles import LAYOUT, ONCE, PARTS, TILES, DamagedTilesError, Store, home_of, store_bytes
 from sat_intervals.tiling import Grid, Tile, Window
 
 Search = Callable[[Image, Image], Found]
@@ -105,19 +105,19 @@ class Job:
                 self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), found=found, ranges=ranges)
         except OSError as error:
             raise _unusable(self.store, error) from error
-        if waiting := self.waiting():
-            self._check_space(waiting)
+        self._check_space()
         return True
 
-    def _check_space(self, waiting: list[Tile]) -> None:
+    def _check_space(self) -> None:
         """Raise if disks have no room for what a run has yet to write."""
         region, files = self.store.grid.region, run_files(self.config.products.compression)
-        share = len(waiting) / len(self.store.grid)
+        share = len(self.waiting()) / len(self.store.grid)
         tiles = store_bytes(self.store.grid, self.config.subpixel_levels)
         handed = handed_bytes(
             self.store.grid, self.config, (self.left, self.right), keeps_pixels=not is_remote(self.config.cluster)
         )
-        before = share * (tiles + handed) + self.has_files * part_bytes(files, region.height, region.width)
+        parts = self.has_files * part_bytes(files, region.height, region.width)
+        before = share * (tiles + handed) + max(0, parts - sum(self.store.folder.sizes(PARTS).values()))
         final = self.has_files * file_bytes(files, region.height, region.width)
         if self.store.folder == folder_at(home_of(self.out)):
             check_space(self.out, round(before + final), "tiles, files and their parts")

@@ -322,7 +322,7 @@ def test_match__names_the_tiles_that_a_truncated_file_fails(folder, tmp_path, cl
     )
     assert int(first.split()[1]) == len(lines)
     failed = {re.fullmatch(r"  tile (\d_\d): (.*)", line)[1] for line in lines}
-    kept = {path.stem for path in (out / "tiles" / "records").glob("[0-9]*.json")}
+    kept = {path.stem for path in (out / "tiles" / "tiles").glob("[0-9]*.npz")}
     assert failed | kept == {f"{row}_{column}" for row in range(4) for column in range(5)}
     assert not failed & kept
     assert {"0_0", "0_4"} <= kept
