@@ -15,7 +15,7 @@ import dask
 import psutil
 import pytest
 import yaml
-from helpers import COMMAND, hashes, wait_until
+from helpers import COMMAND, LOCK, hashes, wait_until
 
 from sat_intervals import SatIntervalsError, match_pair
 from sat_intervals.config import Cluster
@@ -74,7 +74,7 @@ def wait_for_files(process: subprocess.Popen, folder: Path, files: str, count: i
 
 
 def wait_for_tiles(process: subprocess.Popen, folder: Path, count: int) -> None:
-    wait_for_files(process, folder, "records/[0-9]*.json", count)
+    wait_for_files(process, folder, "tiles/[0-9]*.npz", count)
 
 
 def jobs(state: str = "RUNNING") -> set[str]:
@@ -95,13 +95,13 @@ def workers(folder: Path) -> list[psutil.Process]:
 
 def assert_complete(pair, out: Path) -> None:
     assert hashes(out) == hashes(pair / "undisturbed")
-    assert {path.name for path in out.iterdir()} - {"logs"} == {"intervals.tif", "run.json", "validity.tif"}
+    assert {path.name for path in out.iterdir()} - {"logs", LOCK} == {"intervals.tif", "run.json", "validity.tif"}
 
 
 def test_match__goes_on_in_a_new_job_after_scancel(slurm, pair, tmp_path):
     with submitted(pair, tmp_path, own={"JOBQUEUE__SLURM__LOG_DIRECTORY": tmp_path / "own-logs"}) as process:
         before = set()
-        for files, count in (("borders/[0-9]*", 20), ("records/[0-9]*.json", 5)):  # in both phases
+        for files, count in (("borders/[0-9]*", 20), ("tiles/[0-9]*.npz", 5)):  # in both phases
             wait_for_files(process, tmp_path, files, count)
             (job,) = jobs() - before
             before.add(job)
