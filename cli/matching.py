@@ -263,11 +263,11 @@ def run_options(command: Command) -> Command:
             is_flag=True,
             help="End with status 1 if the run prints a warning, for example that the search range is too narrow.",
         ),
-        click.option("--keep-tiles", is_flag=True, help="Keep the raw products of the tiles."),
+        click.option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
         click.option(
             "--overwrite",
             is_flag=True,
-            help="Start again: delete the tiles in OUT, and replace a finished run there.",
+            help="May replace another run in OUT; its tiles are deleted, equal ones are used again.",
         ),
         quiet_option,
         log_options,

@@ -15,7 +15,7 @@ from sat_intervals.errors import ChangedInputError, RunError, SatIntervalsError
 from sat_intervals.match.postprocess import ConfidenceScale, confidence_scale
 from sat_intervals.progress import Progress, logged_stage
 from sat_intervals.raster import OutputError, OutputWriter, Part, run_files
-from sat_intervals.raster.publishing import write_file
+from sat_intervals.raster.publishing import new_file
 from sat_intervals.run.inputs import check_unchanged
 from sat_intervals.run.job import Job, remove_tiles
 from sat_intervals.run.report import report_of, tags_of
@@ -89,9 +89,10 @@ def _publish(
         there = job.out / name
         if not overwrite and there.exists() and not filecmp.cmp(there, new, shallow=False):
             raise SatIntervalsError(f"{there} is not of this run: move it away or give --overwrite; the tiles are kept")
-    (job.out / RUN_REPORT).unlink(missing_ok=True)  # with --overwrite: never beside files of another run
-    writer.publish()
-    write_file(job.out / RUN_REPORT, (json.dumps(report, indent=1) + "\n").encode())
+    with new_file(job.out / RUN_REPORT) as new:  # gets its name last
+        new.write_bytes((json.dumps(report, indent=1) + "\n").encode())
+        (job.out / RUN_REPORT).unlink(missing_ok=True)  # never beside files of another run
+        writer.publish()
 
 
 def end_tiles(job: Job, *, keep_tiles: bool) -> None:

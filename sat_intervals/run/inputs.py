@@ -7,7 +7,7 @@ from typing import Any
 
 from sat_intervals.config import Config, Mccnn
 from sat_intervals.config.weights import weights_file
-from sat_intervals.errors import ChangedInputError
+from sat_intervals.errors import ChangedInputError, RunError
 from sat_intervals.raster import Image, describe
 from sat_intervals.raster.identity import identity
 from sat_intervals.store.manifest import differences
@@ -38,10 +38,13 @@ def _files_of(described: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 def check_unchanged(before: Mapping[str, Any], left: Image, right: Image, config: Config) -> None:
     """Raise ChangedInputError if inputs differ from their description of before; all local files are read."""
     try:
-        now = describe_inputs(left, right, config, {})
-    except OSError as error:
-        raise ChangedInputError(f"an input cannot be read any more, so the tiles are deleted: {error}") from error
-    if changes := list(differences(before, json.loads(json.dumps(now)))):
+        now = json.loads(json.dumps(describe_inputs(left, right, config, {})))
+    except (OSError, ChangedInputError) as error:
+        raise RunError(f"an input cannot be compared now: {error}; rerun the same command: it resumes") from error
+    changes = list(differences(before, now))
+    if silent := [change for change in changes if change.endswith("now null")]:
+        raise RunError(f"an input cannot be compared now ({silent[0]}); rerun the same command: it resumes")
+    if changes:
         path = before[changes[0].partition(".")[0]]["path"]
         raise ChangedInputError(
             f"{path} was changed during the run ({'; '.join(changes)}), so its tiles are deleted: rerun the command "

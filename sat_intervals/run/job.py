@@ -99,7 +99,8 @@ class Job:
             remove_tiles(self.out)
         try:
             self.store.write(ONCE, "begun")  # fails at once where nothing can be written
-            write_manifest(home_of(self.out), self.manifest)
+            if step != "resume":
+                write_manifest(home_of(self.out), self.manifest)
             if self.found or self.local:
                 found, ranges = self.found and self.found.report(), self.local and self.local.report()
                 self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), found=found, ranges=ranges)
@@ -151,8 +152,7 @@ class Job:
             raise DamagedTilesError(
                 f"the image statistics in {self.store.folder} are missing: rerun the same command: it resumes"
             )
-        kept.pop("of")
-        return PairStatistics.of_report(kept)
+        return PairStatistics.of_report({side: kept[side] for side in ("left", "right")})
 
     def ranges(self) -> LocalRanges | None:
         """Return the local search ranges, None without them."""

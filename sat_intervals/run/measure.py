@@ -140,8 +140,8 @@ def _of_subject(
                 check_failures(job, matched.failures)
                 gauge = gauge or _Gauge(job, subject, levels.size, in_blocks)
                 gauge.add(job, 2 * jobs.index(job))
-                check_unchanged(job.inputs, job.left, job.right, job.config)
                 job.store.remove()
+        check_unchanged(jobs[0].inputs, subject.left, subject.right, jobs[0].config)
     assert gauge is not None  # there are jobs
     return gauge.measured()
 

@@ -60,7 +60,8 @@ def match_pair(
     keep_tiles
         Whether to keep the raw products of the tiles.
     overwrite
-        Whether to delete existing tiles in ``out``, and replace a run there once this one is complete.
+        Whether a run in ``out``, and files of its names, may be replaced once this one is complete. Tiles of another
+        run are deleted, equal ones are used again.
     progress
         Called regularly with stage, done and total.
 

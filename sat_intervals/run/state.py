@@ -69,7 +69,7 @@ def next_step(
     if overwrite:
         return "start anew" if changes else "resume" if there else "start"
     if changes:
-        kind = ChangedInputError if all(change.startswith("inputs.") for change in changes) else StoreError
+        kind = ChangedInputError if any(change.startswith("inputs.") for change in changes) else StoreError
         raise kind(
             f"{home} holds the tiles of another run: {'; '.join(changes)} "
             "(use the same settings and inputs to resume, or --overwrite to start again)"

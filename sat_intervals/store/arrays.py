@@ -9,7 +9,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from io import BytesIO
 from typing import Any
 
@@ -27,43 +27,64 @@ class DamagedFileError(Exception):
 
 
 class Archive:
-    """An open file."""
+    """An open file; its methods raise `DamagedFileError`."""
 
     def __init__(self, archive: zipfile.ZipFile, of: str) -> None:
-        """Open a file; raise if it was not written for ``of``."""
+        """Open a file that was written for ``of``."""
         self._archive = archive
-        self.meta: dict[str, Any] = json.loads(archive.read(META))
-        if self.meta["of"] != of:
-            raise ValueError(of)
+        with _damage_noticed():
+            self.meta: dict[str, Any] = json.loads(archive.read(META))
+            if self.meta["of"] != of:
+                raise ValueError(of)
 
     def names(self) -> list[str]:
-        """Return the names of its arrays."""
-        return [name.removesuffix(".npy") for name in self._archive.namelist() if name != META]
+        """Return the names of its arrays; the directory of a zip has no checksum, ``meta`` has one."""
+        return list(self.meta["names"])
 
     def is_intact(self) -> bool:
         """Return whether all of it agrees with its checksums."""
-        return self._archive.testzip() is None
+        with _damage_noticed():
+            return self._archive.testzip() is None and all(map(self._archive.getinfo, map(_member, self.names())))
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Read an array, which cannot be written to."""
-        content = self._archive.read(f"{name}.npy")
-        stream = BytesIO(content)
-        np.lib.format.read_magic(stream)
-        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-        return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape)
+        with _damage_noticed():
+            content = self._archive.read(_member(name))
+            stream = BytesIO(content)
+            np.lib.format.read_magic(stream)
+            shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+            return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape)
+
+
+def _member(name: str) -> str:
+    return f"{name}.npy"
+
+
+@contextmanager
+def _damage_noticed() -> Iterator[None]:
+    """Turn what damage raises into a DamagedFileError."""
+    try:
+        yield
+    except (FileNotFoundError, *_DAMAGES) as error:
+        raise DamagedFileError(error) from error
+    except OSError as error:
+        if error.errno == errno.EINVAL:  # a damaged offset
+            raise DamagedFileError(error) from error
+        raise
 
 
 def packed(arrays: Iterable[tuple[str, np.ndarray]], meta: Mapping[str, Any]) -> memoryview:
     """Return the content of a file; equal arrays and meta give equal bytes."""
-    stream = BytesIO()
+    stream, names = BytesIO(), []
     with zipfile.ZipFile(stream, "w") as archive:
         for name, array in arrays:
+            names.append(name)
             array = np.ascontiguousarray(array)
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+            with archive.open(zipfile.ZipInfo(_member(name)), "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, np.lib.format.header_data_from_array_1_0(array))
                 member.write(array.reshape(-1).view(np.uint8).data)
             del array
-        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta))  # ``arrays`` may complete it
+        archive.writestr(zipfile.ZipInfo(META), json.dumps({**meta, "names": names}))  # completed by ``arrays``
     return stream.getbuffer()
 
 
@@ -81,12 +102,8 @@ def unpacked(folder: Folder, name: str, of: str) -> Iterator[Archive]:
     DamagedFileError
         It is missing, damaged, or was written for something else than ``of``.
     """
-    try:
-        with folder.opened(name) as stream, zipfile.ZipFile(stream) as archive:
-            yield Archive(archive, of)
-    except (FileNotFoundError, *_DAMAGES) as error:
-        raise DamagedFileError(name) from error
-    except OSError as error:
-        if error.errno == errno.EINVAL:  # a damaged offset
-            raise DamagedFileError(name) from error
-        raise
+    with ExitStack() as stack:
+        with _damage_noticed():
+            stream = stack.enter_context(folder.opened(name))
+            archive = stack.enter_context(zipfile.ZipFile(stream))
+        yield Archive(archive, of)

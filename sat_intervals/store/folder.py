@@ -41,7 +41,7 @@ class Folder:
     def _reached(self) -> Iterator[Any]:
         """Yield the file system, which fsspec keeps; errors of its libraries become OSError."""
         try:
-            yield fsspec.url_to_fs(self.place)[0]
+            yield fsspec.url_to_fs(self.place, use_listings_cache=False)[0]
         except OSError:
             raise
         except Exception as error:
@@ -66,8 +66,8 @@ class Folder:
         with self._reached() as system:
             return bytes(system.cat_file(self._path(name)))
 
-    def write(self, name: str, content: bytes | memoryview) -> None:
-        """Write a file that exists only when it is complete."""
+    def write(self, name: str, content: bytes | memoryview, *, is_flushed: bool = False) -> None:
+        """Write a file that exists only when it is complete; ``is_flushed``: also after a power loss."""
         if not self.is_local:
             with self._reached() as system:
                 system.pipe_file(self._path(name), bytes(content))
@@ -76,7 +76,11 @@ class Folder:
         temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(content)
+            with temporary.open("xb") as stream:
+                stream.write(content)
+                if is_flushed:
+                    stream.flush()
+                    os.fsync(stream.fileno())
             os.replace(temporary, path)
         except OSError as error:
             temporary.unlink(missing_ok=True)
@@ -85,7 +89,6 @@ class Folder:
     def sizes(self, kind: str) -> dict[str, int]:
         """Return the sizes in bytes of the finished files in a subfolder, by name."""
         with suppress(FileNotFoundError), self._reached() as system:
-            system.invalidate_cache()
             found = system.ls(self._path(kind), detail=True)
             files = {os.path.basename(file["name"]): file["size"] for file in found if file["type"] == "file"}
             return {name: size for name, size in files.items() if not name.startswith(".")}
@@ -101,7 +104,6 @@ class Folder:
     def remove(self, kind: str) -> None:
         """Delete a subfolder with all that is in it."""
         with suppress(FileNotFoundError), self._reached() as system:
-            system.invalidate_cache()
             system.rm(self._path(kind), recursive=True)
 
     def remove_if_empty(self) -> None:

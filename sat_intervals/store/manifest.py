@@ -46,7 +46,7 @@ def read_manifest(home: Path) -> dict[str, Any] | None:
 
 def write_manifest(home: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest of a run."""
-    folder_at(home).write(MANIFEST, json.dumps(manifest, indent=1).encode())
+    folder_at(home).write(MANIFEST, json.dumps(manifest, indent=1).encode(), is_flushed=True)
 
 
 def grid_of(manifest: Mapping[str, Any]) -> Grid:
