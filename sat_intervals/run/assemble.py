@@ -34,8 +34,7 @@ from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.folder import folder_at
 from sat_intervals.store.tiles import COSTS, FAILURES, PARTS, PIXELS, Tables, home_of
 
-# Threads of this process that copy parts which workers cannot copy: one reads while another writes.
-_THREADS = 2
+_THREADS = 2  # that copy parts which workers cannot copy: one reads while another writes
 
 _LOG = logging.getLogger(__name__)
 

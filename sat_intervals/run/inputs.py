@@ -42,7 +42,7 @@ def check_unchanged(before: Mapping[str, Any], left: Image, right: Image, config
     except (OSError, ChangedInputError) as error:
         raise RunError(f"an input cannot be compared now: {error}; rerun the same command: it resumes") from error
     changes = list(differences(before, now))
-    if silent := [change for change in changes if change.endswith("now null")]:
+    if silent := [change for change in changes if change.endswith("now null")]:  # a server
         raise RunError(f"an input cannot be compared now ({silent[0]}); rerun the same command: it resumes")
     if changes:
         path = before[changes[0].partition(".")[0]]["path"]

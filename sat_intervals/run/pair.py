@@ -26,8 +26,7 @@ from sat_intervals.store.lock import locked
 from sat_intervals.store.tiles import BORDERS, COSTS, FAILURES, PIXELS, DamagedTilesError, home_of
 from sat_intervals.tiling import Tile, Window
 
-# How often damaged tiles are matched again; more damage means a broken disk.
-_TRIES = 2
+_TRIES = 2  # matches of damaged tiles; more damage means a broken disk
 
 _LOG = logging.getLogger(__name__)
 
@@ -60,8 +59,7 @@ def match_pair(
     keep_tiles
         Whether to keep the raw products of the tiles.
     overwrite
-        Whether a run in ``out``, and files of its names, may be replaced once this one is complete. Tiles of another
-        run are deleted, equal ones are used again.
+        Whether another run in ``out`` may be replaced; its tiles are deleted, equal ones are used again.
     progress
         Called regularly with stage, done and total.
 

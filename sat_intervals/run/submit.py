@@ -18,10 +18,8 @@ from sat_intervals.errors import RunError
 from sat_intervals.run.batch_system import check_accepted, logs_of
 from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, in_flight
 
-# Seconds after the last worker left, at which a run ends.
-WORKERS_GONE = 300.0
-# Seconds between warnings while there is no worker.
-_WARN_EVERY = 60.0
+WORKERS_GONE = 300.0  # seconds after the last worker left, at which a run ends
+_WARN_EVERY = 60.0  # seconds between warnings while there is no worker
 
 _LOG = logging.getLogger(__name__)
 

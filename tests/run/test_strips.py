@@ -304,20 +304,24 @@ def test_begin__refuses_a_disk_without_room_for_tiles_parts_and_files(tmp_path, 
     replace(job, has_files=False).begin()
 
 
-def test_begin__counts_missing_tiles_only(tall, tmp_path, monkeypatch):
+def test_begin__counts_missing_tiles_and_parts_only(tall, stopped, tmp_path, monkeypatch):
     folder, settings = tall
-    job = prepare(folder / "left.tif", folder / "right.tif", with_tiles(tall, tmp_path / "out"), settings)
-    monkeypatch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=0))
-    assert job.begin()
     needed = []
-    for tile in job.store.grid:
-        job.store.delete("tiles", [tile.name])
-        with pytest.raises(OutputError, match=r"has 0\.0 MB free, tiles, files and their parts may need") as refused:
-            job.begin()
-        needed.append(float(str(refused.value).partition("may need ")[2].partition(" MB")[0]))
-    assert len(needed) == 5
-    np.testing.assert_allclose(np.diff(needed), (needed[-1] - needed[0]) / 4, atol=0.1)
-    assert needed[0] < 0.6 * needed[-1]
+    for name in ("kept", "stopped"):  # without and with all parts
+        out = shutil.copytree(folder / name / "tiles", tmp_path / name / "tiles").parent
+        job = prepare(folder / "left.tif", folder / "right.tif", out, settings)
+        for tile in (None, *job.store.grid):
+            if tile is not None:
+                job.store.delete("tiles", [tile.name])
+            with monkeypatch.context() as patch:
+                patch.setattr("shutil.disk_usage", lambda place: SimpleNamespace(free=0))
+                with pytest.raises(OutputError, match=r"tiles, files and their parts may need") as refused:
+                    job.begin()
+            needed.append(float(str(refused.value).partition("may need ")[2].partition(" MB")[0]))
+    kept, stopped_later = needed[:6], needed[6:]
+    assert kept == sorted(kept)
+    assert kept[-1] > kept[0] + 1
+    assert all(later < before for later, before in zip(stopped_later, kept, strict=True))
 
 
 def test_match_pair__cleans_up_on_a_full_disk(tall, tmp_path, monkeypatch):
