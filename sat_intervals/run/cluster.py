@@ -64,7 +64,9 @@ def _client(settings: Cluster, out: Path) -> Iterator[Client]:
         with silence_logging_cmgr(logging.CRITICAL), _client_of(str(settings.address)) as client:
             yield client
     elif settings.kind == "processes":
-        with _local(settings) as cluster, Client(cluster) as client:
+        workers = settings.workers or usable_cores()
+        with _local(workers, 1 + readers(settings)) as cluster, Client(cluster) as client:
+            cluster.adapt(minimum=workers, maximum=workers)  # replaces those that are killed as they start
             yield client
     else:
         with batch_system(settings, out / "logs") as cluster, Client(cluster) as client:
@@ -81,12 +83,11 @@ def _client_of(address: str) -> Client:
         raise SatIntervalsError(f"no dask scheduler answers at {address}: {why}") from error
 
 
-def _local(settings: Cluster) -> LocalCluster:
-    workers = settings.workers or usable_cores()
+def _local(workers: int, threads: int) -> LocalCluster:
     try:
         return LocalCluster(
             n_workers=workers,
-            threads_per_worker=1 + readers(settings),
+            threads_per_worker=threads,
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
