@@ -14,7 +14,7 @@ from sat_intervals.config import Cluster
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import batch_system
-from sat_intervals.run.workers import readers
+from sat_intervals.run.workers import readers, reason
 
 # Seconds for local worker processes to start.
 STARTING = 120.0
@@ -94,7 +94,10 @@ def _local(workers: int, threads: int) -> LocalCluster:
             death_timeout=STARTING,
         )
     except Exception as error:  # any error at the start, such as a full /dev/shm
+        cause: BaseException = error
+        while earlier := cause.__cause__ or cause.__context__:
+            cause = earlier
         raise RunError(
-            f"the {workers} worker processes did not start ({' '.join(str(error.__cause__ or error).split())}): give "
+            f"the {workers} worker processes did not start ({reason(cause)}): give "
             "fewer --workers, more room in /dev/shm or another DASK_TEMPORARY_DIRECTORY, or use --cluster threads"
         ) from error

@@ -1,0 +1,136 @@
+"""Tasks on real clusters of dask: workers that die, stop or leave, a scheduler that is lost."""
+
+import os
+import signal
+import threading
+import time
+
+import dask
+import psutil
+import pytest
+from distributed import Client, KilledWorker, LocalCluster, wait
+from helpers import wait_until
+
+from sat_intervals.config import Cluster
+from sat_intervals.errors import RunError, SatIntervalsError
+from sat_intervals.run import cluster, submit
+from sat_intervals.run.cluster import connected
+from sat_intervals.run.submit import DaskWorkers
+from sat_intervals.run.workers import Task, reason
+
+pytestmark = pytest.mark.process
+
+
+def in_threads(workers=1):
+    """A cluster in threads of this process: its scheduler and workers are at hand."""
+    return LocalCluster(n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=None)
+
+
+def spawned():
+    """The worker processes, also those that are just starting."""
+    children = psutil.Process().children()
+    return [child for child in children if child.is_running() and "spawn_main" in " ".join(child.cmdline())]
+
+
+def ended(client, *tasks):
+    return [outcome for outcome in DaskWorkers(client).outcomes(iter(tasks)) if outcome]
+
+
+def test_outcomes__a_task_fails_alone_and_only_after_its_retries(tmp_path):
+    def work(number):
+        with (tmp_path / str(number)).open("a") as tries:
+            tries.write("x")
+        return 12 // number
+
+    with in_threads() as local, Client(local) as client:
+        outcomes = {end.label: end for end in ended(client, *(Task(n, work, (n,), 2) for n in range(4)))}
+    assert {label: end.result for label, end in outcomes.items()} == {0: None, 1: 12, 2: 6, 3: 4}
+    assert isinstance(outcomes[0].error, ZeroDivisionError)
+    assert [len((tmp_path / str(n)).read_text()) for n in range(4)] == [3, 1, 1, 1]
+
+
+def test_outcomes__an_error_of_the_disk_is_one_of_its_task():
+    with in_threads() as local, Client(local) as client:
+        (outcome,) = ended(client, Task(0, os.listdir, ("/nowhere",), 0))
+    assert reason(outcome.error) == "/nowhere: No such file or directory"
+
+
+def test_outcomes__a_task_that_kills_every_worker_fails(tmp_path, monkeypatch):
+    monkeypatch.setitem(cluster.DASK, "distributed.scheduler.allowed-failures", 1)
+    with connected(Cluster(kind="processes", workers=1), tmp_path) as client:
+        (outcome,) = ended(client, Task(0, os._exit, (3,), 2))
+    assert isinstance(outcome.error, KilledWorker)
+    assert reason(outcome.error).startswith("every worker that matched it died, the last at tcp://")
+
+
+def test_outcomes__go_on_when_workers_are_killed_as_they_start(tmp_path):
+    with connected(Cluster(kind="processes", workers=2), tmp_path) as client:
+        killed = set()
+        while len(killed) < 6:
+            for process in spawned():
+                process.kill()
+                killed.add(process.pid)
+        assert [end.result for end in ended(client, Task(0, abs, (-3,), 0))] == [3]
+
+
+def test_outcomes__go_on_without_a_worker_that_is_stopped(tmp_path, monkeypatch):
+    monkeypatch.setitem(cluster.DASK, "distributed.scheduler.worker-ttl", "6s")
+    with connected(Cluster(kind="processes", workers=2), tmp_path) as client:
+        psutil.Process(min(client.run(os.getpid).values())).send_signal(signal.SIGSTOP)
+        outcomes = ended(client, *(Task(n, abs, (-n,), 2) for n in range(9)))
+    assert sorted((end.label, end.result) for end in outcomes) == [(n, n) for n in range(9)]
+
+
+def test_outcomes__say_none_while_a_result_that_left_with_its_worker_is_computed_again(monkeypatch):
+    outcome, left = submit._outcome, []
+    with in_threads() as local, Client(local) as client:
+
+        async def after_its_worker_left(label, future):
+            await wait(future)
+            left.extend(local.workers.values())
+            await left[0].close()
+            threading.Timer(5, local.scale, [2]).start()
+            return await outcome(label, future)
+
+        monkeypatch.setattr(submit, "_outcome", after_its_worker_left)
+        *meanwhile, last = DaskWorkers(client).outcomes(iter([Task(0, abs, (-3,), 0)]))
+    assert (last.result, last.error, len(left)) == (3, None, 1)
+    assert len(meanwhile) > 1
+    assert {*meanwhile} == {None}
+
+
+def test_outcomes__end_when_the_scheduler_is_lost():
+    with in_threads() as local, Client(local) as client:
+        lost = threading.Timer(1, local.close)
+        lost.start()
+        with pytest.raises(RunError, match="the dask scheduler is gone; rerun the same command: it resumes"):
+            ended(client, Task(0, time.sleep, (3,), 0))
+        lost.join()
+
+
+def test_outcomes__tasks_that_nobody_waits_for_are_dropped():
+    with in_threads() as local, Client(local) as client:
+        outcomes = DaskWorkers(client).outcomes(Task(n, time.sleep, (1,), 0) for n in range(99))
+        next(outcomes)
+        outcomes.close()
+        wait_until(lambda: not local.scheduler.tasks, "no task is left")
+
+
+def test_connected__does_not_wait_for_a_host_that_nobody_knows(tmp_path):
+    address = "tcp://nowhere.invalid:1"
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        pytest.raises(SatIntervalsError, match=f"no dask scheduler answers at {address}: "),
+        connected(Cluster(kind="address", address=address), tmp_path),
+    ):
+        pass
+
+
+def test_connected__names_the_settings_with_which_dask_cannot_start(tmp_path):
+    (tmp_path / "file").touch()
+    with (
+        dask.config.set({"temporary-directory": str(tmp_path / "file" / "inside")}),
+        pytest.raises(RunError, match=r"did not start \(.*Not a directory.*\): .* another DASK_TEMPORARY_DIRECTORY"),
+        connected(Cluster(kind="processes", workers=1), tmp_path),
+    ):
+        pass
