@@ -13,8 +13,7 @@ from sat_intervals.config import Cluster
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.run.workers import readers
 
-# Batch systems with projects instead of accounts.
-_CHARGE_PROJECTS = "lsf", "sge"
+_CHARGE_PROJECTS = "lsf", "sge"  # not accounts
 
 
 def batch_system(settings: Cluster, logs: Path) -> Any:

@@ -16,8 +16,7 @@ from sat_intervals.machine import usable_cores
 from sat_intervals.run.batch_system import batch_system
 from sat_intervals.run.workers import readers, reason
 
-# Seconds for local worker processes to start.
-STARTING = 120.0
+STARTING = 120.0  # seconds for local worker processes to start
 DASK = {
     "distributed.scheduler.allowed-failures": 3,  # deaths of workers that a task survives
     "distributed.scheduler.worker-ttl": "5 minutes",  # a stopped worker's tasks then go to others

@@ -15,8 +15,7 @@ from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.machine import usable_cores
 
-# Seconds after which the caller is asked for more tasks, if no task has ended.
-CHECK_EVERY = 2.0
+CHECK_EVERY = 2.0  # seconds after which the caller is asked for more tasks, if no task has ended
 _FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
 _LOG = logging.getLogger(__name__)

@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import suppress
 
 import dask
 import psutil
@@ -26,10 +27,15 @@ def in_threads(workers=1):
     return LocalCluster(n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=None)
 
 
-def spawned():
-    """The worker processes, also those that are just starting."""
-    children = psutil.Process().children()
-    return [child for child in children if child.is_running() and "spawn_main" in " ".join(child.cmdline())]
+def kill_workers():
+    """Kill the worker processes, also those that are just starting; return their ids."""
+    killed = set()
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):
+            if "spawn_main" in " ".join(child.cmdline()):
+                child.kill()
+                killed.add(child.pid)
+    return killed
 
 
 def ended(client, *tasks):
@@ -67,9 +73,7 @@ def test_outcomes__go_on_when_workers_are_killed_as_they_start(tmp_path):
     with connected(Cluster(kind="processes", workers=2), tmp_path) as client:
         killed = set()
         while len(killed) < 6:
-            for process in spawned():
-                process.kill()
-                killed.add(process.pid)
+            killed |= kill_workers()
         assert [end.result for end in ended(client, Task(0, abs, (-3,), 0))] == [3]
 
 
