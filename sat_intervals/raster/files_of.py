@@ -3,6 +3,7 @@
 import os
 import re
 from contextlib import suppress
+from html import unescape
 from pathlib import Path
 
 from rasterio.io import DatasetReader
@@ -25,7 +26,7 @@ def files_of(path: str) -> list[str]:
     try:
         with gdal.reading(path) as dataset:
             check_listed(path, dataset)
-            listed = [file for file in dataset.files if not _is_same(file, path)]
+            listed = [file for file in dataset.files if not _is_same(file, path)] + _sources(path, dataset)
     except gdal.GDAL_ERRORS as error:  # it could be opened before
         raise ChangedInputError(f"{path} cannot be read: {gdal.reason(error)}: restore it") from error
     found = dict.fromkeys([path])
@@ -36,8 +37,17 @@ def files_of(path: str) -> list[str]:
         found[file] = None
         with suppress(*gdal.GDAL_ERRORS), gdal.reading(file) as dataset:  # other files are no rasters
             check_listed(file, dataset)
-            listed += dataset.files
+            listed += dataset.files + _sources(file, dataset)
     return [path, *sorted(found.keys() - {path})]
+
+
+def _sources(path: str, dataset: DatasetReader) -> list[str]:
+    """Return local sources that a virtual raster names and GDAL does not list, such as those of its mask."""
+    text = dataset.tags(ns="xml:VRT").get("xml:VRT", "") if dataset.driver == "VRT" else ""
+    named = re.findall(r'<SourceFilename(?: relativeToVRT="(\d)")?[^>]*>([^<]+)', text)
+    files = [os.path.join(os.path.dirname(path) if relative == "1" else "", unescape(name)) for relative, name in named]
+    listed = {os.path.realpath(file) for file in dataset.files}
+    return [file for file in files if os.path.isfile(file) and os.path.realpath(file) not in listed]
 
 
 def check_listed(path: str, dataset: DatasetReader) -> None:

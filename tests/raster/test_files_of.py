@@ -147,3 +147,10 @@ def test_files_of__refuse_a_format_that_hides_missing_data(folder):
         file.write(np.ones((1, SIZE, SIZE), "uint8"))
     with pytest.raises(InputError, match=r"a\.bil has a format \(ENVI\) in which GDAL .*: convert it with gdal_trans"):
         open_image(folder / "a.bil")
+
+
+def test_files_of__lists_the_source_of_a_mask_band(folder):
+    mask = f'<VRTRasterBand dataType="Byte"><SimpleSource>{SOURCE.format(1, "mask.tif")}</SimpleSource></VRTRasterBand>'
+    text = virtual(1, "image.tif").replace("</VRTDataset>", f"<MaskBand>{mask}</MaskBand></VRTDataset>")
+    (folder / "masked.vrt").write_text(text)
+    assert str(folder / "mask.tif") in files_of(str(folder / "masked.vrt"))
