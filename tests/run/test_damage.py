@@ -16,8 +16,6 @@ from sat_intervals.store.tiles import BORDERS, COSTS, ONCE, PARTS, PIXELS, TILES
 FILES = {
     f"{BORDERS}/0_1_0": "tiles",
     f"{PIXELS}/1_1": "tiles",
-    f"{COSTS}/1_1": "tiles",
-    f"{ONCE}/statistics": "tiles",
     f"{ONCE}/begun": "tiles",
     f"{TILES}/1_0": "bands",
     f"{PARTS}/0_0": "files",
@@ -25,21 +23,27 @@ FILES = {
 
 
 # Of MC-CNN only.
-OF_NETWORK = f"{COSTS}/1_1", f"{ONCE}/statistics"
+OF_NETWORK = {f"{COSTS}/1_1": "tiles", f"{ONCE}/statistics": "tiles"}
+
+
+def made(folder, **more):
+    """Write images and settings of 2 x 3 tiles, and match them."""
+    more |= {"tiles": {"size": 64}, "cluster": {"workers": 1}}
+    settings = write_pair(folder, make_scene(70, 132, seed=1), **more)
+    match_pair(folder / "left.tif", folder / "right.tif", folder / "whole", settings)
+    return folder, settings
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory):
-    """By whether it is matched with MC-CNN: images and settings of 2 x 3 tiles, and a run."""
-    found = {}
-    for has_network in (False, True):
-        folder = tmp_path_factory.mktemp("scene")
-        write_network(folder / "weights.onnx", random_weights())
-        more = {"preset": "mccnn", "cost": {"weights": str(folder / "weights.onnx")}} if has_network else {}
-        more |= {"tiles": {"size": 64}, "cluster": {"workers": 1}}
-        found[has_network] = folder, write_pair(folder, make_scene(70, 132, seed=1), **more)
-        match_pair(folder / "left.tif", folder / "right.tif", folder / "whole", found[has_network][1])
-    return found
+def scene(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def scene_of_network(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    weights = write_network(folder / "weights.onnx", random_weights())
+    return made(folder, preset="mccnn", cost={"weights": str(weights)})
 
 
 def matched(scene, out, **options):
@@ -73,38 +77,50 @@ def damage(file, how):
         file.write_bytes(DAMAGES[how](content))
 
 
-@pytest.mark.parametrize("how", DAMAGES)
-@pytest.mark.parametrize("name", FILES)
-def test_match_pair__makes_a_damaged_file_of_each_kind_again(scenes, tmp_path, name, how):
-    file, is_done = tmp_path / "out" / "tiles" / f"{name}.npz", False
+def matched_with_damage(scene, out, name, stage, how):
+    """Match a scene, and damage a file once when it is there in a stage."""
+    file, is_done = out / "tiles" / f"{name}.npz", False
 
-    def progress(stage, done, total):
+    def progress(now, done, total):
         nonlocal is_done
-        if stage == FILES[name] and not is_done and file.exists():
+        if now == stage and not is_done and file.exists():
             is_done = True
             damage(file, how)
 
-    matched(scenes[name in OF_NETWORK], tmp_path / "out", progress=progress)
+    matched(scene, out, progress=progress)
     assert is_done
 
 
 @pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize(("name", "stage"), FILES.items())
+def test_match_pair__makes_a_damaged_file_of_each_kind_again(scene, tmp_path, name, stage, how):
+    matched_with_damage(scene, tmp_path / "out", name, stage, how)
+
+
+@pytest.mark.peer("onnxruntime", "mc_cnn")
+@pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize(("name", "stage"), OF_NETWORK.items())
+def test_match_pair__makes_damaged_files_of_networks_again(scene_of_network, tmp_path, name, stage, how):
+    matched_with_damage(scene_of_network, tmp_path / "out", name, stage, how)
+
+
+@pytest.mark.parametrize("how", DAMAGES)
 @pytest.mark.parametrize(("stage", "kind"), [("tiles", BORDERS), ("bands", TILES), ("files", PARTS)])
-def test_match_pair__resumes_where_all_files_of_a_kind_are_damaged(scenes, tmp_path, stage, kind, how):
+def test_match_pair__resumes_where_all_files_of_a_kind_are_damaged(scene, tmp_path, stage, kind, how):
     with pytest.raises(StoppedError):
-        matched(scenes[False], tmp_path / "out", progress=stopped_at(stage))
+        matched(scene, tmp_path / "out", progress=stopped_at(stage))
     for file in (tmp_path / "out" / "tiles" / kind).iterdir():
         damage(file, how)
-    matched(scenes[False], tmp_path / "out")
+    matched(scene, tmp_path / "out")
 
 
-def test_match_pair__ends_where_a_disk_damages_all_files_written(scenes, tmp_path, monkeypatch):
+def test_match_pair__ends_where_a_disk_damages_all_files_written(scene, tmp_path, monkeypatch):
     def and_damage(job, block):
         match_block(job, block)
         for tile in job.store.grid.within(block.core):
             damage(job.out / "tiles" / TILES / f"{tile.name}.npz", "one bit")
 
-    folder, settings = scenes[False]
+    folder, settings = scene
     monkeypatch.setattr(run, "match_block", and_damage)
     with pytest.raises(RunError, match=r"^tiles 0_0, .*, 1_2 in .* are damaged or missing: rerun the same command"):
         match_pair(folder / "left.tif", folder / "right.tif", tmp_path / "out", settings)
