@@ -54,19 +54,7 @@ class _File(_Name):
         return Path(name)
 
 
-class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """``exact`` or a number of pixels."""
-
-    name = "exact|PIXELS"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
-        try:
-            return "exact" if value == "exact" else int(value)
-        except ValueError:
-            self.fail(f"{value!r} is neither exact nor a number of pixels: give exact, or 100", param, ctx)
-
-
-NAME, FILE, OVERLAP = _Name(), _File(), _Overlap()
+NAME, FILE = _Name(), _File()
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print errors only.")
 preset_option = click.option(

@@ -133,17 +133,17 @@ def _build_pyramids(image):
     Path(f"{other}.ovr").rename(f"{image}.ovr")
 
 
+def _stop_at_tiles(stage, done, total):
+    if stage == "tiles" and done:
+        raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize("show", [_show_in_qgis, _show_in_arcgis, _build_pyramids])
 def test_match_pair__resumes_when_its_image_was_shown_meanwhile(small_pair, show):
     folder, settings = small_pair
-
-    def stop(stage, done, total):
-        if stage == "tiles" and done:
-            raise KeyboardInterrupt
-
     images = folder / "left.tif", folder / "right.tif", folder / "out"
     with pytest.raises(KeyboardInterrupt):
-        match_pair(*images, settings, progress=stop)
+        match_pair(*images, settings, progress=_stop_at_tiles)
     show(folder / "left.tif")
     assert list(folder.glob("left.tif.*"))
     done = {file: file.stat().st_mtime_ns for file in folder.glob("out/tiles/tiles/*")}
@@ -164,14 +164,9 @@ def test_match__names_settings_that_cannot_be_looked_for(small_pair, dry_run):
 
 def test_match_pair__refuses_to_resume_with_a_changed_input(small_pair):
     folder, settings = small_pair
-
-    def stop(stage, done, total):
-        if stage == "tiles" and done:
-            raise KeyboardInterrupt
-
     images = folder / "left.tif", folder / "right.tif", folder / "out"
     with pytest.raises(KeyboardInterrupt):
-        match_pair(*images, settings, progress=stop)
+        match_pair(*images, settings, progress=_stop_at_tiles)
     kept = (folder / "right.tif").read_bytes()
     shutil.copy(folder / "other.tif", folder / "right.tif")
     with pytest.raises(ChangedInputError, match=r"holds the tiles of another run: inputs\.right\..*sha256 was "):
