@@ -5,14 +5,13 @@ from pathlib import Path
 import click
 
 from sat_intervals.cli.judging import Judging, judging_options, say_scenes
-from sat_intervals.cli.options import FILE, cost_option
+from sat_intervals.cli.options import FILE
 
 
 @click.command(short_help="Compare parts of the method on pairs with known truth.")
 @click.argument("pairs", nargs=-1, required=True, type=FILE)
-@cost_option
 @judging_options
-def ablate(pairs: tuple[Path, ...], cost: str | None, judging: Judging) -> None:
+def ablate(pairs: tuple[Path, ...], judging: Judging) -> None:
     """Compare the paper's baseline, alpha-cuts at several levels, and the whole method on PAIRS (the paper's table 2).
 
     Every pair is matched once, in memory. The table shows the accuracy (share of valid pixels whose interval contains
@@ -28,7 +27,7 @@ def ablate(pairs: tuple[Path, ...], cost: str | None, judging: Judging) -> None:
     from sat_intervals.evaluate.paper import SceneMetrics, table_2
 
     found = find_pairs(pairs)
-    configs = [judging.load(pair, cost) for pair in found]
+    configs = [judging.load(pair) for pair in found]
     scenes = []
     for pair, config in zip(found, configs, strict=True):
         if not judging.quiet:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from sat_intervals.config.pairs import Pair
     from sat_intervals.run.measure import Subject
 
-_OPTIONS_OF_OTHERS = "--coverage applies only with --dsm, and --calibration is an option of match: leave them out."
 _CALIBRATION = """\
 # Calibration: levels of the cost curve that reach a coverage, found by sat-intervals calibrate.
 # Use it with: sat-intervals match LEFT RIGHT OUT --coverage 0.9 --calibration FILE, with the settings of `key`.
@@ -57,18 +56,13 @@ _SETTINGS = """\
 )
 @reference_options("Calibrate this surface model against --reference, instead of pairs.")
 @json_option
-@partial(
-    settings_options,
-    levels=(
-        click.option(
-            "--coverage",
-            type=float,
-            metavar="C",
-            help="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
-        ),
-        click.option("--calibration", metavar="FILE", hidden=True, help="An option of match: refused, with a hint."),
-    ),
+@click.option(
+    "--coverage",
+    type=float,
+    metavar="C",
+    help="With --dsm: coverage that the margins must reach, .5 to .99; default: the coverage of the runs.",
 )
+@partial(settings_options, levels=False)
 @quiet_option
 @log_options
 def calibrate(
@@ -79,6 +73,7 @@ def calibrate(
     name: str | None,
     tune: bool,
     surface: SurfaceAndReference | None,
+    coverage: float | None,
     settings: SettingsArguments,
     as_json: bool,
     quiet: bool,
@@ -102,13 +97,12 @@ def calibrate(
     """
     if surface is not None:
         check_alone(pairs, settings, {"truth": truth, "tune": tune, **judging})
-        coverage = settings.sections.get("interval", {}).get("coverage")
         calibrate_heights(surface, output, name, coverage, overwrite=overwrite, as_json=as_json, quiet=quiet)
         return
     if not pairs:
         raise click.UsageError("give PAIRS, or --dsm and --reference.")
-    if "interval" in settings.sections:
-        raise click.UsageError(_OPTIONS_OF_OTHERS)
+    if coverage is not None:
+        raise click.UsageError("--coverage applies only with --dsm: leave it out.")
     from sat_intervals.cli.console import Console
     from sat_intervals.cli.tables import show_calibration
     from sat_intervals.run.calibrate import calibration_from, check_subjects

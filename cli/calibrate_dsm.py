@@ -26,8 +26,7 @@ def check_alone(pairs: Sequence[Path], settings: SettingsArguments, options: Map
         raise click.UsageError(f"{pairs[0]} is a pair and --dsm a surface model: calibrate one of them at a time.")
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
     for option in (*settings.options, *given):
-        if option != "--coverage":
-            raise click.UsageError(f"{option} applies to pairs, not to --dsm: leave it out.")
+        raise click.UsageError(f"{option} applies to pairs, not to --dsm: leave it out.")
 
 
 def calibrate_heights(

@@ -12,7 +12,7 @@ import click
 
 from sat_intervals.cli.evaluate_dsm import Surface, surface_options
 from sat_intervals.cli.judging import Judging, judging_options, say_scenes
-from sat_intervals.cli.options import COSTS, FILE
+from sat_intervals.cli.options import FILE
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -22,11 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Source:
-    """A finished run, or a pair to match first with a cost; with its truth and mask."""
+    """A finished run, or a pair to match first; with its truth and mask."""
 
     name: str
     pair: "Pair | None"
-    cost: str | None
     truth: Path | None
     mask: Path | None
 
@@ -38,9 +37,6 @@ class _Source:
 @click.option("--remove-bias", is_flag=True, help="Add the median of disparity - truth to the truth first.")
 @click.option("--group", metavar="LABEL", help="Put all scenes in this group; ignore meta.json.")
 @surface_options
-@click.option(
-    "--cost", type=click.Choice(COSTS), multiple=True, help="Matching cost of pairs; give it twice to compare both."
-)
 @judging_options
 def evaluate(
     folders: tuple[Path, ...],
@@ -49,7 +45,6 @@ def evaluate(
     remove_bias: bool,
     group: str | None,
     surface: Surface | None,
-    cost: tuple[str, ...],
     judging: Judging,
 ) -> None:
     """Evaluate the intervals of the runs in the folders OUT against the truth of their left images.
@@ -72,7 +67,7 @@ def evaluate(
     """
     if surface:
         others = {
-            "--truth": truth, "--mask": mask, "--remove-bias": remove_bias, "--group": group, "--cost": cost,
+            "--truth": truth, "--mask": mask, "--remove-bias": remove_bias, "--group": group,
             "--config": judging.config_file, "--preset": judging.preset, "--accurate": judging.accurate,
             "--tolerance": judging.tolerance,
         }  # fmt: skip
@@ -83,8 +78,8 @@ def evaluate(
     from sat_intervals.evaluate.disparity import evaluate_run
     from sat_intervals.evaluate.paper import SceneMetrics
 
-    sources = _sources(folders, truth, mask, cost)
-    configs = _configs(sources, judging, cost)
+    sources = _sources(folders, truth, mask)
+    configs = _configs(sources, judging)
     judge = partial(evaluate_run, tolerance=judging.tolerance, remove_bias=remove_bias)
     scenes = [
         SceneMetrics(source.name, group or _group(source), _evaluated(judge, source, config, judging.quiet))
@@ -107,10 +102,8 @@ def _warn_of_whole_truth(scenes: "list[SceneMetrics]", tolerance: float) -> None
         click.echo(f"warning: the truth of {', '.join(names)} has whole pixels only: try --tolerance 0.5", err=True)
 
 
-def _sources(
-    folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...], costs: tuple[str, ...]
-) -> list[_Source]:
-    """Return the sources named by the arguments, in their order; pairs once per cost."""
+def _sources(folders: tuple[Path, ...], truths: tuple[Path, ...], masks: tuple[Path, ...]) -> list[_Source]:
+    """Return the sources named by the arguments, in their order."""
     if not folders:
         raise click.UsageError("Missing argument 'OUT...'.")
     from sat_intervals.config.pairs import check_names, find_pairs, is_pair
@@ -133,16 +126,13 @@ def _sources(
         if len(given) not in (0, len(found)):
             raise SatIntervalsError(f"{option} is given {len(given)} times for {len(found)} OUT: give it once for each")
     absent = (None,) * len(found)
-    named = list(zip(found, truths or absent, masks or absent, strict=True))
-    several = len(costs) > 1
     return [
-        _Source(f"{name} ({cost})" if several and pair else name, pair, cost if pair else None, truth, mask)
-        for (name, pair), truth, mask in named
-        for cost in ((costs if pair else costs[:1]) or (None,))
+        _Source(name, pair, truth, mask)
+        for (name, pair), truth, mask in zip(found, truths or absent, masks or absent, strict=True)
     ]
 
 
-def _configs(sources: list[_Source], judging: Judging, costs: tuple[str, ...]) -> "list[Config | None]":
+def _configs(sources: list[_Source], judging: Judging) -> "list[Config | None]":
     """Return the settings to match each pair with; None for a run."""
     from sat_intervals.errors import SatIntervalsError
 
@@ -150,7 +140,6 @@ def _configs(sources: list[_Source], judging: Judging, costs: tuple[str, ...]) -
         "--accurate": judging.accurate,
         f"--config {judging.config_file}": judging.config_file,
         f"--preset {judging.preset}": judging.preset,
-        f"--cost {' '.join(costs)}": costs,
     }
     option = next((name for name, value in given.items() if value), None)
     if option and not any(source.pair for source in sources):
@@ -159,7 +148,7 @@ def _configs(sources: list[_Source], judging: Judging, costs: tuple[str, ...]) -
     for source in sources:
         config = None
         if source.pair:
-            config = judging.load(source.pair, source.cost, products={"keep_rejected": True})
+            config = judging.load(source.pair, products={"keep_rejected": True})
             if config.interval is None:
                 raise SatIntervalsError(
                     f"{judging.config_file}: interval is null, but evaluate needs intervals: leave it on"
@@ -177,7 +166,7 @@ def _evaluated(
     from sat_intervals.run.pair import match_pair
 
     if not quiet:
-        click.echo(f"matching {source.name}{f' with {source.cost}' if source.cost else ''}", err=True)
+        click.echo(f"matching {source.name}", err=True)
     with TemporaryDirectory(prefix="sat-intervals-") as out:
         match_pair(source.pair.left, source.pair.right, out, config)
         return judge(out, source.truth or source.pair.truth, source.mask)

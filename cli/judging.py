@@ -44,15 +44,13 @@ class Judging:
     as_json: bool
     quiet: bool
 
-    def load(self, pair: "Pair", cost: str | None, **sections: Any) -> "Config":
+    def load(self, pair: "Pair", **sections: Any) -> "Config":
         """Load the settings to match a pair with."""
         from sat_intervals.config import load_config
 
         sections["disparity"] = {"minimum": pair.minimum, "maximum": pair.maximum}
         if self.preset is not None:
             sections["preset"] = self.preset
-        if cost is not None:
-            sections["cost"] = {"method": cost}
         if self.accurate:
             sections["cross_check"] = {"method": "accurate"}
         return load_config(self.config_file, sections)

@@ -1,6 +1,6 @@
 """Options shared by the commands that match: the pair, its settings, the run."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -12,11 +12,9 @@ from sat_intervals.cli.options import (
     FILE,
     NAME,
     Command,
-    cost_option,
     log_options,
     preset_option,
     quiet_option,
-    store_option,
     with_options,
 )
 
@@ -28,28 +26,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PairArguments:
-    """Two epipolar images, the options that say how to read them, and the region of the left one to match."""
+    """Two epipolar images with their masks, no-data values and bands, and the region of the left one to match."""
 
-    left: str
-    right: str
-    options: Mapping[str, Any]
+    images: tuple[str, str]
+    masks: tuple[str | None, str | None]
+    nodata: tuple[float | None, float | None]
+    bands: tuple[int | None, int | None]
     window: "Window | None"
 
     @property
     def files(self) -> list[str]:
         """Return images and masks."""
-        return [self.left, self.right, *filter(None, (self.options["left_mask"], self.options["right_mask"]))]
+        return [*self.images, *filter(None, self.masks)]
 
     def open(self) -> "tuple[Image, Image]":
-        """Open both images; options of one side win over those of both."""
-        return self._opened(self.left, "left"), self._opened(self.right, "right")
-
-    def _opened(self, file: str, side: str) -> "Image":
+        """Open both images."""
         from sat_intervals.raster import open_image
 
-        own = {name: self.options[f"{side}_{name}"] for name in ("band", "nodata")}
-        both = {name: self.options[name] if value is None else value for name, value in own.items()}
-        return open_image(file, **both, mask=self.options[f"{side}_mask"])
+        left, right = (
+            open_image(file, band=band, nodata=nodata, mask=mask)
+            for file, mask, nodata, band in zip(self.images, self.masks, self.nodata, self.bands, strict=True)
+        )
+        return left, right
 
 
 @dataclass(frozen=True)
@@ -99,17 +97,32 @@ class RunArguments:
             raise RunError(f"{count}, see above, and --strict is given; the files are written")
 
 
+class _Both(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """A number for both images, or two, LEFT,RIGHT."""
+
+    def __init__(self, kind: type[float]) -> None:
+        self.name, self._kind = kind.__name__, kind
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> Any:
+        try:
+            left, *right = map(self._kind, str(value).split(","))
+            (right_or_left,) = right or (left,)
+        except ValueError:
+            self.fail(f"{value!r} is neither a number nor two, LEFT,RIGHT", parameter, context)
+        return left, right_or_left
+
+
 _IMAGE_OPTIONS = (
     click.option("--left-mask", type=NAME, help="Mask of the left image: non-zero = masked."),
     click.option("--right-mask", type=NAME, help="Mask of the right image."),
-    click.option("--nodata", type=float, metavar="V", help="No-data value of both images, replaces that of the files."),
-    click.option("--left-nodata", type=float, metavar="V", help="No-data value of the left image."),
-    click.option("--right-nodata", type=float, metavar="V", help="No-data value of the right image."),
-    click.option("--band", type=int, metavar="N", help="Band to match in both images, required if they have several."),
-    click.option("--left-band", type=int, metavar="N", help="Band of the left image."),
-    click.option("--right-band", type=int, metavar="N", help="Band of the right image."),
+    click.option(
+        "--nodata",
+        type=_Both(float),
+        metavar="V",
+        help="No-data value of both images, or LEFT,RIGHT; replaces that of the files.",
+    ),
+    click.option("--band", type=_Both(int), metavar="N", help="Band to match in both images, or LEFT,RIGHT."),
 )
-_OF_IMAGES = ("left_mask", "right_mask", "nodata", "left_nodata", "right_nodata", "band", "left_band", "right_band")
 
 
 def pair_options(command: Command) -> Command:
@@ -119,8 +132,10 @@ def pair_options(command: Command) -> Command:
     def with_pair(*, left: str, right: str, window: tuple[int, int, int, int] | None, **others: Any) -> Any:
         from sat_intervals.tiling import Window
 
-        of_images = {name: others.pop(name) for name in _OF_IMAGES}
-        return command(pair=PairArguments(left, right, of_images, Window(*window) if window else None), **others)
+        masks = others.pop("left_mask"), others.pop("right_mask")
+        nodata, band = (others.pop(name) or (None, None) for name in ("nodata", "band"))
+        region = Window(*window) if window else None
+        return command(pair=PairArguments((left, right), masks, nodata, band, region), **others)
 
     return with_options(
         with_pair,
@@ -131,18 +146,6 @@ def pair_options(command: Command) -> Command:
             "--window", type=int, nargs=4, metavar="ROW COL HEIGHT WIDTH", help="Region of the left image to match."
         ),
     )
-
-
-class _Overlap(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """``exact`` or a number of pixels."""
-
-    name = "exact|PIXELS"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
-        try:
-            return "exact" if value == "exact" else int(value)
-        except ValueError:
-            self.fail(f"{value!r} is neither exact nor a number of pixels: give exact, or 100", param, ctx)
 
 
 local_option = click.option(
@@ -157,73 +160,84 @@ _SEARCH_OPTIONS = (
         help="Search range in pixels, both ends searched; default: found from the images.",
     ),
     local_option,
-    click.option("--range-grid", type=NAME, help="Raster of two bands, minimum and maximum of each pixel."),
 )
 _LEVEL_OPTIONS = (
-    click.option(
-        "--coverage",
-        type=float,
-        metavar="C",
-        help="Share of true disparities to be inside, .5 to .99, instead of alpha.",
-    ),
+    click.option("--coverage", type=float, metavar="C", help="Share of true disparities to be inside, .5 to .99."),
     click.option("--calibration", type=NAME, help="Calibration for --coverage; default the built-in one."),
+    click.option("--alpha", type=float, metavar="A", help="Level of possibility, 0 to 1, instead of a coverage."),
 )
 _FIRST_SETTINGS = (
     click.option("--config", "config_file", type=FILE, help="Settings (YAML); the command line wins."),
     preset_option,
-    cost_option,
 )
 _LAST_SETTINGS = (
     click.option("--tile-size", type=int, help="Side of a tile's core in pixels, a multiple of 64."),
-    click.option(
-        "--overlap",
-        type=_Overlap(),
-        help="exact (default): results do not depend on the tiles; or a number of pixels read around each tile, with "
-        "results that depend on them slightly.",
-    ),
     click.option("--workers", type=click.IntRange(min=1), help="Tiles at once; default one per core."),
     click.option(
         "--cluster",
         metavar="SPEC",
         help="threads (default), processes, slurm, pbs, lsf, sge, or the address of a dask scheduler.",
     ),
-    store_option,
+    click.option(
+        "--set", "named", multiple=True, metavar="KEY=VALUE", help="Any other setting, such as tiles.overlap=100."
+    ),
 )
 
 
 # Section and key of the options that are settings as they stand.
 _PLACES = {
-    "cost": ("cost", "method"),
     "coverage": ("interval", "coverage"),
     "calibration": ("interval", "calibration"),
+    "alpha": ("interval", "alpha"),
     "tile_size": ("tiles", "size"),
-    "overlap": ("tiles", "overlap"),
     "workers": ("cluster", "workers"),
-    "store": ("cluster", "store"),
 }
 
 
-def settings_options(command: Command, levels: Sequence[Callable[[Command], Command]] = _LEVEL_OPTIONS) -> Command:
+def settings_options(command: Command, *, levels: bool = True) -> Command:
     """Add options for settings; the command gets ``settings``, a `SettingsArguments`.
 
-    ``levels`` are the options --coverage and --calibration, where they mean something else than in `match`.
+    ``levels``: whether --coverage, --calibration and --alpha are among them.
     """
 
     @wraps(command)
-    def with_settings(*, config_file: Path | None, preset: str | None, cluster: str | None, **others: Any) -> Any:
-        sections: dict[str, Any] = {"preset": preset} if preset else {}
-        given = {"config": config_file, "preset": preset, "cluster": cluster} | {name: others[name] for name in _PLACES}
-        names = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
-        for option, (section, key) in _PLACES.items():
-            if (value := others.pop(option)) is not None:
-                sections.setdefault(section, {})[key] = value
+    def with_settings(
+        *, config_file: Path | None, preset: str | None, cluster: str | None, named: tuple[str, ...], **others: Any
+    ) -> Any:
+        places = {name: place for name, place in _PLACES.items() if levels or place[0] != "interval"}
+        values = {name: others.pop(name) for name in places}
+        given = {"config": config_file, "preset": preset, "cluster": cluster, "set": named or None} | values
+        sections = _named(named) | ({"preset": preset} if preset else {})
+        for name, (section, key) in places.items():
+            if values[name] is not None:
+                sections[section] = sections.get(section, {}) | {key: values[name]}
         if cluster:
-            is_address = "://" in cluster
-            chosen = {"kind": "address", "address": cluster} if is_address else {"kind": cluster}
+            chosen = {"kind": "address", "address": cluster} if "://" in cluster else {"kind": cluster}
             sections["cluster"] = sections.get("cluster", {}) | chosen
-        return command(settings=SettingsArguments(config_file, sections, names), **others)
+        options = tuple(f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None)
+        return command(settings=SettingsArguments(config_file, sections, options), **others)
 
-    return with_options(with_settings, *_FIRST_SETTINGS, *levels, *_LAST_SETTINGS)
+    return with_options(with_settings, *_FIRST_SETTINGS, *(_LEVEL_OPTIONS if levels else ()), *_LAST_SETTINGS)
+
+
+def _named(settings: tuple[str, ...]) -> dict[str, Any]:
+    """Return the sections of settings given as ``KEY=VALUE``, whose values are YAML."""
+    if not settings:
+        return {}
+    import yaml
+
+    from sat_intervals.config.files import set_by_name
+
+    sections: dict[str, Any] = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        try:
+            if not equals:
+                raise ValueError("give KEY=VALUE, such as tiles.overlap=100")
+            set_by_name(sections, key, value)
+        except (ValueError, yaml.YAMLError) as error:
+            raise click.UsageError(f"--set {setting}: {' '.join(str(error).split())}") from error
+    return sections
 
 
 def search_options(command: Command) -> Command:
@@ -231,19 +245,13 @@ def search_options(command: Command) -> Command:
 
     @wraps(command)
     def with_search(
-        *,
-        settings: SettingsArguments,
-        disparity: tuple[int, int] | None,
-        local_range: bool,
-        range_grid: str | None,
-        **others: Any,
+        *, settings: SettingsArguments, disparity: tuple[int, int] | None, local_range: bool, **others: Any
     ) -> Any:
         search: dict[str, Any] = dict(zip(("minimum", "maximum"), disparity or (), strict=False))
         if local_range:
             search["local"] = True
-        if range_grid is not None:
-            search["grid"] = range_grid
-        sections = settings.sections | ({"disparity": search} if search else {})
+        named = settings.sections.get("disparity", {})
+        sections = settings.sections | ({"disparity": named | search} if search else {})
         return command(settings=replace(settings, sections=sections), **others)
 
     return with_options(settings_options(with_search), *_SEARCH_OPTIONS)
@@ -258,11 +266,7 @@ def run_options(command: Command) -> Command:
 
     return with_options(
         with_run,
-        click.option(
-            "--strict",
-            is_flag=True,
-            help="End with status 1 if the run prints a warning, for example that the search range is too narrow.",
-        ),
+        click.option("--strict", is_flag=True, help="End with status 1 if the run prints a warning."),
         click.option("--keep-tiles", is_flag=True, help="Keep the products of tiles, until a call without it."),
         click.option(
             "--overwrite",

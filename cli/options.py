@@ -13,8 +13,7 @@ from click.shell_completion import CompletionItem
 from sat_intervals.cli.logs import logged
 
 # Copied from `sat_intervals.config`, which --help must not import.
-COSTS = ("census", "mccnn")
-PRESETS = ("paper", "satellite", "satellite-mccnn", "urban", "mountain", "homogeneous", "mccnn")
+PRESETS = ("satellite", "satellite-mccnn", "paper", "mccnn")
 
 # Pictures that `plot` writes to the folder of a run, without their ending.
 PICTURES = ("overview", "errors", "coverage", "range", "profile", "curve", "dsm")
@@ -60,11 +59,8 @@ quiet_option = click.option("--quiet", "-q", is_flag=True, help="Print errors on
 preset_option = click.option(
     "--preset",
     type=click.Choice(PRESETS),
-    help="Settings for all keys that are not given: satellite for satellite images, satellite-mccnn for different "
-    "dates or little texture, paper (default) for the paper's figures.",
+    help="satellite (default), satellite-mccnn for different dates or little texture, paper for the paper's figures.",
 )
-cost_option = click.option("--cost", type=click.Choice(COSTS), help="Matching cost, with its default penalties.")
-store_option = click.option("--store", type=NAME, metavar="URL", help="Folder or fsspec URL for tiles during the run.")
 _SENSOR_OPTIONS = tuple(
     click.option(f"--{side}-{kind}", required=True, type=FILE, help=text.format(side))
     for kind, text in (("model", "RPC model of the {} sensor image."), ("grid", "Epipolar grid of the {} image."))

@@ -14,7 +14,7 @@ _BARS = 8
 
 @click.command("range", short_help="Find the search range of a pair.")
 @pair_options
-@click.option("--output", type=FILE, help="Write the local ranges, for --range-grid of match.")
+@click.option("--output", type=FILE, help="Write the local ranges, for the setting disparity.grid of match.")
 @overwrite_option
 @json_option
 @quiet_option
@@ -36,7 +36,7 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
     with Console(quiet or as_json) as console:
         left, right = pair.open()
         if output:
-            names = [name for image in (left, right) for name in (image.path, image.mask) if name]
+            names = pair.files
             check_not_replaced([file for name in names for file in (name, *files_of(name))], [output])
             check_free(output, overwrite=overwrite)
         found = find_here(left, right, console.progress)
@@ -47,7 +47,7 @@ def search_range(pair: PairArguments, output: Path | None, overwrite: bool, as_j
         return
     for name, value in _rows(found):
         click.echo(f"{name:<36}{value}")
-    for line in doubts(found.quality, {"left": pair.left, "right": pair.right}):
+    for line in doubts(found.quality, dict(zip(("left", "right"), pair.images, strict=True))):
         click.echo(line)
 
 

@@ -64,10 +64,9 @@ def pytest_collection_finish() -> None:
 LEAST = {"cross_check": None, "median": None, "regularization": None}
 SEARCH = {"minimum": 0, "maximum": 9}
 VARIANTS = (
-    {},
-    {"disparity": SEARCH | {"local": True}} | LEAST,
-    {"preset": "satellite"} | LEAST,
-    {"sgm": {"penalty": "negative", "alpha": 1, "gamma": 40}} | LEAST,
+    {"preset": "satellite"},
+    {"preset": "paper", "disparity": SEARCH | {"local": True}} | LEAST,
+    {"preset": "paper"} | LEAST,
 )
 
 

@@ -53,7 +53,7 @@ def _report(inputs, bands, validity):
     tally = Tally(MAXIMUM - MINIMUM + 1)
     tally.add(Bands(*bands, validity))
     described = {"height": height, "width": width, "band": 1, "nodata": "0.0", "mask": None, "dtype": "uint16"}
-    config = load_config({"disparity": {"minimum": MINIMUM, "maximum": MAXIMUM}})
+    config = load_config({"preset": "paper", "disparity": {"minimum": MINIMUM, "maximum": MAXIMUM}})
     return {
         "finished": FINISHED,
         "settings": config.model_dump(mode="json"),

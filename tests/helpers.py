@@ -39,11 +39,12 @@ STATISTICS = (
 
 
 def write_pair(folder: Path, scene: Scene, *, group: str = "all", **sections: Any) -> dict[str, Any]:
-    """Write images and truth of a scene, meta.json and settings.yaml; return the settings: its range and sections."""
+    """Write images and truth of a scene, meta.json and settings.yaml; return these: the paper's, range, sections."""
     for name, nodata in (("left", 0), ("right", 0), ("truth", np.nan)):
         write_layer(folder / f"{name}.tif", getattr(scene, name), nodata, PLACE)
     (folder / "meta.json").write_text(json.dumps({"disparity": [scene.minimum, scene.maximum], "group": group}))
-    settings = {"disparity": {"minimum": scene.minimum, "maximum": scene.maximum}} | sections
+    search = {"minimum": scene.minimum, "maximum": scene.maximum}
+    settings = {"preset": "paper", "disparity": search} | sections
     (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
     return settings
 

@@ -128,17 +128,15 @@ def path_cost(cost, empty, step, p1, p2):
     return path
 
 
-def edge_penalties(left, right, count, step, tables, edges, own_column=None):
+def edge_penalties(left, right, count, step, tables, edges):
     """P1 and P2 of a path by the number of images, none to both, whose gradient along it is above its edge.
 
-    ``tables`` are P1 and P2 by that number; ``own_column`` = -minimum looks at the right image in the left pixel's own
-    column instead of at the pixel that a candidate faces.
+    ``tables`` are P1 and P2 by that number.
     """
     shape = *left.shape, count
     p1, p2 = np.zeros(shape, int), np.zeros(shape, int)
     for r, c, k in np.ndindex(shape):
-        x = c + (k if own_column is None else own_column)
-        found = gradient(left, (r, c), step) > edges[0], gradient(right, (r, x), step) > edges[1]
+        found = gradient(left, (r, c), step) > edges[0], gradient(right, (r, c + k), step) > edges[1]
         p1[r, c, k], p2[r, c, k] = (table[sum(found)] for table in tables)
     return p1, p2
 
@@ -148,14 +146,6 @@ def gradient(image, p, step):
     q = p[0] - step[0], p[1] - step[1]
     inside = 0 <= q[0] < image.shape[0] and 0 <= q[1] < image.shape[1]
     return abs(float(image[p]) - float(image[q])) if inside else 0.0
-
-
-def banz_penalties(left, count, step, p1, p2, curve):
-    """P1 and P2 of a path where P2 is a curve of the left image's gradient, at least p2 (Banz et al. 2012)."""
-    result = np.zeros((*left.shape, count), int)
-    for r, c in np.ndindex(left.shape):
-        result[r, c] = max(p2, math.floor(curve(gradient(left, (r, c), step)) + 0.5))
-    return p1, result
 
 
 def correlation(left, right):
@@ -464,7 +454,7 @@ def match_view(view, minimum, maximum, config):
         window,
     )
     if config.sgm is not None:
-        volume = aggregate(volume, window, config.sgm.p1, config.sgm.p2)
+        volume = aggregate(volume, window, int(config.sgm.p1), int(config.sgm.p2))
     return volume, window_state(left_state, window), window_state(right_state, window)
 
 
@@ -497,16 +487,13 @@ def percentiles_of(amounts, searched, config):
 
 
 def cuts_of(volume, cost_span, config):
-    """Sections 5 and 16: bounds of each pixel as indices, at one level or at those of both classes."""
+    """Sections 5 and 16: bounds of each pixel as indices, those of alpha or those of both classes of a coverage."""
     refine = config.refinement is not None
-    if config.interval.bounds == "whole":
+    if config.interval.coverage is None:
         yield alpha_cut(volume, config.interval.alpha, cost_span, extend=refine)
         return
-    levels = [Fraction((1 - Decimal(str(config.interval.alpha or 1))) * cost_span)]
-    if config.interval.coverage is not None:
-        levels = [Fraction(config.cuts.high), Fraction(config.cuts.low)]
-    for level in levels:
-        yield tuple(bound / 64 for bound in subpixel_cut(volume, level, 64, refine))
+    for level in (config.cuts.high, config.cuts.low):
+        yield tuple(bound / 64 for bound in subpixel_cut(volume, Fraction(level), 64, refine))
 
 
 def match_arrays(left, right, left_state, right_state, config):
@@ -520,9 +507,9 @@ def match_arrays(left, right, left_state, right_state, config):
     view = SimpleNamespace(left=left, right=right, left_state=left_state, right_state=right_state)
     minimum, maximum = config.disparity.minimum, config.disparity.maximum
     volume, left_windows, right_windows = match_view(view, minimum, maximum, config)
-    cost_span = span(config.cost.window, config.sgm and config.sgm.p2)
+    cost_span = span(config.cost.window, config.sgm and int(config.sgm.p2))
 
-    is_subpixel = config.interval is not None and config.interval.bounds == "subpixel"
+    is_subpixel = config.interval is not None and config.interval.coverage is not None
 
     winner = winner_takes_all(volume)
     searched = winner != NONE

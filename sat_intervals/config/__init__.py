@@ -8,7 +8,7 @@ from sat_intervals.config.height_calibration import (
     surface_key,
 )
 from sat_intervals.config.interval import Interval
-from sat_intervals.config.penalties import CosineSgm, InverseSgm, MccnnSgm, NegativeSgm, Sgm
+from sat_intervals.config.penalties import MccnnSgm, Sgm
 from sat_intervals.config.presets import PRESETS, preset_text
 from sat_intervals.config.reading import load_config, named_files, read_yaml
 from sat_intervals.config.sections import (
@@ -31,14 +31,11 @@ __all__ = [
     "Cluster",
     "Config",
     "ConfigError",
-    "CosineSgm",
     "Disparity",
     "HeightCalibration",
     "Interval",
-    "InverseSgm",
     "Mccnn",
     "MccnnSgm",
-    "NegativeSgm",
     "Regularization",
     "Sgm",
     "WidthClass",

@@ -151,7 +151,7 @@ def key_of(config: "Config") -> dict[str, Any]:
 
     return {
         "cost": cost,
-        "sgm": content(config.sgm),
+        "sgm": config.sgm and config.sgm.model_dump(mode="json", exclude_none=True),
         "span": config.cost_span,
         "ambiguity": ambiguity and ambiguity.model_dump(mode="json", include={"eta_max", "eta_step", "normalization"}),
         "refinement": content(config.refinement),

@@ -57,6 +57,18 @@ def load_yaml(text: str | bytes, most: int = _NODES) -> Any:
         loader.dispose()
 
 
+def set_by_name(settings: dict[str, Any], key: str, value: Any) -> None:
+    """Set a setting by its dotted name, such as ``tiles.size``; text is parsed as YAML."""
+    *sections, last = key.split(".")
+    for section in sections:
+        settings = settings.setdefault(section, {})
+        if not isinstance(settings, dict):
+            raise ValueError(f"{section} is also given as a whole")
+    if last in settings:
+        raise ValueError(f"parts of {last} are also given" if isinstance(settings[last], dict) else "given twice")
+    settings[last] = load_yaml(value) if isinstance(value, str) else value
+
+
 def read_small(file: Path, most: int = _LARGEST_FILE) -> bytes:
     """Read a file of settings or pairs of at most ``most`` bytes."""
     with file.open("rb") as stream:

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from sat_intervals.config.files import LARGEST_TABLE, load_yaml, read_small
+from sat_intervals.config.files import LARGEST_TABLE, load_yaml, read_small, set_by_name
 from sat_intervals.errors import SatIntervalsError
 
 _FILES = ("left.tif", "right.tif", "truth.tif", "meta.json")
@@ -197,7 +197,7 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
     settings: dict[str, Any] = {}
     for key, value in row.items():
         try:
-            _set(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
+            set_by_name(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
         except (ValueError, RecursionError, yaml.YAMLError) as error:
             raise SatIntervalsError(f"{place}: {key} is {value!r}: {' '.join(str(error).split())}") from error
     return PairOfBatch(name, settings=settings, reading=reading, window=window, **images, **surface)
@@ -233,18 +233,6 @@ def _window(place: str, value: Any) -> tuple[int, int, int, int]:
     except (TypeError, ValueError) as error:
         raise SatIntervalsError(f"{place}: window is {value!r}, needed: row, column, height and width") from error
     return row, column, height, width
-
-
-def _set(settings: dict[str, Any], key: str, value: Any) -> None:
-    """Set a setting by its dotted name; text, such as a cell of a CSV file, is parsed as YAML."""
-    *sections, last = key.split(".")
-    for section in sections:
-        settings = settings.setdefault(section, {})
-        if not isinstance(settings, dict):
-            raise ValueError(f"the row also gives {section} as a whole")
-    if last in settings:
-        raise ValueError(f"the row also gives parts of {last}" if isinstance(settings[last], dict) else "given twice")
-    settings[last] = load_yaml(value) if isinstance(value, str) else value
 
 
 def _relative_to(file: Path, path: str) -> str:

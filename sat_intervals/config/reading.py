@@ -1,20 +1,17 @@
 """Read settings from YAML files, mappings and the command line."""
 
-import logging
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from sat_intervals.config.files import read_mapping
-from sat_intervals.config.presets import PRESETS, merged, without_other_cost, without_other_interval
-from sat_intervals.config.sections import ConfigError
+from sat_intervals.config.presets import PRESETS, merged, preset_settings
+from sat_intervals.config.sections import ConfigError, Section
 from sat_intervals.config.settings import Config
 from sat_intervals.config.wording import explained, shown
 
-_LOG = logging.getLogger(__name__)
 # Settings that name a file.
 _FILES = ("cost", "weights"), ("interval", "calibration"), ("disparity", "grid")
 
@@ -45,42 +42,47 @@ def load_config(
     ConfigError
         Lists all errors in one line.
     """
-    overrides = overrides or {}
-    values: Mapping[str, Any] = {}
-    place = f"{file}: " if file else ""
-    match source:
-        case None:
-            pass
-        case str() | Path():
-            values, place = read_yaml(Path(source)), f"{source}: "
-        case Config():
-            values = source.model_dump()
-            if overrides.get("preset") not in (None, source.preset):
-                raise ConfigError(
-                    f"preset {shown(overrides['preset'])} has no effect on a Config, which is complete: give it with "
-                    "the settings that the Config is made from"
-                )
-        case Mapping():
-            values = source
-        case _:
-            raise ConfigError(f"settings are {shown(source)}, allowed: a YAML file, a mapping or a Config")
+    if isinstance(source, Config) and not overrides:
+        return source
+    overrides = _plain(overrides or {})
+    place = f"{source}: " if isinstance(source, str | Path) else f"{file}: " if file else ""
+    values = _values(source)
     names = [settings["preset"] for settings in (values, overrides) if settings.get("preset") is not None]
+    if isinstance(source, Config) and len(set(names)) > 1:
+        raise ConfigError(
+            f"preset {shown(overrides['preset'])} has no effect on a Config, which is complete: give it with the "
+            "settings that the Config is made from"
+        )
     if len(set(map(str, names))) > 1 and not preset_wins:
         raise ConfigError(f"{place}preset is {shown(names[0])}, and {shown(names[1])} is asked for: leave one out")
-    settings = merged(without_other_interval(without_other_cost(values, overrides), overrides), overrides)
+    preset = names[-1] if names else PRESETS[0]
+    if preset in PRESETS:
+        values = merged(preset_settings(preset), values)
     try:
-        config = Config.model_validate(settings)
+        return Config.model_validate(merged(values, overrides))
     except ValidationError as error:
         problems = error.errors(include_url=False)
         if all(_given(overrides, problem["loc"]) for problem in problems):
             place = ""  # the errors are in the overrides
         raise ConfigError(place + "; ".join(dict.fromkeys(map(explained, problems)))) from error
-    if "sgm" not in settings and (better := f"{config.preset}-{config.cost.method}") in PRESETS:
-        _warn(
-            f"preset {config.preset} has no penalties for cost.method {config.cost.method}, so defaults are used: "
-            f"--preset {better} has penalties for such images"
-        )
-    return config
+
+
+def _values(source: Any) -> Mapping[str, Any]:
+    """Return the sections of a source of settings."""
+    match source:
+        case None:
+            return {}
+        case str() | Path():
+            return read_yaml(Path(source))
+        case Config():
+            return source.model_dump()
+        case Mapping():
+            return _plain(source)
+    raise ConfigError(f"settings are {shown(source)}, allowed: a YAML file, a mapping or a Config")
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value.model_dump() if isinstance(value, Section) else value for name, value in settings.items()}
 
 
 def named_files(settings: Mapping[str, Any] | Config | None) -> list[str]:
@@ -88,11 +90,6 @@ def named_files(settings: Mapping[str, Any] | Config | None) -> list[str]:
     sections = settings.model_dump() if isinstance(settings, Config) else settings or {}
     named = [sections[name].get(key) for name, key in _FILES if isinstance(sections.get(name), Mapping)]
     return [file for file in named if isinstance(file, str)]
-
-
-@lru_cache  # once per batch
-def _warn(line: str) -> None:
-    _LOG.warning(line)
 
 
 def _given(overrides: Any, path: tuple[int | str, ...]) -> bool:

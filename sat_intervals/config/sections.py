@@ -38,6 +38,11 @@ def as_written(value: Any) -> Any:
     return Decimal(repr(value)) if type(value) in (int, float) else value
 
 
+def as_number(value: Decimal) -> int | float:
+    """Return a decimal as JSON has it."""
+    return int(value) if value % 1 == 0 else float(value)
+
+
 def absolute(value: str) -> str:
     """Return a path that workers with another working directory find; ".." after a link leaves the link's target."""
     path = Path(value).absolute()
@@ -47,7 +52,7 @@ def absolute(value: str) -> str:
 Odd = Annotated[int, AfterValidator(check_odd)]
 AbsolutePath = Annotated[str, AfterValidator(absolute)]
 # A number whose thresholds must be exact; a plain number in JSON, so that settings of a run can be read back.
-Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(float, when_used="json")]
+Exact = Annotated[Decimal, BeforeValidator(as_written), PlainSerializer(as_number, when_used="json")]
 # Disparities are stored as int16; within this limit the difference of any two also fits.
 # The engine and so mypy only see numbers: auto is replaced before a pair is matched, see `Disparity.is_auto`.
 AUTO: Any = "auto"
@@ -122,7 +127,7 @@ class Census(Section):
     """Matching cost: Hamming distance of Census codes."""
 
     method: Literal["census"] = Field("census", description="matching cost, census or mccnn")
-    window: Odd = Field(5, ge=3, le=11, description="side of the square window, in pixels")
+    window: Odd = Field(7, ge=3, le=11, description="side of the square window, in pixels")
 
     @property
     def steps(self) -> int:

@@ -12,8 +12,8 @@ from pydantic import Field, model_validator
 
 from sat_intervals.config.calibration import Calibration, Levels, at, calibration_of
 from sat_intervals.config.interval import Interval
-from sat_intervals.config.penalties import AnySgm, CosineSgm, MccnnSgm, Sgm
-from sat_intervals.config.presets import PRESETS, with_preset
+from sat_intervals.config.penalties import AnySgm, MccnnSgm, Sgm
+from sat_intervals.config.presets import PRESETS
 from sat_intervals.config.sections import (
     Ambiguity,
     Census,
@@ -53,27 +53,16 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _choose_methods(cls, values: Any) -> Any:
-        """Complete with the preset; add the missing kinds of sections: census, and the penalties of the cost."""
+        """Add the missing kinds of sections: census, and the penalties of the cost."""
         if not isinstance(values, Mapping):
             return values
-        values = with_preset(values)
-        cost = values.setdefault("cost", {})
+        cost, sgm = values.get("cost", {}), values.get("sgm", {})
         if isinstance(cost, Mapping):
-            cost = values["cost"] = {"method": "census", **cost}
-        method = cost.get("method") if isinstance(cost, Mapping) else getattr(cost, "method", None)
-        sgm = values.setdefault("sgm", {})
+            cost = {"method": "census", **cost}
+        method = cost["method"] if isinstance(cost, Mapping) else getattr(cost, "method", None)
         if isinstance(sgm, Mapping):
             sgm = {"penalty": "mc_cnn_fast" if method == "mccnn" else "constant", **sgm}
-            if sgm["penalty"] == "constant" and method == "mccnn":
-                if missing := [key for key in ("p1", "p2", "span") if key not in sgm]:
-                    raise ValueError(
-                        f"sgm lacks {' and '.join(missing)}: constant penalties have no defaults with cost.method "
-                        "mccnn (see config --preset satellite-mccnn)"
-                    )
-            elif sgm["penalty"] == "constant" and "span" in sgm:
-                raise ValueError(f"sgm.span is given, but with cost.method {method} it follows from p2: leave it out")
-            values["sgm"] = sgm
-        return values
+        return {**values, "cost": cost, "sgm": sgm}
 
     @model_validator(mode="after")
     def _check_sections(self) -> Self:
@@ -85,9 +74,9 @@ class Config(Section):
                 f"regularization needs {' and '.join(off)}, set to null: give {' and '.join(off)} or set "
                 "regularization to null too"
             )
-        if self.interval is not None and self.interval.coverage is not None and self.regularization is None:
+        if self.has_coverage and self.regularization is None:
             raise ValueError(
-                f"interval.coverage is {self.interval.coverage} and regularization null, but calibrations are for two "
+                "interval has a coverage and regularization null, but calibrations are for two "
                 "classes of confidence, which it makes: give regularization, or alpha instead of the coverage"
             )
         if self.disparity.is_local and self.cross_check and self.cross_check.method == "accurate":
@@ -102,25 +91,29 @@ class Config(Section):
             )
         return self
 
-    def _check_sgm(self, sgm: AnySgm) -> None:
-        if isinstance(sgm, CosineSgm | MccnnSgm) != isinstance(self.cost, Mccnn):
-            known = "constant or mc_cnn_fast" if isinstance(self.cost, Mccnn) else "constant, negative or inverse"
-            raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: {known} with cost.method {self.cost.method}")
+    def _check_sgm(self, sgm: Sgm | MccnnSgm) -> None:
+        is_census = isinstance(self.cost, Census)
+        if is_census and isinstance(sgm, MccnnSgm):
+            raise ValueError(f"sgm.penalty is {sgm.penalty}, allowed: constant with cost.method census")
+        if is_census and sgm.span is not None:
+            raise ValueError("sgm.span is given, but with cost.method census it follows from p2: leave it out")
+        if is_census and (fraction := [name for name in ("p1", "p2") if getattr(sgm, name) % 1]):
+            raise ValueError(f"sgm.{fraction[0]} is {getattr(sgm, fraction[0])}, allowed: whole numbers with census")
+        if not is_census and sgm.span is None:
+            raise ValueError(
+                "sgm.span is missing: it has no default with cost.method mccnn (see config --preset mccnn)"
+            )
         # The largest uint16 marks the summed cost of an impossible candidate.
         largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.cost.largest
         if self.largest_p2 > largest:
-            key = "p2" if sgm.penalty in ("constant", "mc_cnn_fast") else "gamma, the penalty without gradient,"
             raise ValueError(
-                f"sgm.{key} is {float(sgm.largest_p2):g}, allowed: <= {largest // self.cost.steps} with "
-                f"{self._cost_in_words}, so that costs summed over {SGM_PATHS} paths fit in 16 bits"
+                f"sgm.p2 is {sgm.p2}, allowed: <= {largest // self.cost.steps} with {self._cost_in_words}, so that "
+                f"costs summed over {SGM_PATHS} paths fit in 16 bits"
             )
-        if isinstance(sgm, CosineSgm | MccnnSgm) and self.cost_span > self.largest_sum:
+        if self.cost_span > self.largest_sum:
             raise ValueError(
                 f"sgm.span is {sgm.span}, allowed: <= {self.largest_sum / self.cost.steps:g} with p2 {sgm.p2}"
             )
-        is_raw = isinstance(sgm, MccnnSgm) and sgm.gradients == "raw"
-        if is_raw and not self.disparity.is_auto and not self.disparity.minimum <= 0 <= self.disparity.maximum:
-            raise ValueError("sgm.gradients raw reads the right image at disparity 0: search a range with 0")
 
     @property
     def _cost_in_words(self) -> str:
@@ -143,12 +136,12 @@ class Config(Section):
     @property
     def opens_ends(self) -> bool:
         """Return whether intervals at the ends of the search range are open, with confidence 0."""
-        return self.disparity.open_ends or (self.interval is not None and self.interval.coverage is not None)
+        return self.disparity.open_ends or self.has_coverage
 
     @property
     def largest_p2(self) -> int:
         """Return the largest penalty as an integer cost, 0 without SGM."""
-        return 0 if self.sgm is None else self.in_steps(self.sgm.largest_p2)
+        return 0 if self.sgm is None else self.in_steps(self.sgm.p2)
 
     @property
     def impossible_cost(self) -> int:
@@ -168,7 +161,7 @@ class Config(Section):
         the result depend on the tiling. With Census real scenes attain both bounds. With MC-CNN they stay far from
         them and vary, hence the setting.
         """
-        return self.in_steps(self.sgm.span) if isinstance(self.sgm, CosineSgm | MccnnSgm) else self.largest_sum
+        return self.largest_sum if self.sgm is None or self.sgm.span is None else self.in_steps(self.sgm.span)
 
     @property
     def cut_level(self) -> int | None:
@@ -182,32 +175,26 @@ class Config(Section):
 
     @property
     def cuts(self) -> Levels | None:
-        """Return the levels of sub-pixel cuts in integer costs, and the quantile of the regularisation.
+        """Return the calibrated levels of sub-pixel cuts in integer costs, and the quantile of the regularisation.
 
-        With alpha both levels are the same. None without intervals, and with bounds in whole pixels. Whether a
-        calibration that is given belongs to the settings is checked by `resolved`, once a run.
+        None without a coverage. Whether a calibration that is given belongs to the settings is checked by `resolved`,
+        once a run.
 
         Raises
         ------
         ConfigError
             No calibration belongs to the settings.
         """
-        if self.interval is None or not self.subpixel_levels:
+        if self.interval is None or self.interval.coverage is None:
             return None
-        if self.interval.coverage is not None:
-            given = self.interval.calibration
-            calibration = given if isinstance(given, Calibration) else calibration_of(self)
-            return at(calibration, float(self.interval.coverage))
-        level = float((1 - Fraction(self.interval.alpha or 1)) * self.cost_span)
-        quantile = self.regularization.quantile if self.regularization else None
-        return Levels(coverage=None, high=level, low=level, quantile=quantile)
+        given = self.interval.calibration
+        calibration = given if isinstance(given, Calibration) else calibration_of(self)
+        return at(calibration, float(self.interval.coverage))
 
     @property
-    def subpixel_levels(self) -> int:
-        """Return the number of levels of sub-pixel bounds: 2 with a coverage, 1 with alpha, 0 for whole pixels."""
-        if self.interval is None or self.interval.bounds == "whole":
-            return 0
-        return 1 if self.interval.coverage is None else 2
+    def has_coverage(self) -> bool:
+        """Return whether intervals have a coverage, and so sub-pixel bounds at two calibrated levels."""
+        return self.interval is not None and self.interval.coverage is not None
 
     @property
     def bound_steps(self) -> int:
@@ -215,7 +202,7 @@ class Config(Section):
 
         It is 64 up to 1024 disparities; beyond, the largest with which the range fits in 16 bits.
         """
-        if not self.subpixel_levels:
+        if not self.has_coverage:
             return 0
         steps = BOUND_STEPS
         while (self.disparity.count - 1) * steps >= np.iinfo(np.uint16).max:

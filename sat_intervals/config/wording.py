@@ -12,7 +12,6 @@ from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from sat_intervals.config.penalties import COSINE, CosineSgm
 from sat_intervals.config.sections import Section, check_odd
 from sat_intervals.config.settings import Config
 
@@ -75,7 +74,7 @@ def explained(problem: ErrorDetails) -> str:
             return f"{path[0]}.{_name(kinds[0])[0]} is {shown(problem['ctx']['tag'])}, allowed: {methods}"
         if len(kinds) > 1 and len(path) > 1:
             tag = path.pop(1)  # pydantic adds the kind
-            kinds = [kind for kind in kinds if tag == (COSINE if kind is CosineSgm else _name(kind)[1])]
+            kinds = [kind for kind in kinds if tag == _name(kind)[1]]
         owner = kinds[0] if len(path) > 1 else Config
     where = ".".join(path)
     if problem["type"] == "value_error":

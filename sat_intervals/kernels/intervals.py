@@ -94,9 +94,9 @@ def subpixel_cuts(curve, span, lowest, disparity, settings):
     """Bounds of the cuts at the levels ``high`` and ``low`` above ``lowest``, in steps (METHOD.md, section 16).
 
     They are rounded outwards and hold ``disparity``, the refined winner ``k + shift``. Returns ``(lower, upper)`` of
-    both levels, without meaning for a level that is off.
+    both levels.
     """
-    high, low = _whole_cuts(curve, span, _limit(lowest, settings.high), _limit(lowest, max(settings.low, 0.0)))
+    high, low = _whole_cuts(curve, span, _limit(lowest, settings.high), _limit(lowest, settings.low))
     winner = disparity * settings.steps
     return (
         _subpixel_cut(curve, lowest + settings.high, high, winner, settings),

@@ -26,7 +26,7 @@ class Raw(NamedTuple):
     ambiguity: uint32, 0 where there is no candidate.
     validity: uint16 flags, without those of the left image's mask, cross-checking and regularisation.
     lower_low, upper_low: sub-pixel bounds at the level of low-confidence pixels; those at the other level are ``lower``
-        and ``upper``. ``(0, 0)`` without a second level.
+        and ``upper``. ``(0, 0)`` for bounds in whole pixels.
     """
 
     winner: np.ndarray
@@ -72,7 +72,7 @@ def _sweep(costs, gradients, settings, output, core, keep, borders, cells):
     size = padded_to_lanes(settings.count)
     buffers = new_buffers(costs, gradients, settings, borders, cells)
     shape = output.height, output.width
-    of_low = shape if settings.low >= 0 else (0, 0)
+    of_low = shape if settings.steps else (0, 0)
     # Allocated for each tile: a buffer kept between tiles (4 % faster) can pause a dask worker above its memory limit.
     starts = volume_starts(buffers.cells, output)
     volume = Volume(np.empty(starts[-1], np.uint16), starts, np.zeros(costs.left_state.shape[1], np.int64))

@@ -132,28 +132,21 @@ def advance_pixel(candidates, span, penalties, paths, slots, r, c, target):
 
 
 @inlined
-def _advance_pair(candidates, span, penalties, paths, slots, i, r, c):
-    """Advance the paths ``i`` and ``i + 1``, which have ``slots``, by the pixel ``(r, c)``."""
+def advance_wave(candidates, span, penalties, paths, slots, wave, r, c):
+    """Advance the two paths of a wave by the pixel ``(r, c)``."""
     curves, lowest, spans = paths
     p1, p2, row = penalties
-    path_1, path_2 = _begin(paths, slots[0], span.start), _begin(paths, slots[1], span.start)
+    i = 2 * wave
+    pair = slots[i], slots[i + 1]
+    path_1, path_2 = _begin(paths, pair[0], span.start), _begin(paths, pair[1], span.start)
     for k in range(span.start, span.stop, LANES):
         costs = candidate_costs(candidates, r, c, k)
         path_1, cost_1 = _advance(path_1, curves, k, costs, penalties_of(p1, p2, row, i, c, k))
         path_2, cost_2 = _advance(path_2, curves, k, costs, penalties_of(p1, p2, row, i + 1, c, k))
         store(curves, path_1[0] + k, cost_1)
         store(curves, path_2[0] + k, cost_2)
-    lowest[slots[0]], lowest[slots[1]] = smallest(path_1[4]), smallest(path_2[4])
-    _wall_up(curves, spans, span, slots)
-
-
-@inlined
-def advance_wave(candidates, span, penalties, paths, slots, wave, r, c):
-    """Advance the two paths of a wave by the pixel ``(r, c)``."""
-    if wave == 0:
-        _advance_pair(candidates, span, penalties, paths, (slots[0], slots[1]), 0, r, c)
-    else:
-        _advance_pair(candidates, span, penalties, paths, (slots[2], slots[3]), 2, r, c)
+    lowest[pair[0]], lowest[pair[1]] = smallest(path_1[4]), smallest(path_2[4])
+    _wall_up(curves, spans, span, pair)
 
 
 @inlined

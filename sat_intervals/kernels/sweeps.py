@@ -66,8 +66,8 @@ class Settings(NamedTuple):
     impossible: matching cost of an impossible candidate inside SGM, above all possible ones.
     p1, p2, regularized: constant SGM penalties, and whether SGM runs; else the aggregated cost is the matching cost.
     cut_level: ``floor((1 - alpha) * span)`` of bounds in whole pixels; -1: none.
-    high, low, steps: levels of sub-pixel cuts above the lowest cost, and steps per pixel of their bounds. ``low`` -1:
-        one level. ``steps`` 0: bounds in whole pixels.
+    high, low, steps: levels of sub-pixel cuts above the lowest cost, of high and of low confidence, and steps per pixel
+        of their bounds. ``steps`` 0: bounds in whole pixels.
     weights: uint16: the table of `ambiguity`, for every cost above the lowest; empty: no ambiguity.
     refine: whether winners are refined, and bounds extended by one for it.
     offset, total: first disparity, and number of disparities, of the whole search range that this one is a part of:
@@ -229,10 +229,9 @@ def sweep_down(buffers, gradients, settings, output, volume):
             span = span_at(ranges, settings.count, curve.size, c)
             if possible[c] == 0:
                 restart(paths, slots)
-            elif contains(output, r, c):
-                advance_pixel(candidates, span, penalties, paths, slots, r, c, (volume.sums, volume.places[c]))
-            else:
-                advance_pixel(candidates, span, penalties, paths, slots, r, c, (curve, 0))
+                continue
+            target = (volume.sums, volume.places[c]) if contains(output, r, c) else (curve, 0)
+            advance_pixel(candidates, span, penalties, paths, slots, r, c, target)
 
 
 @cached
@@ -269,7 +268,7 @@ def sweep_up(buffers, gradients, settings, output, volume, raw, right, keep):
             lowest = close_impossible(curve, candidates, span, c)
             winner[i, j], shift, refined, high, low, ambiguity[i, j] = read_curve(curve, span, lowest, settings)
             lower[i, j], upper[i, j] = high
-            if settings.low >= 0:
+            if settings.steps > 0:
                 lower_low[i, j], upper_low[i, j] = low
             disparity[i, j], cost[i, j] = winner[i, j] + shift, lowest
             if not refined:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sat_intervals.config import Config, MccnnSgm
+from sat_intervals.config import Config
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.tiling import Window
 
@@ -41,8 +41,6 @@ class LocalRanges:
         """Settings that search the hull of the ranges of a window: as much as one of its pixels needs, and no more."""
         here = self._cells_of(window)
         least, most = int(self.minimum[here].min()), int(self.maximum[here].max())
-        if isinstance(config.sgm, MccnnSgm) and config.sgm.gradients == "raw":
-            least, most = min(least, 0), max(most, 0)  # the right image is read at disparity 0
         hull = config.disparity.model_copy(update={"minimum": least, "maximum": most})
         return config.model_copy(update={"disparity": hull})
 

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sat_intervals.config import Config, InverseSgm, Mccnn, MccnnSgm, NegativeSgm
+from sat_intervals.config import Config, Mccnn, MccnnSgm
 from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.correlation import correlate
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between, census, padded_to_lanes, window_state
-from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
+from sat_intervals.kernels.penalties import Gradients, Rule
 from sat_intervals.match.mccnn import RADIUS, Network, load_network
 from sat_intervals.match.normalization import ImageStatistics, PairStatistics
 from sat_intervals.tiling import View, Views, Window, facing, hull
@@ -210,33 +210,16 @@ def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStati
 # ---- Penalties ---------------------------------------------------------------------------------------------
 def _gradients(area: Area, views: Views, config: Config, statistics: PairStatistics | None) -> Gradients | None:
     """Gradients that the penalties of an area follow; None for constant penalties."""
-    if isinstance(config.sgm, MccnnSgm):
-        edges = np.full(2, config.sgm.d)
-        if config.sgm.gradients == "normalized":
-            assert statistics is not None
-            edges *= [statistics[area.mirrored].deviation, statistics[not area.mirrored].deviation]
-        rule = _edge_rule(config, config.sgm, edges, area)
-    elif isinstance(config.sgm, NegativeSgm | InverseSgm):
-        rule = _banz_rule(config.sgm)
-    else:
+    sgm = config.sgm
+    if not isinstance(sgm, MccnnSgm):
         return None
-    base, there = views[area.mirrored], views[not area.mirrored]
-    here, facing_it = base.inner(base.pixels, area.base), there.inner(there.pixels, area.facing)
-    return Gradients(here.astype(np.float32, copy=False), facing_it.astype(np.float32, copy=False), rule)
-
-
-def _edge_rule(config: Config, sgm: MccnnSgm, edges: np.ndarray, area: Area) -> Rule:
+    assert statistics is not None  # as above
     divisors = 1, sgm.q1, sgm.q1 * sgm.q2
     p1 = [config.in_steps(sgm.p1 / divisor) for divisor in divisors]
     vertical = [config.in_steps(sgm.p1 / divisor / sgm.v) for divisor in divisors]
     p2 = [config.in_steps(sgm.p2 / divisor) for divisor in divisors]
-    tables = np.array([p1, p1, p1, vertical], np.uint16), np.array([p2] * 4, np.uint16)
-    left, right = map(float, edges)
-    return Rule(EDGES, *tables, left, right, sgm.gradients == "normalized", -area.minimum)
-
-
-def _banz_rule(sgm: NegativeSgm | InverseSgm) -> Rule:
-    tables = np.full((4, 3), sgm.p1, np.uint16), np.full((4, 3), sgm.p2, np.uint16)
-    if isinstance(sgm, NegativeSgm):
-        return Rule(NEGATIVE, *tables, alpha=sgm.alpha, gamma=sgm.gamma)
-    return Rule(INVERSE, *tables, alpha=sgm.alpha, beta=sgm.beta, gamma=sgm.gamma)
+    edges = (sgm.d * statistics[side].deviation for side in (area.mirrored, not area.mirrored))
+    rule = Rule(np.array([p1, p1, p1, vertical], np.uint16), np.array([p2] * 4, np.uint16), *edges)
+    base, there = views[area.mirrored], views[not area.mirrored]
+    here, facing_it = base.inner(base.pixels, area.base), there.inner(there.pixels, area.facing)
+    return Gradients(here.astype(np.float32, copy=False), facing_it.astype(np.float32, copy=False), rule)

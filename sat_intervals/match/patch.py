@@ -5,7 +5,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sat_intervals.config import Config, CosineSgm, Disparity, Sgm
+from sat_intervals.config import Config, Disparity, Sgm
 from sat_intervals.kernels.cost import Cells
 from sat_intervals.kernels.matching import Raw, RightView, match_costs
 from sat_intervals.kernels.sgm import Borders, Edge
@@ -59,8 +59,7 @@ class Patch(NamedTuple):
 def kernel_settings(config: Config) -> Settings:
     """Convert a configuration to the settings of the kernels."""
     cuts = config.cuts
-    # penalties that follow gradients come with these
-    constant = config.sgm if isinstance(config.sgm, Sgm | CosineSgm) else None
+    constant = config.sgm if isinstance(config.sgm, Sgm) else None  # penalties at edges come with their gradients
     return Settings(
         minimum=config.disparity.minimum,
         count=config.disparity.count,
@@ -68,11 +67,11 @@ def kernel_settings(config: Config) -> Settings:
         p1=config.in_steps(constant.p1) if constant else 0,
         p2=config.in_steps(constant.p2) if constant else 0,
         regularized=config.sgm is not None,
-        cut_level=-1 if cuts or config.cut_level is None else config.cut_level,
+        cut_level=-1 if config.cut_level is None else config.cut_level,
         weights=np.zeros(0, np.uint16) if config.ambiguity_weights is None else config.ambiguity_weights,
         refine=config.refinement is not None,
         high=cuts.high if cuts else -1.0,
-        low=cuts.low if cuts and config.subpixel_levels == 2 else -1.0,
+        low=cuts.low if cuts else -1.0,
         steps=config.bound_steps,
     )
 
@@ -231,7 +230,7 @@ def _mark_ambiguous(raw: Raw, flat: np.ndarray, config: Config) -> None:
         search, steps = config.disparity, config.bound_steps
         first, last = (0, steps * (search.count - 1)) if steps else (search.minimum, search.maximum)
         raw.lower[ambiguous], raw.upper[ambiguous] = first, last
-        if config.subpixel_levels == 2:
+        if steps:
             raw.lower_low[ambiguous], raw.upper_low[ambiguous] = first, last
     raw.ambiguity[ambiguous] = config.largest_ambiguity
 
@@ -261,9 +260,7 @@ def _reject_ends(raw: Raw, least: np.ndarray, most: np.ndarray, search: Disparit
 def mirrored_settings(settings: Settings) -> Settings:
     """Settings of the right view, where disparities change sign; only its winners are read."""
     maximum = settings.minimum + settings.count - 1
-    return settings._replace(
-        minimum=-maximum, cut_level=-1, low=-1.0, steps=0, weights=np.zeros(0, np.uint16), refine=False
-    )
+    return settings._replace(minimum=-maximum, cut_level=-1, steps=0, weights=np.zeros(0, np.uint16), refine=False)
 
 
 def match_right(

@@ -41,7 +41,7 @@ class RawRows(NamedTuple):
     ambiguity: uint32.
     validity: uint16 flags.
     right_winner: ``(rows, columns + count - 1)`` int16, see `RightView`.
-    lower_low, upper_low: bounds of low-confidence pixels, see `Raw`; empty without two levels.
+    lower_low, upper_low: bounds of low-confidence pixels, see `Raw`; empty for bounds in whole pixels.
     """
 
     winner: np.ndarray
@@ -182,7 +182,7 @@ def _bounds(rows: RawRows, low: np.ndarray | None, config: Config) -> tuple[np.n
         nothing = np.full(rows.lower.shape, np.float32(np.nan))
         return nothing, nothing
     lower, upper, steps = rows.lower, rows.upper, config.bound_steps
-    if low is not None and config.subpixel_levels == 2:
+    if low is not None and steps:
         lower, upper = np.where(low, rows.lower_low, lower), np.where(low, rows.upper_low, upper)
     lower, upper = lower.astype(np.float32), upper.astype(np.float32)
     if not steps:

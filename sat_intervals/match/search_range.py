@@ -263,7 +263,8 @@ def settings(first: int, last: int) -> Config:
     """Settings that a level is matched with over the disparities ``first .. last``: Census, no intervals."""
     confidence = {"eta_step": 0.1, "normalization": "range"}
     search = {"minimum": first, "maximum": last}
-    return load_config({"disparity": search, "ambiguity": confidence, "interval": None, "regularization": None})
+    off = {"interval": None, "regularization": None}
+    return load_config({"preset": "paper", "disparity": search, "ambiguity": confidence} | off)
 
 
 def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, speckle: int) -> Matches:

@@ -113,7 +113,7 @@ class Job:
         """Raise if disks have no room for what a run has yet to write."""
         region, files = self.store.grid.region, run_files(self.config.products.compression)
         share = len(self.waiting()) / len(self.store.grid)
-        tiles = store_bytes(self.store.grid, self.config.subpixel_levels)
+        tiles = store_bytes(self.store.grid, has_coverage=self.config.has_coverage)
         handed = handed_bytes(
             self.store.grid, self.config, (self.left, self.right), keeps_pixels=not is_remote(self.config.cluster)
         )

@@ -92,7 +92,7 @@ def plan(
         worker_bytes=PROCESS_BYTES + waiting + task,
         together=together,
         together_bytes=PROCESS_BYTES + waiting + together * task,
-        disk_bytes=store_bytes(grid, config.subpixel_levels)
+        disk_bytes=store_bytes(grid, has_coverage=config.has_coverage)
         + part_bytes(files, region.height, region.width)
         + file_bytes(files, region.height, region.width)
         + handed_bytes(grid, config, (left, right), keeps_pixels=not is_remote(config.cluster)),

@@ -216,7 +216,7 @@ def _tile_products(patch: Patch, tile: Tile, job: Job) -> dict[str, np.ndarray]:
     raw = patch.raw
     inner = tile.core.relative_to(patch.output).slices
     arrays = {name: getattr(raw, name)[inner] for name in ("winner", "lower", "upper", "disparity", "validity")}
-    if job.config.subpixel_levels == 2:
+    if job.config.has_coverage:
         arrays |= {name: getattr(raw, name)[inner] for name in ("lower_low", "upper_low")}
     ambiguity = raw.ambiguity[inner]
     histogram = ambiguity_histogram(ambiguity, arrays["winner"] != NO_DISPARITY, job.config.largest_ambiguity)

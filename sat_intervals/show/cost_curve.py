@@ -79,7 +79,7 @@ def _largest_above(results: Results, row: int, column: int, settings: Settings) 
     """Return the largest cost above the lowest that belongs to the cut of a pixel's class; None without intervals."""
     if settings.steps == 0:
         return settings.cut_level if settings.cut_level >= 0 else None
-    is_low = settings.low >= 0 and results.read_pixel(row, column).validity & REGULARIZED
+    is_low = results.read_pixel(row, column).validity & REGULARIZED
     return settings.low if is_low else settings.high
 
 

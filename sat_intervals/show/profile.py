@@ -108,8 +108,7 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     cut = curve.cut
     chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
     inside = curve.disparities[cut]
-    is_whole = results.config.subpixel_levels == 0
-    wider = is_whole and (curve.lower < inside.min() or curve.upper > inside.max())
+    wider = not results.config.has_coverage and (curve.lower < inside.min() or curve.upper > inside.max())
     ends = f"{curve.lower:.4g} to {curve.upper:.4g} px"
     text = f"interval, {ends}:\ncut pushed out by refinement" if wider else f"interval of the cut, {ends}"
     chart.vlines([curve.lower, curve.upper], 0, 1, color=BLUE, lw=1.2, label=text)

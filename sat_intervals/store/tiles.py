@@ -26,7 +26,7 @@ _ROWS = 64
 # Rank of a right pixel without candidates, see `_rank`.
 _UNSEEN = np.uint32(0xFFFFFFFF)
 # Bytes of a pixel of a tile, and of each sub-pixel level.
-PIXEL_BYTES, LEVEL_BYTES = 20, 4
+PIXEL_BYTES, COVERAGE_BYTES = 20, 8
 
 
 class DamagedTilesError(RunError):
@@ -216,9 +216,9 @@ class Store:
         )
 
 
-def store_bytes(grid: Grid, levels: int) -> int:
+def store_bytes(grid: Grid, *, has_coverage: bool) -> int:
     """Return the size of all tiles, at most."""
-    return (PIXEL_BYTES + LEVEL_BYTES * levels) * grid.region.height * grid.region.width
+    return (PIXEL_BYTES + COVERAGE_BYTES * has_coverage) * grid.region.height * grid.region.width
 
 
 def home_of(out: Path) -> Path:

@@ -20,10 +20,10 @@ from sat_intervals.tiling import Grid, Window
 
 SIDE, COUNT, RUNS = 4000, 64, 3
 SETTINGS = {
-    "overlap 100": ["--overlap", "100"],
-    "overlap 200": ["--overlap", "200"],
-    "exact": ["--overlap", "exact"],
-    "exact, tiles of 256": ["--overlap", "exact", "--tile-size", "256"],
+    "overlap 100": ["--set", "tiles.overlap=100"],
+    "overlap 200": ["--set", "tiles.overlap=200"],
+    "exact": ["--set", "tiles.overlap=exact"],
+    "exact, tiles of 256": ["--set", "tiles.overlap=exact", "--tile-size", "256"],
     "exact, `satellite`": ["--preset", "satellite"],
 }
 

@@ -35,7 +35,7 @@ def run(pair, tmp_path_factory):
 
 def test_match__coverage_replaces_the_alpha_of_a_file(run):
     interval = json.loads((run / "run.json").read_text())["settings"]["interval"]
-    assert (interval["alpha"], interval["coverage"], interval["bounds"]) == (None, 0.9, "subpixel")
+    assert (interval["alpha"], interval["coverage"]) == (None, 0.9)
     assert interval["calibration"]["name"] == "flat"
 
 
@@ -90,5 +90,6 @@ def test_match__names_what_is_wrong_with_a_coverage(pair, tmp_path):
 
     own = "--calibration", pair / "own.yaml"
     assert "interval.coverage is 0.3, allowed: number >= 0.5, <= 0.99 or null" in says("--coverage", 0.3, *own)
-    assert "calibration goes with coverage only" in says(*own)
-    assert "belongs to other settings, cost.window is 5" in says("--coverage", 0.9, *own, "--preset", "satellite")
+    assert "calibration goes with coverage only" in says("--alpha", 0.9, *own)
+    assert "alpha is 0.9 and coverage 0.9: leave one out" in says("--alpha", 0.9, "--coverage", 0.9)
+    assert "belongs to other settings, cost.window is 5" in says("--coverage", 0.9, *own, "--set", "cost.window=7")

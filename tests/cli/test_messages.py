@@ -12,7 +12,6 @@ from helpers import COMMAND, invoke, refused
 
 from sat_intervals import SatIntervalsError, load_config, match_arrays, open_image
 from sat_intervals.cli import app
-from sat_intervals.config import reading
 from sat_intervals.config.pairs import read_batch
 from sat_intervals.evaluate.dsm import evaluate_surface
 from sat_intervals.products import SURFACE
@@ -76,25 +75,10 @@ def test_read_batch__names_what_cannot_be_read_and_names_that_are_too_long(tmp_p
         read_batch(tmp_path / "pairs.csv")
 
 
-def test_load_config__warns_once_of_penalties_that_are_not_of_the_preset(caplog):
-    satellite = {"preset": "satellite", "disparity": {"minimum": 0, "maximum": 9}}
-    mccnn = {"cost": {"method": "mccnn"}}
-    reading._warn.cache_clear()
-    load_config(satellite)
-    load_config(satellite | {"preset": "satellite-mccnn"}, mccnn)
-    load_config(satellite, mccnn | {"sgm": {"p2": 4, "span": 45}})
-    assert not caplog.records
-    for _ in range(2):
-        load_config(load_config(satellite, mccnn))
-    (record,) = caplog.records
-    assert "preset satellite has no penalties for cost.method mccnn" in record.getMessage()
-    assert "--preset satellite-mccnn" in record.getMessage()
-
-
 def test_load_config__refuses_a_preset_that_would_change_nothing_of_a_config():
     config = load_config({"preset": "satellite", "disparity": {"minimum": 0, "maximum": 9}})
-    with pytest.raises(SatIntervalsError, match="preset 'urban' has no effect on a Config"):
-        load_config(config, {"preset": "urban"})
+    with pytest.raises(SatIntervalsError, match="preset 'paper' has no effect on a Config"):
+        load_config(config, {"preset": "paper"})
     assert load_config(config, {"preset": "satellite"}) == config
 
 
@@ -207,5 +191,5 @@ def test_folders__that_are_files_are_named_with_a_way_out_that_helps(tmp_path, p
         ["export", out, "--to", "otb", folder], f"{folder} cannot be written: {reason}: choose another name or folder\n"
     )
     pair = [write(tmp_path / name, np.arange(6400, dtype="uint16").reshape(64, 100)) for name in ("l.tif", "r.tif")]
-    command = ["match", *pair, tmp_path / "new", "--disparity", "0", "4", "--store", folder]
+    command = ["match", *pair, tmp_path / "new", "--disparity", "0", "4", "--set", f"cluster.store={folder}"]
     refused(command, f"{folder}/", "cannot be used: Not a directory: make room, check its rights or choose another")

@@ -108,8 +108,8 @@ def test_load_calibration__names_a_missing_file() -> None:
 @pytest.mark.parametrize(
     ("settings", "difference"),
     [
-        ({"cost": {"window": 7}}, "cost.window is 5 in the calibration and 7 in the settings"),
-        ({"sgm": {"p2": 64}}, "sgm.p2 is 32 in the calibration and 64 in the settings"),
+        ({"cost": {"window": 5}}, "cost.window is 7 in the calibration and 5 in the settings"),
+        ({"sgm": {"p2": 64}}, "sgm.p2 is 128 in the calibration and 64 in the settings"),
         ({"median": None}, "median.size is 3 in the calibration and null in the settings"),
         ({"regularization": {"kernel": 7}}, "confidence.kernel is 5 in the calibration and 7 in the settings"),
         (
@@ -156,7 +156,9 @@ def test_key_of__of_mccnn_has_the_digest_of_its_weights(tmp_path) -> None:
 
 def test_calibration_of__without_one_names_the_command() -> None:
     config = load_config(RANGE, {"cost": {"window": 9}, "interval": {"coverage": 0.9}})
-    nearest = r"\(that of paper is the nearest: cost.window is 5 in the calibration and 9 in the settings, span is .*\)"
+    nearest = (
+        r"\(that of satellite is the nearest: cost.window is 7 in the calibration and 9 in the settings, span is .*\)"
+    )
     with pytest.raises(ConfigError, match=rf"no built-in .* settings {nearest}: .* calibrate"):
         resolved(config)
 
@@ -165,12 +167,12 @@ def test_calibration_of__without_one_names_the_command() -> None:
 
 
 def test_load_config__coverage_of_the_command_line_takes_the_place_of_alpha() -> None:
-    file = RANGE | {"interval": {"alpha": 0.8, "bounds": "whole"}}
-    interval = load_config(file, {"interval": {"coverage": 0.95}}).interval
-    assert (interval.alpha, interval.bounds, float(interval.coverage)) == (None, "subpixel", 0.95)
-    assert load_config(RANGE, {"preset": "satellite", "interval": {"coverage": 0.95}}).interval == interval
+    interval = load_config(RANGE | {"interval": {"alpha": 0.8}}, {"interval": {"coverage": 0.95}}).interval
+    assert (interval.alpha, float(interval.coverage)) == (None, 0.95)
+    assert load_config(RANGE, {"preset": "paper", "interval": {"coverage": 0.95}}).interval == interval
     back = load_config(RANGE | {"interval": {"coverage": 0.8, "calibration": rising()}}, {"interval": {"alpha": 0.7}})
-    assert (float(back.interval.alpha), back.interval.bounds, back.interval.coverage) == (0.7, "whole", None)
+    assert (float(back.interval.alpha), back.interval.coverage, back.interval.calibration) == (0.7, None, None)
+    assert load_config(RANGE, {"interval": {"alpha": 0.7}}).interval == back.interval
     kept = load_config(
         RANGE | {"interval": {"coverage": 0.8, "calibration": rising()}}, {"interval": {"coverage": 0.7}}
     )
@@ -182,10 +184,8 @@ def test_load_config__coverage_of_the_command_line_takes_the_place_of_alpha() ->
     [
         ({"alpha": 0.8, "coverage": 0.9}, "interval: alpha is 0.8 and coverage 0.9: leave one out or set it to null"),
         ({"coverage": 0.995}, "interval.coverage is 0.995, allowed: number >= 0.5, <= 0.99 or null"),
-        ({"coverage": 0.9, "bounds": "whole"}, "interval: bounds whole go with alpha only"),
-        ({"calibration": rising()}, "interval: calibration goes with coverage only"),
+        ({"alpha": 0.8, "calibration": rising()}, "interval: calibration goes with coverage only"),
         ({"coverage": 0.9, "calibration": 3}, "interval.calibration: calibration is 3, allowed: a file"),
-        ({"bounds": "half"}, "interval.bounds is 'half', allowed: whole or subpixel"),
     ],
 )
 def test_load_config__explains_intervals(interval, words) -> None:
@@ -195,14 +195,13 @@ def test_load_config__explains_intervals(interval, words) -> None:
 
 
 def test_load_config__a_coverage_needs_classes_of_confidence() -> None:
-    with pytest.raises(ConfigError, match=r"interval.coverage is 0.9 and regularization null, .*: give regulariz"):
-        load_config(RANGE, {"interval": {"coverage": 0.9}, "regularization": None})
+    with pytest.raises(ConfigError, match=r"interval has a coverage and regularization null, .*: give regulariz"):
+        load_config(RANGE, {"regularization": None})
 
 
 def test_bound_steps__fit_in_16_bits() -> None:
     def steps(count):
-        settings = {"disparity": {"minimum": -16000, "maximum": count - 16001}, "interval": {"bounds": "subpixel"}}
-        return load_config(settings).bound_steps
+        return load_config({"disparity": {"minimum": -16000, "maximum": count - 16001}}).bound_steps
 
     assert [steps(count) for count in (1, 1024, 1025, 2048, 32001)] == [64, 64, 32, 32, 2]
-    assert load_config(RANGE).bound_steps == 0
+    assert load_config(RANGE | {"preset": "paper"}).bound_steps == 0

@@ -473,7 +473,6 @@ def test_command__refuses_a_tolerance_that_is_no_number(run, name, value):
     [
         (["RUN", "--accurate"], "--accurate applies to pairs, but every OUT is a finished run: leave it out"),
         (["RUN", "--config", "nope.yaml"], "--config nope.yaml applies to pairs"),
-        (["RUN", "--cost", "census"], "--cost census applies to pairs"),
         (["RUN", "OTHER/../out"], "out is given 2 times: give it once"),
         (["PAIR", "PAIR/../one"], "2 pairs or runs are called|/one/left.tif is given 2 times: give it once"),
         (["PAIR", "PAIR"], "2 pairs or runs are called .*/one: give each its own name"),

@@ -345,6 +345,7 @@ def configs(draw):
     }
     config = load_config(
         {
+            "preset": "paper",
             "disparity": {"minimum": minimum, "maximum": minimum + draw(st.integers(0, 9))},
             "cost": {"window": draw(st.sampled_from([3, 5]))},
             "sgm": on({"p1": 4, "p2": draw(st.integers(4, 40))}),
@@ -357,16 +358,11 @@ def configs(draw):
             "products": {"keep_rejected": draw(st.booleans())},
         }
     )
-    return load_config(config, {"interval": draw(subpixel(config))} if interval and draw(st.booleans()) else {})
-
-
-@st.composite
-def subpixel(draw, config):
-    """Sub-pixel bounds for settings: with alpha, or with a coverage and some levels, which needs classes."""
     if config.regularization is None or draw(st.booleans()):
-        return {"alpha": float(config.interval.alpha), "bounds": "subpixel"}
+        return config
     levels = draw(st.integers(0, 99)) / 4, draw(st.integers(0, 199)) / 4
-    return {"coverage": 0.9, "calibration": calibration(config, *levels, draw(st.sampled_from([0.9, 0.6, None])))}
+    own = calibration(config, *levels, draw(st.sampled_from([0.9, 0.6, None])))
+    return load_config(config, {"interval": {"coverage": 0.9, "calibration": own}})
 
 
 def image_pair(seed, disparity, holes=0):
@@ -470,7 +466,7 @@ def test_match_arrays__equals_reference_where_texture_ends(seed, config, holes, 
 @pytest.mark.parametrize(("minimum", "maximum"), [(0, 60), (-30, 30), (-60, 0)])
 def test_match_arrays__of_images_without_texture_is_certain_of_nothing(minimum, maximum, more):
     flat = np.full((40, 200), 65535, np.uint16)
-    found = match_arrays(flat, flat, {"disparity": {"minimum": minimum, "maximum": maximum}} | more)
+    found = match_arrays(flat, flat, {"preset": "paper", "disparity": {"minimum": minimum, "maximum": maximum}} | more)
     valid = found["validity"].values & INVALID == 0
     assert valid.any()
     assert (found["lower"].values[valid] == minimum).all()
@@ -480,7 +476,7 @@ def test_match_arrays__of_images_without_texture_is_certain_of_nothing(minimum, 
 
 def test_match_arrays__of_nothing_is_nothing():
     empty = np.full((6, 9), np.nan, np.float32)
-    config = load_config({"disparity": {"minimum": -2, "maximum": 1}})
+    config = load_config({"preset": "paper", "disparity": {"minimum": -2, "maximum": 1}})
     found = match_arrays(empty, empty, config)
     state = np.zeros(empty.shape, np.uint8)
     expected = reference.match_arrays(empty, empty, state, state, config)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sat_intervals.kernels.cost import Cells, Codes, Costs, between
 from sat_intervals.kernels.matching import cost_volume, match_costs
-from sat_intervals.kernels.penalties import EDGES, INVERSE, NEGATIVE, Gradients, Rule
+from sat_intervals.kernels.penalties import Gradients, Rule
 from sat_intervals.kernels.sweeps import Settings
 from sat_intervals.products import IMPOSSIBLE_COST, MASKED, NO_DATA
 from sat_intervals.tiling import Window
@@ -225,14 +225,14 @@ def test_cost_volume__empty_rows_cut_the_patch_in_two():
 
 
 # ---- Penalties that follow the gradients -------------------------------------------------------------------
-def gradients_of(scene, **rule):
+def gradients_of(scene, p1, p2, left_edge, right_edge):
     """The windows' centres of a scene's images, and a rule."""
     radius = scene.window // 2
     inner = np.s_[radius : scene.left.shape[0] - radius]
     left, right = (
         np.ascontiguousarray(image[inner, radius : image.shape[1] - radius]) for image in (scene.left, scene.right)
     )
-    return Gradients(left, right, Rule(**rule))
+    return Gradients(left, right, Rule(p1, p2, float(left_edge), float(right_edge)))
 
 
 def varying_volume(scene, gradients):
@@ -258,47 +258,27 @@ def line_of(step):
 small_windows = reference.scenes(windows=(3, 5), rows=6, columns=12)
 
 
-@pytest.mark.parametrize("facing", [True, False])
+@pytest.mark.peer("onnxruntime", "mc_cnn")  # only MC-CNN has gradients: kernels compiled for no other test
 @bounded
 @given(scene=small_windows, left_edge=st.integers(0, 6), right_edge=st.integers(0, 6))
-def test_cost_volume__equals_reference_with_penalties_that_follow_edges(facing, scene, left_edge, right_edge):
+def test_cost_volume__equals_reference_with_penalties_that_follow_edges(scene, left_edge, right_edge):
     scene.regularized, scene.p2 = True, int(P2.max())
-    own_column = min(max(-scene.minimum, 0), scene.count - 1)
-    rule = {"kind": EDGES, "p1": P1, "p2": P2, "left_edge": float(left_edge), "right_edge": float(right_edge)}
-    gradients = gradients_of(scene, **rule, facing=facing, own_column=own_column)
+    gradients = gradients_of(scene, P1, P2, left_edge, right_edge)
 
     def penalties(step):
         tables, edges = (P1[line_of(step)], P2[line_of(step)]), (left_edge, right_edge)
-        images = gradients.left, gradients.right, scene.count
-        return reference.edge_penalties(*images, step, tables, edges, None if facing else own_column)
+        return reference.edge_penalties(gradients.left, gradients.right, scene.count, step, tables, edges)
 
     np.testing.assert_array_equal(varying_volume(scene, gradients), expected_volume(scene, penalties))
 
 
-@pytest.mark.parametrize("kind", [NEGATIVE, INVERSE])
-@few
-@given(scene=small_windows, p2=st.integers(8, 30))
-def test_cost_volume__equals_reference_with_penalties_of_banz(kind, scene, p2):
-    scene.regularized, scene.p2 = True, 60
-    alpha, beta, gamma = (4.5, 0.0, 60.0) if kind == NEGATIVE else (80.0, 1.6, 10.0)
-    table = np.full((4, 3), 5, np.uint16), np.full((4, 3), p2, np.uint16)
-    gradients = gradients_of(scene, kind=kind, p1=table[0], p2=table[1], alpha=alpha, beta=beta, gamma=gamma)
-
-    def curve(gradient):
-        return gamma - alpha * gradient if kind == NEGATIVE else gamma + alpha / (gradient + beta)
-
-    def penalties(step):
-        return reference.banz_penalties(gradients.left, scene.count, step, 5, p2, curve)
-
-    np.testing.assert_array_equal(varying_volume(scene, gradients), expected_volume(scene, penalties))
-
-
+@pytest.mark.peer("onnxruntime", "mc_cnn")
 @few
 @given(scene=small_windows)
 def test_cost_volume__penalties_without_gradients_are_constant(scene):
     scene.regularized, scene.p2 = True, 32
     tables = np.full((4, 3), scene.p1, np.uint16), np.full((4, 3), 32, np.uint16)
-    gradients = gradients_of(scene, kind=EDGES, p1=tables[0], p2=tables[1])
+    gradients = gradients_of(scene, *tables, 0, 0)
     np.testing.assert_array_equal(varying_volume(scene, gradients), volume(scene))
 
 

@@ -22,9 +22,8 @@ from sat_intervals.store.tiles import Store
 
 SETTINGS = {
     "satellite": {"preset": "satellite"},
-    "gradients": {"sgm": {"penalty": "negative", "alpha": 0.5, "gamma": 40}, "cross_check": None},
-    "no SGM": {"sgm": None},
-    "accurate": {"cross_check": {"method": "accurate"}},
+    "no SGM": {"preset": "paper", "sgm": None},
+    "accurate": {"preset": "paper", "cross_check": {"method": "accurate"}},
 }
 
 
@@ -49,8 +48,8 @@ def whole(folder):
 
 
 def match(folder, out, size, settings, **options):
-    search = {"disparity": {"minimum": -8, "maximum": 9}, "tiles": {"size": size, "overlap": "exact"}}
-    return match_pair(folder / "left.tif", folder / "right.tif", out, search | settings, **options)
+    base = {"preset": "paper", "disparity": {"minimum": -8, "maximum": 9}, "tiles": {"size": size, "overlap": "exact"}}
+    return match_pair(folder / "left.tif", folder / "right.tif", out, base | settings, **options)
 
 
 @pytest.mark.parametrize("name", SETTINGS)

@@ -19,7 +19,11 @@ def scene():
     part = np.s_[20:34, 40:80]
     left, right = (np.ma.masked_equal(image[part].copy(), 0) for image in (whole.left, whole.right))
     left[4, 7] = right[9, 21] = right[9, 22] = np.ma.masked
-    return left, right, load_config({"disparity": {"minimum": -6, "maximum": 9}, "cost": {"window": 3}})
+    return (
+        left,
+        right,
+        load_config({"preset": "paper", "disparity": {"minimum": -6, "maximum": 9}, "cost": {"window": 3}}),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +131,7 @@ def test_match_arrays__takes_images_of_different_widths(scene):
 
 def test_match_arrays__takes_what_load_config_takes(scene, expected):
     left, right, _ = scene
-    sections = {"disparity": {"minimum": -6, "maximum": 9}, "cost": {"window": 3}}
+    sections = {"preset": "paper", "disparity": {"minimum": -6, "maximum": 9}, "cost": {"window": 3}}
     check(match_arrays(left, right, sections), expected)
     with pytest.raises(SatIntervalsError, match="disparity is null"):
         match_arrays(left, right, {"disparity": None})

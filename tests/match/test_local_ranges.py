@@ -11,7 +11,7 @@ from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.match.whole import match_whole
 from sat_intervals.tiling import Window
 
-SEARCH = {"disparity": {"minimum": -14, "maximum": 27}}
+SEARCH = {"preset": "paper", "disparity": {"minimum": -14, "maximum": 27}}
 
 
 def ranges(minimum, maximum, height=16, width=16):
@@ -55,10 +55,9 @@ def test_match_whole__ranges_of_all_cells_as_wide_as_the_whole_change_nothing(im
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("bounds", ["whole", "subpixel"])
-def test_match_whole__cells_of_one_range_have_the_bounds_of_that_range_alone(images, bounds):
+def test_match_whole__cells_of_one_range_have_the_bounds_of_that_range_alone(images):
     off = dict.fromkeys(("ambiguity", "cross_check", "median", "regularization"))
-    config = load_config(SEARCH | off | {"interval": {"bounds": bounds}})
+    config = load_config(SEARCH | off)
     alone = match_whole(*images, load_config(config, {"disparity": {"minimum": 0, "maximum": 20}}))
     found = match_whole(*images, config, ranges=ranges(np.full((6, 10), 0), np.full((6, 10), 20)))
     assert found.valid.mean() > 0.5

@@ -33,7 +33,7 @@ def raw_rows() -> RawRows:
 @pytest.mark.parametrize("sections", [{}, {"median": {"size": 7}, "regularization": {"depth": 4}}, {"median": None}])
 def test_postprocess_strip__equals_the_whole_region_in_every_bit(sections):
     search = {"minimum": MINIMUM, "maximum": MINIMUM + COUNT - 1}
-    config = load_config({"disparity": search, "cross_check": {"tolerance": 9}} | sections)
+    config = load_config({"preset": "paper", "disparity": search, "cross_check": {"tolerance": 9}} | sections)
     raw, scale, margin = raw_rows(), ConfidenceScale(3.0, 70.0), halo(config)
     whole = postprocess_rows(raw, 0, ROWS, scale, config)
     assert (whole.validity & REGULARIZED != 0).any()

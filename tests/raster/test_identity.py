@@ -61,7 +61,7 @@ def put(images: dict[str, bytes], folder: Path) -> None:
 def match(server: ThreadingHTTPServer, out: Path, *options: str, prefix: str = "") -> subprocess.Popen:
     address = f"{prefix}http://127.0.0.1:{server.server_address[1]}"
     command = [COMMAND, "match", f"{address}/left.tif", f"{address}/right.tif", out, "--disparity", "-18", "40"]
-    command += ["--overlap", "20", "--quiet", *options]
+    command += ["--set", "tiles.overlap=20", "--quiet", *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

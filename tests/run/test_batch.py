@@ -116,7 +116,15 @@ def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path, pl
 
 
 def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(images, tmp_path):
-    arguments = ["batch", str(rows(images, broken=True)), str(tmp_path / "out"), "--tile-size", "64", "--overlap", "20"]
+    arguments = [
+        "batch",
+        str(rows(images, broken=True)),
+        str(tmp_path / "out"),
+        "--tile-size",
+        "64",
+        "--set",
+        "tiles.overlap=20",
+    ]
     first = invoke(*arguments)
     assert first.exit_code == 1
     assert "1 of 3 pairs failed" in first.stderr
@@ -522,9 +530,11 @@ def test_plan__of_tiles_in_a_bucket_counts_the_one_that_waits(images):
         "--tile-size",
         1024,
     )
-    found = [json.loads(invoke(*words, "--json", *more).stdout) for more in ((), ("--store", "memory://plan"))]
+    found = [
+        json.loads(invoke(*words, "--json", *more).stdout) for more in ((), ("--set", "cluster.store=memory://plan"))
+    ]
     assert found[1]["worker_bytes"] == found[1]["together_bytes"] > found[0]["worker_bytes"]
-    limited = invoke(*words, "--store", "memory://plan", "--memory", "500MB")
+    limited = invoke(*words, "--set", "cluster.store=memory://plan", "--memory", "500MB")
     assert limited.exit_code == 0, limited.output
     assert "smaller than set, to fit" in limited.stdout
     assert "fits in 500 MB" in limited.stdout

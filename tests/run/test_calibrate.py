@@ -194,7 +194,7 @@ def test_measure_subjects__ends_where_an_image_changes(scene, tmp_path):
 
 
 def test_calibrate__takes_over_tiles_that_a_killed_one_left_in_a_store(scene, tmp_path, monkeypatch):
-    store = "--store", tmp_path / "store"
+    store = "--set", f"cluster.store={tmp_path / 'store'}"
     whole = calibrated(scene, tmp_path / "whole.yaml", *store)
     with monkeypatch.context() as killed:
         killed.setattr(Store, "remove", lambda store, kinds=(): None)

@@ -129,7 +129,9 @@ def test_match__warns_of_ranges_of_another_left_image(folder, tmp_path):
     assert invoke("range", *images, "--output", file, "-q").exit_code == 0
     said = f"{file} was made for another left image than {images[1]}: check that it is of this pair"
     for order in (1, -1):
-        done = invoke("match", *images[::order], tmp_path / f"out{order}", "--range-grid", file, "--tile-size", 128)
+        done = invoke(
+            "match", *images[::order], tmp_path / f"out{order}", "--set", f"disparity.grid={file}", "--tile-size", 128
+        )
         assert done.exit_code == 0
         assert (said in done.stderr) == (order == -1)
 
@@ -175,7 +177,9 @@ def test_match__keeps_the_raster_of_ranges(folder, tmp_path):
     grid = tmp_path / "tiles/range.tif"
     grid.parent.mkdir()
     write_bands(grid, *np.stack([np.full((130, 300), -5), np.full((130, 300), 5)]))
-    result = invoke("match", folder / "left.tif", folder / "right.tif", tmp_path, "--range-grid", grid, "--overwrite")
+    result = invoke(
+        "match", folder / "left.tif", folder / "right.tif", tmp_path, "--set", f"disparity.grid={grid}", "--overwrite"
+    )
     assert result.exit_code == 2
     assert "is an input" in result.stderr
     assert grid.exists()

@@ -161,7 +161,7 @@ def test_match__of_a_renamed_folder_resumes(scene, tmp_path):
 
 
 def test_match__with_tiles_elsewhere_names_where_they_are(scene, tmp_path):
-    stores = [("--store", tmp_path / name) for name in ("first", "second")]
+    stores = [("--set", f"cluster.store={tmp_path / name}") for name in ("first", "second")]
     succeeds(scene, tmp_path / "out", *stores[0], "--keep-tiles")
     (tmp_path / "out" / "run.json").unlink()
     refused(command(scene, tmp_path / "out", *stores[1]), "place was ", "first", "second")

@@ -39,7 +39,7 @@ def pair(tmp_path_factory) -> Path:
 def started(pair: Path, out: Path, store: str | Path, *options: str) -> Iterator[subprocess.Popen]:
     """``match`` as a process of its own that does not outlive the test."""
     command = [COMMAND, "match", pair / "left.tif", pair / "right.tif", out, "--config", pair / "settings.yaml"]
-    command += ["--store", store, "--quiet", *options]
+    command += ["--set", f"cluster.store={store}", "--quiet", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             yield process
@@ -131,7 +131,7 @@ def test_batch__keeps_the_tiles_of_equal_pairs_in_folders_of_their_own(bucket, p
     rows = [{"name": name, "left": "left.tif", "right": "right.tif"} for name in ("one", "two")]
     (pair / "pairs.json").write_text(json.dumps(rows))
     command = [COMMAND, "batch", pair / "pairs.json", tmp_path, "--config", pair / "settings.yaml", "--quiet"]
-    command += ["--store", f"{bucket}/batch/", "--keep-tiles", "--tile-size", "512"]
+    command += ["--set", f"cluster.store={bucket}/batch/", "--keep-tiles", "--tile-size", "512"]
     subprocess.run(command, check=True)
     names = sorted(re.sub(r"-\w{32}/", "/", name) for name in records(f"{bucket}/batch"))
     assert names == ["one/tiles/0_0.npz", "two/tiles/0_0.npz"]
