@@ -9,23 +9,17 @@ from functools import cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from sat_intervals.config.files import read_mapping
 from sat_intervals.config.sections import ConfigError
-from sat_intervals.config.weights import weights_file
 from sat_intervals.products import IMPOSSIBLE_COST
-
-if TYPE_CHECKING:
-    from sat_intervals.config.settings import Config
 
 # Coverages of a calibration; others are interpolated.
 COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.975, 0.99)
-_MAKE_ONE = "make one with sat-intervals calibrate and give it by --calibration"
-
-
+MAKE_ONE = "make one with sat-intervals calibrate and give it by --calibration"
 # Keys of settings that no calibration has.
 SETTINGS = {"preset", "disparity", "cost", "sgm", "interval"}
 
@@ -66,7 +60,7 @@ class Levels(StrictModel):
 
 
 class Calibration(CalibrationFile):
-    """Levels for each of COVERAGES, in this order, and the settings that they belong to, see `key_of`.
+    """Levels for each of COVERAGES, in this order, and the settings that they belong to, see `settings.key_of`.
 
     Levels do not fall as the coverage rises, except ``low`` where the quantile changes. Name and provenance are shown.
     """
@@ -108,7 +102,7 @@ def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calib
         values = read_mapping(file, f"keys {', '.join(Calibration.model_fields)}")
     except OSError as error:
         known = ", ".join(name for name, _ in _built_in_files()) or "none"
-        raise ConfigError(f"calibration {file}: {error.strerror} (built in: {known}): {_MAKE_ONE}") from error
+        raise ConfigError(f"calibration {file}: {error.strerror} (built in: {known}): {MAKE_ONE}") from error
     if "classes" in values:
         raise ConfigError(f"{file} is a calibration of heights: give it to dsm --calibration")
     if "levels" not in values and values.keys() & SETTINGS:
@@ -135,52 +129,17 @@ def _built_in_files() -> Iterator[tuple[str, Path]]:
                 yield file.name.removesuffix(".yaml"), Path(str(file))
 
 
-def key_of(config: "Config") -> dict[str, Any]:
-    """Return all settings that decide which coverage a level reaches, as a calibration holds them.
-
-    Neither the search range nor alpha nor the quantile of the regularisation is among them.
-    """
-    cost = config.cost.model_dump(mode="json")
-    if "weights" in cost:
-        with weights_file(cost["weights"]).open("rb") as weights:
-            cost["weights"] = hashlib.file_digest(weights, "sha256").hexdigest()
-    ambiguity, low = config.ambiguity, config.regularization
-
-    def content(section: Any) -> Any:
-        return section and section.model_dump(mode="json")
-
-    return {
-        "cost": cost,
-        "sgm": config.sgm and config.sgm.model_dump(mode="json", exclude_none=True),
-        "span": config.cost_span,
-        "ambiguity": ambiguity and ambiguity.model_dump(mode="json", include={"eta_max", "eta_step", "normalization"}),
-        "refinement": content(config.refinement),
-        "cross_check": content(config.cross_check),
-        "median": content(config.median),
-        "confidence": low and low.model_dump(mode="json", include={"threshold", "kernel", "depth"}),
-    }
-
-
-def calibration_of(config: "Config") -> Calibration:
-    """Return the calibration of the settings: the one that they give, else the built-in one with their key.
-
-    If there is none, the error names the first difference.
-    """
-    assert config.interval is not None
-    given, key = config.interval.calibration, key_of(config)
-    if isinstance(given, Calibration):
-        if different := differences(given.key, key):
-            raise ConfigError(f"calibration {given.name} belongs to other settings, {different[0]}: {_MAKE_ONE}")
-        return given
+def built_in(key: Mapping[str, Any], preset: str) -> Calibration:
+    """Return the built-in calibration of settings with this key; if there is none, the error names the nearest."""
     names = [name for name, _ in _built_in_files()]
-    for name in sorted(names, key=lambda name: name != config.preset):  # that of the preset first: reading takes 20 ms
+    for name in sorted(names, key=lambda name: name != preset):  # that of the preset first: reading takes 20 ms
         if (calibration := _built_in(name)).key == key:
             return calibration
     different_of = {name: differences(_built_in(name).key, key) for name in names}
     nearest = min(names, key=lambda name: len(different_of[name]))
     raise ConfigError(
         f"no built-in calibration belongs to these settings (that of {nearest} is the nearest: "
-        f"{', '.join(different_of[nearest][:3])}): {_MAKE_ONE}"
+        f"{', '.join(different_of[nearest][:3])}): {MAKE_ONE}"
     )
 
 
@@ -209,25 +168,6 @@ def _flat(key: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         is_section = isinstance(value, Mapping) and value
         flat |= _flat(value, f"{prefix}{name}.") if is_section else {f"{prefix}{name}": value}
     return flat
-
-
-def resolved(config: "Config") -> "Config":
-    """Return the settings with the content of their calibration, which decides the bytes of a run."""
-    if config.interval is None or config.interval.coverage is None:
-        return config
-    interval = config.interval.model_copy(update={"calibration": calibration_of(config)})
-    return config.model_copy(update={"interval": interval})
-
-
-def unreached(config: "Config") -> str:
-    """Return a warning if the calibration does not reach the coverage asked for; else, and with alpha, ``""``."""
-    levels = config.cuts
-    if levels is None or levels.reached:
-        return ""
-    return (
-        f"the pairs of calibration {calibration_of(config).name} do not reach coverage {levels.coverage:g} at any "
-        "level: expect less, or ask for less"
-    )
 
 
 def at(calibration: Calibration, coverage: float) -> Levels:

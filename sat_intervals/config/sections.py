@@ -4,18 +4,10 @@ import json
 from collections.abc import Mapping
 from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PlainSerializer,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 from pydantic_core import PydanticCustomError
 
 from sat_intervals.errors import SatIntervalsError
@@ -80,12 +72,10 @@ class Disparity(Section):
 
     minimum: Pixels = Field(AUTO, description="smallest disparity searched, in pixels; auto: found from the images")
     maximum: Pixels = Field(AUTO, description="largest disparity searched, in pixels; auto: found from the images")
-
     open_ends: bool = Field(
         False,
         description="confidence 0 and open intervals at the ends of the range, as where it is found or with a coverage",
     )
-
     local: bool = Field(False, description="search a separate range in each cell of the image, found from the images")
     grid: AbsolutePath | None = Field(
         None, description="raster of two bands, minimum and maximum, for local ranges; null: found from the images"
@@ -129,10 +119,9 @@ class Census(Section):
     method: Literal["census"] = Field("census", description="matching cost, census or mccnn")
     window: Odd = Field(7, ge=3, le=11, description="side of the square window, in pixels")
 
-    @property
-    def steps(self) -> int:
-        """Return the quantisation levels per unit of cost, a bit."""
-        return 1
+    steps: ClassVar = 1  # quantisation levels per unit of cost, a bit
+    precomputed: ClassVar = False  # SGM compares codes
+    needs_statistics: ClassVar = False
 
     @property
     def largest(self) -> int:
@@ -144,16 +133,6 @@ class Census(Section):
         """Return the part of `Config.impossible_cost` that the cost decides, at least ``largest``; as in libSGM."""
         return self.window**2
 
-    @property
-    def precomputed(self) -> bool:
-        """Return whether the costs of a patch are computed before SGM, a byte each; SGM compares codes."""
-        return False
-
-    @property
-    def needs_statistics(self) -> bool:
-        """Return whether the costs need mean and standard deviation of the whole images."""
-        return False
-
 
 class Mccnn(Section):
     """Matching cost: 1 - cosine of features of the network MC-CNN fast (Zbontar and LeCun 2016)."""
@@ -161,35 +140,12 @@ class Mccnn(Section):
     method: Literal["mccnn"] = Field("mccnn", description="matching cost, census or mccnn")
     weights: AbsolutePath | None = Field(None, description="ONNX file of the network; null: that of the extra [mccnn]")
 
-    @property
-    def window(self) -> int:
-        """Return the side of the receptive field of a feature, in pixels."""
-        return 11
-
-    @property
-    def steps(self) -> int:
-        """Return the quantisation levels per unit of cost, a unit of the cosine."""
-        return COSINE_STEPS
-
-    @property
-    def largest(self) -> int:
-        """Return the largest integer cost."""
-        return 2 * COSINE_STEPS
-
-    @property
-    def ceiling(self) -> int:
-        """Return the part of `Config.impossible_cost` that the cost decides, at least ``largest``."""
-        return self.largest
-
-    @property
-    def precomputed(self) -> bool:
-        """Return whether the costs of a patch are computed before SGM, a byte each."""
-        return True
-
-    @property
-    def needs_statistics(self) -> bool:
-        """Return whether the costs need mean and standard deviation of the whole images."""
-        return True
+    window: ClassVar = 11  # side of the receptive field of a feature, in pixels
+    steps: ClassVar = COSINE_STEPS  # quantisation levels per unit of cost, a unit of the cosine
+    largest: ClassVar = 2 * COSINE_STEPS  # integer cost
+    ceiling: ClassVar = largest  # as of Census
+    precomputed: ClassVar = True  # the costs of a patch are computed before SGM, a byte each
+    needs_statistics: ClassVar = True  # mean and standard deviation of the whole images
 
 
 class Ambiguity(Section):

@@ -1,5 +1,6 @@
 """All settings of a run, checks across sections, and the integer thresholds derived from them."""
 
+import hashlib
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
@@ -10,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from sat_intervals.config.calibration import Calibration, Levels, at, calibration_of
+from sat_intervals.config.calibration import Calibration, Levels, at, built_in
 from sat_intervals.config.interval import Interval
 from sat_intervals.config.penalties import AnySgm, MccnnSgm, Sgm
 from sat_intervals.config.presets import PRESETS
@@ -28,6 +29,7 @@ from sat_intervals.config.sections import (
     Section,
     Tiles,
 )
+from sat_intervals.config.weights import weights_file
 from sat_intervals.products import BOUND_STEPS, IMPOSSIBLE_COST
 
 SGM_PATHS = 8
@@ -177,18 +179,13 @@ class Config(Section):
     def cuts(self) -> Levels | None:
         """Return the calibrated levels of sub-pixel cuts in integer costs, and the quantile of the regularisation.
 
-        None without a coverage. Whether a calibration that is given belongs to the settings is checked by `resolved`,
-        once a run.
-
-        Raises
-        ------
-        ConfigError
-            No calibration belongs to the settings.
+        None without a coverage. Whether a calibration that is given belongs to the settings is checked by
+        `calibrated.resolved`, once a run.
         """
         if self.interval is None or self.interval.coverage is None:
             return None
         given = self.interval.calibration
-        calibration = given if isinstance(given, Calibration) else calibration_of(self)
+        calibration = given if isinstance(given, Calibration) else built_in(key_of(self), self.preset)
         return at(calibration, float(self.interval.coverage))
 
     @property
@@ -236,3 +233,25 @@ class Config(Section):
             return None
         below = np.searchsorted(levels, np.arange(self.largest_sum + 1), side="left")
         return (len(levels) - below).astype(np.uint16)
+
+
+def key_of(config: Config) -> dict[str, Any]:
+    """Return all settings that decide which coverage a level reaches, as a calibration holds them.
+
+    Neither the search range nor alpha nor the quantile of the regularisation is among them.
+    """
+    sections = config.model_dump(mode="json")
+    cost, sgm, ambiguity, low = (sections[name] for name in ("cost", "sgm", "ambiguity", "regularization"))
+    if "weights" in cost:
+        with weights_file(cost["weights"]).open("rb") as weights:
+            cost["weights"] = hashlib.file_digest(weights, "sha256").hexdigest()
+    return {
+        "cost": cost,
+        "sgm": sgm and {name: value for name, value in sgm.items() if value is not None},
+        "span": config.cost_span,
+        "ambiguity": ambiguity and {name: ambiguity[name] for name in ("eta_max", "eta_step", "normalization")},
+        "refinement": sections["refinement"],
+        "cross_check": sections["cross_check"],
+        "median": sections["median"],
+        "confidence": low and {name: low[name] for name in ("threshold", "kernel", "depth")},
+    }
