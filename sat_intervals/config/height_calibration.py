@@ -14,10 +14,10 @@ from sat_intervals.config.sections import ConfigError
 
 _MAKE_ONE = "make one with sat-intervals calibrate --dsm"
 # Tags of a surface that its intervals depend on.
-_OF_MATCHING = "COVERAGE", "ALPHA", "DISPARITY_CALIBRATION"
-_OF_INTERVALS = *_OF_MATCHING, "INTERVAL", "RADIUS", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE"
-# Metres.
-_LARGEST = 10_000.0
+_OF_INTERVALS = (
+    "COVERAGE", "ALPHA", "DISPARITY_CALIBRATION", "INTERVAL", "RADIUS", "OUTLIERS", "OPEN_POINTS", "MIN_CONFIDENCE"
+)  # fmt: skip
+_LARGEST = 10_000.0  # metres
 
 
 class WidthClass(StrictModel):

@@ -3,15 +3,15 @@
 import csv
 import io
 import json
-import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from sat_intervals.config.files import LARGEST_TABLE, load_yaml, read_small, set_by_name
 from sat_intervals.errors import SatIntervalsError
@@ -26,7 +26,14 @@ _RESERVED = (REPORT, "logs")
 # Bytes of a pair's name: a folder's name has at most 255, and a store adds a digest.
 _LONGEST_NAME = 200
 _IMAGES = ("left", "right", "left_mask", "right_mask")
-_READING = tuple(f"{side}{what}" for what in ("nodata", "band") for side in ("", "left_", "right_"))
+_READING = {
+    f"{side}{what}": kind for what, kind in (("nodata", float), ("band", int)) for side in ("", "left_", "right_")
+}
+# Four integers, or text with them.
+_WINDOW = Annotated[
+    tuple[int, int, int, int], BeforeValidator(lambda value: value.split() if isinstance(value, str) else value)
+]
+_TOLERANCE = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _SENSORS = ("left_model", "right_model", "left_grid", "right_grid")
 # YAML nodes allowed in a list of pairs, which may have thousands of rows.
 _NODES = 200_000
@@ -131,13 +138,16 @@ def _meta(file: Path) -> dict[str, Any]:
         meta = json.loads(read_small(file).decode())
     except SatIntervalsError:
         raise
-    except OSError as error:
-        raise SatIntervalsError(f"{file} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise SatIntervalsError(f"{file} cannot be read: {error}: it must be a JSON object") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise SatIntervalsError(f"{file} cannot be read: {_why(error)}: it must be a JSON object") from error
     if not isinstance(meta, dict):
         raise SatIntervalsError(f"{file} holds {type(meta).__name__}, it must be a JSON object")
     return meta
+
+
+def _why(error: Exception) -> str:
+    """Return the reason of an error in one line."""
+    return " ".join(str(getattr(error, "strerror", None) or error).split())
 
 
 def _of_folder(folder: Path) -> Pair:
@@ -165,20 +175,20 @@ def _of_table(file: Path) -> list[Pair]:
             raise SatIntervalsError(f"{place}: minimum {minimum!r}, maximum {maximum!r}, needed: integers") from error
         left, right, truth = (file.parent / row[image] for image in ("left", "right", "truth"))
         named = row.get("name", row["left"]), row.get("group", NO_GROUP)
-        pairs.append(Pair(*named, left, right, truth, *search, *_of_truth(place, row)))
+        judging = _value(place, row, "tolerance", _TOLERANCE), _value(place, row, "remove_bias", bool)
+        pairs.append(Pair(*named, left, right, truth, *search, *judging))
     return pairs
 
 
-def _of_truth(place: str, row: Mapping[str, Any]) -> tuple[float | None, bool | None]:
-    """Return tolerance and remove_bias of a row, None where it has none."""
-    tolerance, remove_bias = (load_yaml(row.get(key, "null")) for key in ("tolerance", "remove_bias"))
-    if not isinstance(remove_bias, bool | None):
-        raise SatIntervalsError(f"{place}: remove_bias is {remove_bias!r}, allowed: true or false")
-    if tolerance is None:
-        return None, remove_bias
-    if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < math.inf:
-        raise SatIntervalsError(f"{place}: tolerance is {tolerance!r}, allowed: a number >= 0")
-    return float(tolerance), remove_bias
+def _value(place: str, row: dict[str, Any], key: str, kind: Any) -> Any:
+    """Take a value, or the text of one, out of a row; None if it has none."""
+    if (value := row.pop(key, None)) is None:
+        return None
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        why = error.errors(include_url=False)[0]["msg"].lower()
+        raise SatIntervalsError(f"{place}: {key} is {value!r}: {why}") from error
 
 
 def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
@@ -191,48 +201,28 @@ def _of_batch(place: str, row: dict[str, Any], file: Path) -> PairOfBatch:
             f"{place}: name {name!r} cannot be a folder's name: choose another of at most {_LONGEST_NAME} bytes"
         )
     images: dict[str, Any] = {key: _relative_to(file, str(row.pop(key))) for key in _IMAGES if key in row}
-    reading = {key: _number(place, key, row.pop(key)) for key in _READING if key in row}
-    window = _window(place, row.pop("window")) if "window" in row else None
+    reading = {key: _value(place, row, key, kind) for key, kind in _READING.items() if key in row}
+    window = _value(place, row, "window", _WINDOW)
     surface = _surface(place, row, file)
     settings: dict[str, Any] = {}
     for key, value in row.items():
         try:
             set_by_name(settings, f"disparity.{key}" if key in ("minimum", "maximum") else str(key), value)
         except (ValueError, RecursionError, yaml.YAMLError) as error:
-            raise SatIntervalsError(f"{place}: {key} is {value!r}: {' '.join(str(error).split())}") from error
+            raise SatIntervalsError(f"{place}: {key} is {value!r}: {_why(error)}") from error
     return PairOfBatch(name, settings=settings, reading=reading, window=window, **images, **surface)
 
 
 def _surface(place: str, row: dict[str, Any], file: Path) -> dict[str, Any]:
     """Take what a surface model needs out of a row, all or nothing."""
     needed = (*_SENSORS, "resolution")
-    given = {key: row.pop(key) for key in needed if key in row}
-    if not given:
+    missing = [key for key in needed if key not in row]
+    if len(missing) == len(needed):
         return {}
-    if missing := [key for key in needed if key not in given]:
+    if missing:
         raise SatIntervalsError(f"{place} lacks {' and '.join(missing)}: a surface needs {', '.join(needed)}")
-    resolution = _number(place, "resolution", given.pop("resolution"))
-    return {"sensors": tuple(_relative_to(file, str(name)) for name in given.values()), "resolution": resolution}
-
-
-def _number(place: str, key: str, value: Any) -> int | float:
-    """Return the number of a band or a no-data value, which is a number or the text of one."""
-    kind, needed = (int, "an integer") if key.endswith("band") else (float, "a number")
-    try:
-        if isinstance(value, bool):
-            raise TypeError
-        return kind(value)
-    except (TypeError, ValueError) as error:
-        raise SatIntervalsError(f"{place}: {key} is {value!r}, needed: {needed}") from error
-
-
-def _window(place: str, value: Any) -> tuple[int, int, int, int]:
-    """Return the window of a list of four integers, or of text with them."""
-    try:
-        row, column, height, width = (int(part) for part in (value.split() if isinstance(value, str) else value))
-    except (TypeError, ValueError) as error:
-        raise SatIntervalsError(f"{place}: window is {value!r}, needed: row, column, height and width") from error
-    return row, column, height, width
+    sensors = tuple(_relative_to(file, str(row.pop(key))) for key in _SENSORS)
+    return {"sensors": sensors, "resolution": _value(place, row, "resolution", float)}
 
 
 def _relative_to(file: Path, path: str) -> str:
@@ -250,8 +240,7 @@ def _rows(file: Path, needed: Sequence[str]) -> list[tuple[str, dict[str, Any]]]
     except SatIntervalsError:
         raise
     except (OSError, ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
-        why = " ".join(str(getattr(error, "strerror", None) or error).split())
-        raise SatIntervalsError(f"{file} cannot be read: {why}: {wanted}") from error
+        raise SatIntervalsError(f"{file} cannot be read: {_why(error)}: {wanted}") from error
     if not isinstance(rows, list) or not rows or not all(isinstance(row, Mapping) for row in rows):
         raise SatIntervalsError(f"{file} holds no pairs: {wanted}")
     found = []

@@ -26,8 +26,7 @@ def preset_settings(name: str) -> Mapping[str, Any]:
 def merged(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings with overrides, which win key by key.
 
-    What belongs to another matching cost, other penalties or another level of intervals than the overrides' is left
-    out.
+    What belongs to another matching cost, other penalties or another level of intervals than theirs is left out.
     """
     kept = {name: dict(section) if isinstance(section, Mapping) else section for name, section in values.items()}
 

@@ -7,6 +7,8 @@ processor: one of AVX-512, two of AVX2, four of SSE2 or NEON.
 Sums and differences wrap around. Comparisons are unsigned. A mask of lanes is a 32-bit number, lane 0 the lowest bit.
 """
 
+from functools import update_wrapper
+
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -14,13 +16,12 @@ from numba.extending import intrinsic, models, register_model
 
 LANES = 32
 
-_BYTE = ir.IntType(8)
 _HALF = ir.IntType(16)
 _WORD = ir.IntType(32)
-_BYTES = ir.VectorType(_BYTE, LANES)
+_BYTES = ir.VectorType(ir.IntType(8), LANES)
 _VECTOR = ir.VectorType(_HALF, LANES)
+_WORDS = ir.VectorType(_WORD, LANES)
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
-_LANE_INDEX = ir.VectorType(_WORD, LANES)
 
 
 class _VectorType(types.Type):
@@ -41,10 +42,44 @@ class _VectorModel(models.PrimitiveModel):
         super().__init__(manager, kind, kind.kind)
 
 
-def _address(context, builder, array_type, array, index, pointee):
-    """Pointer to the flat element ``index`` of a C-contiguous array, as a pointer to a vector."""
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), pointee.as_pointer())
+def _primitive(result, *parameters):
+    """Make an intrinsic of a function that builds its instructions, ``build(builder, *values)``."""
+
+    def intrinsic_of(build):
+        def typed(typing_context, *arguments):
+            def generate(context, builder, signature, values):
+                return build(builder, *values)
+
+            return result(*parameters), generate
+
+        return intrinsic(update_wrapper(typed, build))  # numba counts the parameters of `build`
+
+    return intrinsic_of
+
+
+def _on_array(result, *parameters):
+    """Make an intrinsic on a C-contiguous array of a function ``build(builder, data, index, *values)``.
+
+    ``data`` is the address of the first element.
+    """
+
+    def intrinsic_of(build):
+        def typed(typing_context, array, *arguments):
+            def generate(context, builder, signature, values):
+                data = context.make_array(array)(context, builder, values[0]).data
+                built = build(builder, data, *values[1:])
+                return context.get_dummy_value() if result is types.void else built
+
+            return result(array, types.intp, *parameters), generate
+
+        return intrinsic(update_wrapper(typed, build))
+
+    return intrinsic_of
+
+
+def _vector_at(builder, data, index, kind):
+    """Address of the vector from the flat element ``index`` on."""
+    return builder.bitcast(builder.gep(data, [index]), kind.as_pointer())
 
 
 def _splat(builder, value, kind):
@@ -53,216 +88,145 @@ def _splat(builder, value, kind):
     return builder.shuffle_vector(single, ir.Constant(kind, ir.Undefined), zeros)
 
 
-def _call(builder, name, result, arguments):
+def _call(builder, name, result, *arguments):
     kind = ir.FunctionType(result, [argument.type for argument in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
 
 
-def _lane_mask(builder, lanes):
-    return builder.bitcast(lanes, _WORD)
+@_on_array(vector_type)
+def load(builder, data, index):
+    """Return ``array.ravel()[index : index + 32]`` of a uint16 array."""
+    return builder.load(_vector_at(builder, data, index, _VECTOR), align=2)
 
 
-@intrinsic
-def load(typing_context, array, index):
-    """Return ``array.ravel()[index : index + 32]`` of a contiguous uint16 array."""
-
-    def generate(context, builder, signature, arguments):
-        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _VECTOR)
-        return builder.load(pointer, align=2)
-
-    return vector_type(array, types.intp), generate
-
-
-@intrinsic
-def store(typing_context, array, index, vector):
+@_on_array(types.void, vector_type)
+def store(builder, data, index, vector):
     """Write a vector to ``array.ravel()[index : index + 32]``."""
-
-    def generate(context, builder, signature, arguments):
-        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _VECTOR)
-        builder.store(arguments[2], pointer, align=2)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vector), generate
+    builder.store(vector, _vector_at(builder, data, index, _VECTOR), align=2)
 
 
-@intrinsic
-def load_bytes(typing_context, array, index):
-    """Return ``array.ravel()[index : index + 32]`` of a contiguous uint8 array, as uint16 lanes."""
-
-    def generate(context, builder, signature, arguments):
-        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _BYTES)
-        return builder.zext(builder.load(pointer, align=1), _VECTOR)
-
-    return vector_type(array, types.intp), generate
+@_on_array(vector_type)
+def load_bytes(builder, data, index):
+    """Return ``array.ravel()[index : index + 32]`` of a uint8 array, as uint16 lanes."""
+    return builder.zext(builder.load(_vector_at(builder, data, index, _BYTES), align=1), _VECTOR)
 
 
-@intrinsic
-def load_floats(typing_context, array, index):
-    """Return ``array.ravel()[index : index + 32]`` of a contiguous float32 array."""
-
-    def generate(context, builder, signature, arguments):
-        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], _FLOATS)
-        return builder.load(pointer, align=4)
-
-    return float_vector_type(array, types.intp), generate
+@_on_array(float_vector_type)
+def load_floats(builder, data, index):
+    """Return ``array.ravel()[index : index + 32]`` of a float32 array."""
+    return builder.load(_vector_at(builder, data, index, _FLOATS), align=4)
 
 
-@intrinsic
-def splat_float(typing_context, value):
-    """Return a vector with the float32 ``value`` in every lane."""
-
-    def generate(context, builder, signature, arguments):
-        return _splat(builder, arguments[0], _FLOATS)
-
-    return float_vector_type(types.float32), generate
-
-
-@intrinsic
-def multiply_add(typing_context, first, second, total):
-    """Lane by lane ``first * second + total`` of float vectors, rounded once where the processor can."""
-
-    def generate(context, builder, signature, arguments):
-        return _call(builder, f"llvm.fmuladd.v{LANES}f32", _FLOATS, arguments)
-
-    return float_vector_type(first, second, total), generate
-
-
-@intrinsic
-def store_rounded(typing_context, array, index, vector):
+@_on_array(types.void, float_vector_type)
+def store_rounded(builder, data, index, vector):
     """Write a float vector, rounded and clipped to 0 .. 255, to ``array.ravel()[index : index + 32]`` of uint8."""
-
-    def generate(context, builder, signature, arguments):
-        array, index, value = arguments
-        zeros, most, half = (ir.Constant(_FLOATS, [limit] * LANES) for limit in (0.0, 255.0, 0.5))
-        value = builder.fadd(value, half)
-        value = builder.select(builder.fcmp_ordered(">", value, zeros), value, zeros)  # NaN becomes 0
-        value = builder.select(builder.fcmp_ordered("<", value, most), value, most)
-        words = builder.fptoui(value, ir.VectorType(_WORD, LANES))
-        pointer = _address(context, builder, signature.args[0], array, index, _BYTES)
-        builder.store(builder.trunc(words, _BYTES), pointer, align=1)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vector), generate
+    zeros, most, half = (ir.Constant(_FLOATS, [limit] * LANES) for limit in (0.0, 255.0, 0.5))
+    value = builder.fadd(vector, half)
+    value = builder.select(builder.fcmp_ordered(">", value, zeros), value, zeros)  # NaN becomes 0
+    value = builder.select(builder.fcmp_ordered("<", value, most), value, most)
+    words = builder.fptoui(value, _WORDS)
+    builder.store(builder.trunc(words, _BYTES), _vector_at(builder, data, index, _BYTES), align=1)
 
 
-@intrinsic
-def splat(typing_context, value):
+@_primitive(float_vector_type, types.float32)
+def splat_float(builder, value):
     """Return a vector with ``value`` in every lane."""
-
-    def generate(context, builder, signature, arguments):
-        return _splat(builder, arguments[0], _VECTOR)
-
-    return vector_type(types.uint16), generate
+    return _splat(builder, value, _FLOATS)
 
 
-def _binary(name, operation, doc):
-    @intrinsic
-    def function(typing_context, first, second):
-        def generate(context, builder, signature, arguments):
-            return operation(builder, *arguments)
-
-        return vector_type(vector_type, vector_type), generate
-
-    function.__doc__ = doc
-    return function
+@_primitive(float_vector_type, *3 * [float_vector_type])
+def multiply_add(builder, first, second, total):
+    """Lane by lane ``first * second + total``, rounded once where the processor can."""
+    return _call(builder, f"llvm.fmuladd.v{LANES}f32", _FLOATS, first, second, total)
 
 
-def _smaller(builder, first, second):
-    return _call(builder, f"llvm.umin.v{LANES}i16", _VECTOR, (first, second))
+@_primitive(vector_type, types.uint16)
+def splat(builder, value):
+    """Return a vector with ``value`` in every lane."""
+    return _splat(builder, value, _VECTOR)
 
 
-def _larger(builder, first, second):
-    return _call(builder, f"llvm.umax.v{LANES}i16", _VECTOR, (first, second))
+@_primitive(vector_type, vector_type, vector_type)
+def add(builder, first, second):
+    """Lane by lane ``first + second``."""
+    return builder.add(first, second)
 
 
-def _slide_up(builder, before, vector):
-    lanes = ir.Constant(_LANE_INDEX, list(range(LANES - 1, 2 * LANES - 1)))
-    return builder.shuffle_vector(before, vector, lanes)
+@_primitive(vector_type, vector_type, vector_type)
+def subtract(builder, first, second):
+    """Lane by lane ``first - second``."""
+    return builder.sub(first, second)
 
 
-def _slide_down(builder, vector, after):
-    lanes = ir.Constant(_LANE_INDEX, list(range(1, LANES + 1)))
-    return builder.shuffle_vector(vector, after, lanes)
+@_primitive(vector_type, vector_type, vector_type)
+def smaller(builder, first, second):
+    """Lane by lane ``min(first, second)``."""
+    return _call(builder, f"llvm.umin.v{LANES}i16", _VECTOR, first, second)
 
 
-add = _binary("add", lambda builder, a, b: builder.add(a, b), "Lane by lane ``a + b``.")
-subtract = _binary("subtract", lambda builder, a, b: builder.sub(a, b), "Lane by lane ``a - b``.")
-smaller = _binary("smaller", _smaller, "Lane by lane ``min(a, b)``.")
-larger = _binary("larger", _larger, "Lane by lane ``max(a, b)``.")
-slide_up = _binary("slide_up", _slide_up, "Return ``(before, vector)`` shifted: lane i holds element i - 1.")
-slide_down = _binary("slide_down", _slide_down, "Return ``(vector, after)`` shifted: lane i holds element i + 1.")
+@_primitive(vector_type, vector_type, vector_type)
+def larger(builder, first, second):
+    """Lane by lane ``max(first, second)``."""
+    return _call(builder, f"llvm.umax.v{LANES}i16", _VECTOR, first, second)
 
 
-@intrinsic
-def smallest(typing_context, vector):
+@_primitive(vector_type, vector_type, vector_type)
+def slide_up(builder, before, vector):
+    """Return ``(before, vector)`` shifted: lane i holds element i - 1."""
+    return builder.shuffle_vector(before, vector, ir.Constant(_WORDS, list(range(LANES - 1, 2 * LANES - 1))))
+
+
+@_primitive(vector_type, vector_type, vector_type)
+def slide_down(builder, vector, after):
+    """Return ``(vector, after)`` shifted: lane i holds element i + 1."""
+    return builder.shuffle_vector(vector, after, ir.Constant(_WORDS, list(range(1, LANES + 1))))
+
+
+@_primitive(types.uint16, vector_type)
+def smallest(builder, vector):
     """Return the smallest lane."""
-
-    def generate(context, builder, signature, arguments):
-        return _call(builder, f"llvm.vector.reduce.umin.v{LANES}i16", _HALF, arguments)
-
-    return types.uint16(vector), generate
+    return _call(builder, f"llvm.vector.reduce.umin.v{LANES}i16", _HALF, vector)
 
 
-@intrinsic
-def lanes_at_most(typing_context, vector, limit):
+@_primitive(types.uint32, vector_type, types.uint16)
+def lanes_at_most(builder, vector, limit):
     """Return the mask of the lanes that are ``<= limit``."""
-
-    def generate(context, builder, signature, arguments):
-        limits = _splat(builder, arguments[1], _VECTOR)
-        return _lane_mask(builder, builder.icmp_unsigned("<=", arguments[0], limits))
-
-    return types.uint32(vector, types.uint16), generate
+    return builder.bitcast(builder.icmp_unsigned("<=", vector, _splat(builder, limit, _VECTOR)), _WORD)
 
 
-@intrinsic
-def fill_where_nonzero(typing_context, vector):
+@_primitive(vector_type, vector_type)
+def fill_where_nonzero(builder, vector):
     """Return 65535 in the nonzero lanes, 0 in the others."""
-
-    def generate(context, builder, signature, arguments):
-        zeros = ir.Constant(_VECTOR, [0] * LANES)
-        return builder.sext(builder.icmp_unsigned("!=", arguments[0], zeros), _VECTOR)
-
-    return vector_type(vector), generate
+    return builder.sext(builder.icmp_unsigned("!=", vector, ir.Constant(_VECTOR, [0] * LANES)), _VECTOR)
 
 
-@intrinsic
-def mix(typing_context, mask, first, second):
+@_primitive(vector_type, *3 * [vector_type])
+def mix(builder, mask, first, second):
     """Return ``second`` in the lanes where the mask is 65535, ``first`` where it is 0."""
-
-    def generate(context, builder, signature, arguments):
-        mask, first, second = arguments
-        return builder.xor(first, builder.and_(mask, builder.xor(first, second)))
-
-    return vector_type(mask, first, second), generate
+    return builder.xor(first, builder.and_(mask, builder.xor(first, second)))
 
 
-@intrinsic
-def choose_smaller(typing_context, candidate, best, index, best_index):
+@_primitive(vector_type, *4 * [vector_type])
+def choose_smaller(builder, candidate, best, index, best_index):
     """Return ``index`` in the lanes where ``candidate <= best``, ``best_index`` in the others."""
-
-    def generate(context, builder, signature, arguments):
-        candidate, best, index, best_index = arguments
-        return builder.select(builder.icmp_unsigned("<=", candidate, best), index, best_index)
-
-    return vector_type(candidate, best, index, best_index), generate
+    return builder.select(builder.icmp_unsigned("<=", candidate, best), index, best_index)
 
 
-def _bit_count(name, doc):
-    @intrinsic
-    def function(typing_context, mask):
-        def generate(context, builder, signature, arguments):
-            zero_is_undefined = ir.Constant(ir.IntType(1), 1)
-            count = _call(builder, f"llvm.{name}.i32", _WORD, (arguments[0], zero_is_undefined))
-            return builder.zext(count, ir.IntType(64))
-
-        return types.intp(types.uint32), generate
-
-    function.__doc__ = doc
-    return function
+def _zeros_beside(builder, mask, name):
+    zero_is_undefined = ir.Constant(ir.IntType(1), 1)
+    return builder.zext(_call(builder, f"llvm.{name}.i32", _WORD, mask, zero_is_undefined), ir.IntType(64))
 
 
-first_lane = _bit_count("cttz", "Return the number of the lowest lane of a non-empty mask.")
-lanes_above_last = _bit_count("ctlz", "Return the number of lanes above the highest lane of a non-empty mask.")
+@_primitive(types.intp, types.uint32)
+def first_lane(builder, mask):
+    """Return the number of the lowest lane of a non-empty mask."""
+    return _zeros_beside(builder, mask, "cttz")
+
+
+@_primitive(types.intp, types.uint32)
+def lanes_above_last(builder, mask):
+    """Return the number of lanes above the highest lane of a non-empty mask."""
+    return _zeros_beside(builder, mask, "ctlz")
 
 
 @intrinsic
@@ -273,11 +237,12 @@ def hamming(typing_context, words, index, word):
     """
 
     def generate(context, builder, signature, arguments):
-        bits = signature.args[0].dtype.bitwidth
+        array, index, word = arguments
+        bits = words.dtype.bitwidth
         kind = ir.VectorType(ir.IntType(bits), LANES)
-        pointer = _address(context, builder, signature.args[0], arguments[0], arguments[1], kind)
-        differing = builder.xor(builder.load(pointer, align=bits // 8), _splat(builder, arguments[2], kind))
-        counts = _call(builder, f"llvm.ctpop.v{LANES}i{bits}", kind, (differing,))
+        pointer = _vector_at(builder, context.make_array(words)(context, builder, array).data, index, kind)
+        differing = builder.xor(builder.load(pointer, align=bits // 8), _splat(builder, word, kind))
+        counts = _call(builder, f"llvm.ctpop.v{LANES}i{bits}", kind, differing)
         return builder.trunc(counts, _VECTOR)
 
     return vector_type(words, types.intp, words.dtype), generate
