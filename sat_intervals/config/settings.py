@@ -102,7 +102,9 @@ class Config(Section):
         if is_census and (fraction := [name for name in ("p1", "p2") if getattr(sgm, name) % 1]):
             raise ValueError(f"sgm.{fraction[0]} is {getattr(sgm, fraction[0])}, allowed: whole numbers with census")
         if not is_census and sgm.span is None:
-            raise ValueError("sgm.span is missing: it has no default with mccnn (see config --preset mccnn)")
+            raise ValueError(
+                "sgm.span is missing: it has no default with cost.method mccnn (see config --preset mccnn)"
+            )
         # The largest uint16 marks the summed cost of an impossible candidate.
         largest = (IMPOSSIBLE_COST - 1) // SGM_PATHS - self.cost.largest
         if self.largest_p2 > largest:
