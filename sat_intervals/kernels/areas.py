@@ -6,7 +6,7 @@ Letters: r row, c column, s and t segments (runs of low-confidence pixels in a r
 import numpy as np
 
 from sat_intervals.kernels.compiled import cached
-from sat_intervals.kernels.intervals import find_segments, find_touching
+from sat_intervals.kernels.intervals import find_segments
 
 
 @cached
@@ -18,10 +18,7 @@ def area_maximum(values, low, depth):
     depth: largest number of steps between touching segments of an area, as in `regularize`.
     Returns ``(rows, columns)`` float64, NaN outside low-confidence pixels and where the area has no value.
     """
-    start, stop, row_start = find_segments(low)
-    above, below = np.zeros((start.size, 2), np.int64), np.zeros((start.size, 2), np.int64)
-    find_touching(start, stop, row_start, above, -1)
-    find_touching(start, stop, row_start, below, 1)
+    start, stop, row_start, above, below = find_segments(low)
     largest = np.full(start.size, -np.inf)
     for r in range(values.shape[0]):
         for s in range(row_start[r], row_start[r + 1]):

@@ -30,29 +30,6 @@ def ambiguity_histogram(ambiguity: np.ndarray, searched: np.ndarray, largest: in
     return np.bincount(ambiguity[searched], minlength=largest + 1)
 
 
-def percentiles(histogram: np.ndarray) -> tuple[float, float]:
-    """1st and 99th percentile of the values ``0 .. n - 1`` of a histogram.
-
-    ``histogram[a]`` pixels have the value ``a``.
-    Returns ``(p1, p99)``, interpolated as by ``numpy.percentile`` on the values; NaN for an empty histogram.
-    """
-    cumulative = np.cumsum(histogram)
-    if cumulative.size == 0 or cumulative[-1] == 0:
-        return float("nan"), float("nan")
-
-    def percentile(share: float) -> float:
-        rank = share * float(cumulative[-1] - 1)
-        below = int(np.floor(rank))
-        first = float(np.searchsorted(cumulative, below, side="right"))
-        second = float(np.searchsorted(cumulative, min(below + 1, int(cumulative[-1]) - 1), side="right"))
-        part = rank - below
-        if part < 0.5:
-            return first + (second - first) * part
-        return second - (second - first) * (1.0 - part)  # rounds as numpy does
-
-    return percentile(0.01), percentile(0.99)
-
-
 @cached
 def normalize(ambiguity, searched, p1, p99):
     """Confidence in [0, 1] from ambiguity: ``1 - clip((A - p1) / (p99 - p1), 0, 1)``.

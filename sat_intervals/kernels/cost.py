@@ -178,11 +178,6 @@ class Cells(NamedTuple):
     column: int
 
 
-def one_cell(rows: int, columns: int, count: int) -> Cells:
-    """Cells of a patch of which every pixel has all ``count`` candidates."""
-    return Cells(np.zeros((1, 1), np.int64), np.full((1, 1), count - 1, np.int64), rows, columns, 0, 0)
-
-
 class Ranges(NamedTuple):
     """Search range of each pixel of a row, all ``(columns,)`` int64.
 
@@ -211,11 +206,6 @@ def span_at(ranges, count, size, c):
     if ranges is None:  # kernels are compiled for either form
         return Span(0, count - 1, 0, size)
     return Span(ranges.first[c], ranges.last[c], ranges.start[c], ranges.stop[c])
-
-
-def new_ranges(columns: int) -> Ranges:
-    """Allocate the ranges of a row."""
-    return Ranges(*(np.zeros(columns, np.int64) for _ in Ranges._fields))
 
 
 def volume_starts(cells: Cells, output: Window) -> np.ndarray:

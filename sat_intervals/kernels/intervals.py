@@ -108,8 +108,9 @@ def subpixel_cuts(curve, span, lowest, disparity, settings):
 def find_segments(low):
     """Find the runs of low-confidence pixels.
 
-    Returns the columns ``[start, stop)`` of each segment, int32, and the first segment of each row, ``(rows + 1,)``
-    int64; the last entry is the number of segments.
+    Returns the columns ``[start, stop)`` of each segment, int32; the first segment of each row, ``(rows + 1,)`` int64,
+    whose last entry is the number of segments; and the touching segments in the rows above and below, ``(segments, 2)``
+    int64, see `_find_touching`.
     """
     rows, columns = low.shape
     count = 0
@@ -130,11 +131,14 @@ def find_segments(low):
                     stop[s] = c + 1
                     s += 1
     row_start[rows] = s
-    return start, stop, row_start
+    above, below = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
+    _find_touching(start, stop, row_start, above, -1)
+    _find_touching(start, stop, row_start, below, 1)
+    return start, stop, row_start, above, below
 
 
 @part
-def find_touching(start, stop, row_start, neighbours, step):
+def _find_touching(start, stop, row_start, neighbours, step):
     """Fill ``neighbours[s]`` with ``first, stop`` of the segments in row ``r + step`` that share a column with s."""
     rows = row_start.size - 1
     for r in range(rows):
@@ -249,11 +253,8 @@ def regularize(lower, upper, low, minimum, depth, quantile, rows, per_pixel):
     Returns ``(lower, upper)``, float32 of shape ``(last - first, columns)``; pixels that are not low keep their bounds.
     """
     first, last = rows
-    start, stop, row_start = find_segments(low)
+    start, stop, row_start, above, below = find_segments(low)
     segments = start.size
-    above, below = np.zeros((segments, 2), np.int64), np.zeros((segments, 2), np.int64)
-    find_touching(start, stop, row_start, above, -1)
-    find_touching(start, stop, row_start, below, 1)
     segment_row = np.empty(segments, np.int64)
     for r in range(row_start.size - 1):
         segment_row[row_start[r] : row_start[r + 1]] = r

@@ -112,7 +112,7 @@ def trace(
 ) -> Edge:
     """Path states of one wavefront where it leaves ``borders.inside``: no sums, no cost curves.
 
-    Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS, and only its ring of ``borders`` is used.
+    Parameters as in `match_costs`; ``wavefront`` is an index of WAVEFRONTS: only its states around are used.
     """
     down, wave = WAVEFRONTS[wavefront]
     buffers = new_buffers(costs, gradients, settings, borders, cells, down)

@@ -62,10 +62,8 @@ class Penalties(NamedTuple):
 
 def make_penalties(gradients: Gradients | None, p1: int, p2: int, columns: int, size: int) -> Penalties:
     """Allocate penalties: constants without gradients, else buffers of a row for `fill_row`."""
-    if gradients is None:
-        return Penalties(p1, p2, None)
-    first, second = np.zeros((2, 4, columns), np.uint16), np.zeros((2, 4, columns), np.uint16)
-    return Penalties(p1, p2, RowPenalties(first, second, np.zeros((4, columns + size), np.uint16)))
+    tables = (np.zeros(shape, np.uint16) for shape in ((2, 4, columns), (2, 4, columns), (4, columns + size)))
+    return Penalties(p1, p2, None if gradients is None else RowPenalties(*tables))
 
 
 @part

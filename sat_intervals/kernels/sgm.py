@@ -217,22 +217,11 @@ WAVEFRONTS = ((True, 0), (True, 1), (False, 0), (False, 1))
 LAST, LAST_WAVE = 3, WAVEFRONTS[3][1]
 
 
-class Ring(NamedTuple):
-    """Path states of one wavefront on the pixels around a tile. Empty arrays: no neighbour, so paths start.
-
-    column: ``(rows, 2, size)`` uint16: states beside each row of the tile, in the column that the wavefront comes from.
-    row: ``(columns, 2, size)`` uint16: states in the row that the wavefront comes from, for each column of the patch.
-    """
-
-    column: np.ndarray
-    row: np.ndarray
-
-
 class Edge(NamedTuple):
-    """Path states of one wavefront on the last pixels of a tile, which it hands on; empty if nobody takes them over.
+    """Path states of one wavefront on a column and a row of pixels, both ``(pixels, 2, size)`` uint16.
 
-    column: ``(rows, 2, size)`` uint16: states in the column that the wavefront goes to, for each row of the tile.
-    row: ``(columns, 2, size)`` uint16: states in the row that it goes to, for each column of the tile.
+    Those around a tile, in the column and the row that the wavefront comes from: empty without a neighbour, so paths
+    start. Those of its last pixels, which it hands on: empty if nobody takes them over.
     """
 
     column: np.ndarray
@@ -243,25 +232,25 @@ class Borders(NamedTuple):
     """Path states around the pixels of a patch that are computed.
 
     inside: these pixels. The patch has one pixel more on each side that has a neighbour.
-    rings: by wavefront.
+    around: by wavefront; a row has states for each column of the patch.
     """
 
     inside: Window
-    rings: tuple[Ring, ...]
+    around: tuple[Edge, ...]
 
 
 def no_borders(inside: Window, size: int) -> Borders:
     """Borders of a patch without neighbours; ``size`` is a number of whole vectors."""
     nothing = np.zeros((0, 2, size), np.uint16)
-    return Borders(inside, (Ring(nothing, nothing),) * len(WAVEFRONTS))
+    return Borders(inside, (Edge(nothing, nothing),) * len(WAVEFRONTS))
 
 
 @part
-def take_over(paths, rings, inside, r, falling, rising, down):
-    """Set the paths that enter row ``r``, or the next row where ``r`` lies outside, to the states of the rings."""
+def take_over(paths, around, inside, r, falling, rising, down):
+    """Set the paths that enter row ``r``, or the next row where ``r`` lies outside, to the states around."""
     columns = paths.lowest.size // 3
     for wave in range(2):
-        column, row = rings[wave]
+        column, row = around[wave]
         if not inside.row <= r < inside.row_stop:
             for c in range(row.shape[0]):
                 _set_wave(paths, path_slots(c, columns, falling, rising), wave, row[c])

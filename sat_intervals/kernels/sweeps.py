@@ -19,8 +19,6 @@ from sat_intervals.kernels.cost import (
     Ranges,
     cost_curve,
     enter_cells,
-    new_ranges,
-    one_cell,
     padded_to_lanes,
     span_at,
 )
@@ -42,7 +40,6 @@ from sat_intervals.kernels.sgm import (
     Borders,
     Edge,
     Paths,
-    Ring,
     add_curve,
     advance_pixel,
     advance_wave,
@@ -110,8 +107,8 @@ class Buffers(NamedTuple):
     usable: ``(columns + count,)`` int64: number of usable right pixels of the row before each one.
     possible: ``(columns,)`` int64: number of possible candidates of each pixel of the row.
     curve, opened: ``(size,)`` uint16: one curve; ``(2,)`` int64: its vectors that are in use, None if all are.
-    inside: pixels whose paths are computed; those of the pixels around them come from ``rings``.
-    rings: those of the two waves of the sweep.
+    inside: pixels whose paths are computed; those of the pixels around them come from ``around``.
+    around: those of the two waves of the sweep.
     leaving: states that leave the pixels ``inside``, to fill; empty if nobody takes them over.
     down: direction of the sweep. As a constant argument of `_enter_row` it would be compiled for each direction.
     """
@@ -126,7 +123,7 @@ class Buffers(NamedTuple):
     curve: np.ndarray
     opened: np.ndarray | None
     inside: Rectangle
-    rings: tuple[Ring, ...]
+    around: tuple[Edge, ...]
     leaving: Edge
     down: bool
 
@@ -142,15 +139,15 @@ def new_buffers(
     """Allocate the buffers of a sweep; parameters as in `match_costs`."""
     (rows, columns), size = costs.left_state.shape, padded_to_lanes(settings.count)
     left = borders.inside if borders else Window(0, 0, 0, 0)
-    inside, rings = borders or no_borders(Window(0, 0, rows, columns), size)
+    inside, around = borders or no_borders(Window(0, 0, rows, columns), size)
     has_cells = cells is not None
     k = np.arange(size)
-    cells = cells or one_cell(rows, columns, settings.count)
+    cells = cells or Cells(np.zeros((1, 1), np.int64), np.full((1, 1), settings.count - 1), rows, columns, 0, 0)
     walls = ((k < cells.first.reshape(-1, 1)) | (k > cells.last.reshape(-1, 1))) * np.uint16(WALL)
     return Buffers(
         Candidates(costs, np.zeros(columns + size, np.uint16), walls, np.zeros(columns, np.int64)),
         cells,
-        new_ranges(columns) if has_cells else None,
+        Ranges(*np.zeros((4, columns), np.int64)) if has_cells else None,
         np.zeros(columns + settings.count, np.int64),
         np.zeros(columns, np.int64),
         make_penalties(gradients, settings.p1, settings.p2, columns, size),
@@ -158,7 +155,7 @@ def new_buffers(
         np.zeros(size, np.uint16),
         np.array([0, size]) if has_cells else None,
         rectangle_of(inside),
-        rings[:2] if down else rings[2:],
+        around[:2] if down else around[2:],
         Edge(np.zeros((left.height, 2, size), np.uint16), np.zeros((left.width, 2, size), np.uint16)),
         down,
     )
@@ -170,7 +167,7 @@ def _enter_row(buffers, gradients, settings, r):
 
     Returns ``falling`` and ``rising``, the row's arguments of `path_slots`.
     """
-    candidates, cells, ranges, usable, possible, penalties, paths, curve, _, inside, rings, _, down = buffers
+    candidates, cells, ranges, usable, possible, penalties, paths, curve, _, inside, around, _, down = buffers
     costs, barrier = candidates.costs, candidates.barrier
     for x in range(costs.right_state.shape[1]):
         barrier[x] = settings.impossible if costs.right_state[r, x] else 0
@@ -182,7 +179,7 @@ def _enter_row(buffers, gradients, settings, r):
         possible[c] = inner if costs.left_state[r, c] == 0 else 0
     falling, rising = -r % possible.size, r % possible.size
     enter_row(paths, possible.size, falling, rising, down)
-    take_over(paths, rings, inside, r, falling, rising, down)
+    take_over(paths, around, inside, r, falling, rising, down)
     fill_row(gradients, r, down, penalties.row)
     return falling, rising
 

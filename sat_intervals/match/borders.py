@@ -12,7 +12,7 @@ import numpy as np
 from sat_intervals.config import Config
 from sat_intervals.kernels.cost import padded_to_lanes
 from sat_intervals.kernels.matching import trace
-from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Edge, Ring
+from sat_intervals.kernels.sgm import WALL, WAVEFRONTS, Borders, Edge
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.match.matching_cost import MatchingCost
 from sat_intervals.match.patch import Frame, frame_area, mirrored_settings, patch_settings, path_window
@@ -43,8 +43,8 @@ def in_order(wavefront: int, tiles: Iterable[Tile]) -> list[Tile]:
     return sorted(tiles, key=lambda tile: (-row * tile.grid_row, -column * tile.grid_column))
 
 
-def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size: int) -> Ring:
-    """The ring of a patch, from the borders of the tile's `sources` that exist.
+def _around(wavefront: int, patch: Window, borders: Mapping[Place, Border], size: int) -> Edge:
+    """The states around a patch, from the borders of the tile's `sources` that exist.
 
     ``size`` is the number of disparities in whole vectors.
     """
@@ -58,7 +58,7 @@ def ring_of(wavefront: int, patch: Window, borders: Mapping[Place, Border], size
                 inside, edge = borders[place]
                 shared = inside.clipped(Window(inside.row, patch.column, inside.height, patch.width))
                 row[shared.relative_to(patch).slices[1]] = edge.row[shared.relative_to(inside).slices[1]]
-    return Ring(borders[beside].edge.column if beside in borders else nothing, row)
+    return Edge(borders[beside].edge.column if beside in borders else nothing, row)
 
 
 def rehulled(edge: Edge, minimum: int, config: Config) -> Edge:
@@ -80,8 +80,8 @@ def rehulled(edge: Edge, minimum: int, config: Config) -> Edge:
 def borders_of(frame: Frame, config: Config, found: Sequence[Mapping[Place, Border]]) -> Borders:
     """Borders of a tile for the kernels, from those of its neighbours by wavefront and place."""
     patch, size = frame_area(frame, config).base, padded_to_lanes(config.disparity.count)
-    rings = tuple(ring_of(wavefront, patch, borders, size) for wavefront, borders in enumerate(found))
-    return Borders(path_window(frame, config).relative_to(patch), rings)
+    around = tuple(_around(wavefront, patch, borders, size) for wavefront, borders in enumerate(found))
+    return Borders(path_window(frame, config).relative_to(patch), around)
 
 
 def trace_area(

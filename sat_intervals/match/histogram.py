@@ -1,8 +1,24 @@
-"""Histograms of numbers, for medians of any number of pixels."""
+"""Histograms of numbers, for medians and quantiles of any number of pixels."""
+
+from math import floor, nan
 
 import numpy as np
 
 _BIAS, _LARGEST_BIAS = 1000, 1000  # steps a pixel, and pixels
+
+
+def quantile(values: np.ndarray, counts: np.ndarray, share: float) -> float:
+    """Quantile of values that occur ``counts`` times each, rounded as by `numpy.quantile`; NaN without values."""
+    order = np.argsort(values, kind="stable")
+    upto = np.cumsum(counts[order])
+    if not upto.size or upto[-1] == 0:
+        return nan
+    rank = share * float(upto[-1] - 1)
+    below = floor(rank)
+    places = np.searchsorted(upto, [below, min(below + 1, int(upto[-1]) - 1)], side="right")
+    low, high = (float(value) for value in values[order][places])
+    part = rank - below
+    return low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part)
 
 
 class Histogram:
@@ -21,46 +37,33 @@ class Histogram:
             counts = np.bincount(places - least)
             self._counts[least : least + counts.size] += counts
 
+    def _present(self) -> tuple[np.ndarray, np.ndarray]:
+        """Values that occur, ascending, and their counts."""
+        places = np.flatnonzero(self._counts)
+        return self._first + places / self._steps, self._counts[places]
+
     def median(self) -> float | None:
         """Return the median (the mean of both middle values of an even number); None without values."""
-        upto = np.cumsum(self._counts)
-        if upto[-1] == 0:
-            return None
-        middle = np.searchsorted(upto, [(upto[-1] - 1) // 2, upto[-1] // 2], side="right")
-        return float(self._first + middle.sum() / (2 * self._steps))
+        return self.quantile(0.5)
 
     def quantile(self, share: float) -> float | None:
         """Return a quantile, linear between values; None without values."""
-        present = np.flatnonzero(self._counts)
-        return _quantile(self._first + present / self._steps, self._counts[present], share)
+        values, counts = self._present()
+        return quantile(values, counts, share) if values.size else None
 
     def quantile_of_absolutes(self, share: float) -> float | None:
         """Return a quantile of the absolute values, linear between values; None without values."""
-        present = np.flatnonzero(self._counts)
-        values = np.abs(self._first + present / self._steps)
-        order = np.argsort(values, kind="stable")
-        return _quantile(values[order], self._counts[present][order], share)
+        values, counts = self._present()
+        return quantile(np.abs(values), counts, share) if values.size else None
 
     def deviation(self) -> float | None:
-        """Return the median absolute deviation from the median; None without values."""
-        median = self.median()
+        """Return the median absolute deviation from the median, the lower of two middle ones; None without values."""
+        median, (values, counts) = self.median(), self._present()
         if median is None:
             return None
-        present = np.flatnonzero(self._counts)
-        distance = np.abs(self._first + present / self._steps - median)
-        nearest_first = np.argsort(distance, kind="stable")
-        upto = np.cumsum(self._counts[present][nearest_first])
-        return float(distance[nearest_first[np.searchsorted(upto, (upto[-1] - 1) // 2, side="right")]])
-
-
-def _quantile(values: np.ndarray, counts: np.ndarray, share: float) -> float | None:
-    """Return a quantile of sorted values that occur several times, as `numpy.quantile`."""
-    upto = np.cumsum(counts)
-    if not upto.size:
-        return None
-    place = share * (upto[-1] - 1)
-    low, high = values[np.searchsorted(upto, [np.floor(place), np.ceil(place)], side="right")]
-    return float(low + (place - np.floor(place)) * (high - low))
+        number = counts.sum()
+        share = (number - 1) // 2 / max(1, number - 1)  # of the lower
+        return quantile(np.abs(values - median), counts, share)
 
 
 def bias_histogram() -> Histogram:

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from sat_intervals.config import Ambiguity, Config
-from sat_intervals.kernels.confidence import low_confidence, normalize, percentiles
+from sat_intervals.kernels.confidence import low_confidence, normalize
 from sat_intervals.kernels.disparity import cross_check, median
 from sat_intervals.kernels.intervals import regularize
 from sat_intervals.kernels.matching import Raw, RightView
+from sat_intervals.match.histogram import quantile
 from sat_intervals.products import (
     BOUND_STEPS,
     INVALID,
@@ -89,7 +90,7 @@ def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceSc
     """
     if settings.p1 is not None and settings.p99 is not None:
         return ConfidenceScale(settings.p1, settings.p99)
-    p1, p99 = percentiles(histogram)
+    p1, p99 = (quantile(np.arange(histogram.size), histogram, share) for share in (0.01, 0.99))
     if settings.normalization == "range" or p1 == p99:
         return ConfidenceScale(0.0, float(histogram.size - 1))
     return ConfidenceScale(p1, p99)
