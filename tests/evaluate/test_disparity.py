@@ -196,7 +196,7 @@ def pair(tmp_path_factory):
 
 def settings_of(folder, **more):
     (pair,) = find_pairs([folder])
-    return {"disparity": {"minimum": pair.minimum, "maximum": pair.maximum}, **more}
+    return {"preset": "paper", "disparity": {"minimum": pair.minimum, "maximum": pair.maximum}, **more}
 
 
 @pytest.fixture(scope="module")
