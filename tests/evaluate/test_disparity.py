@@ -433,7 +433,7 @@ def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
             for p in find_pairs([folder])
         )
     )
-    status, text, shown = command("evaluate", tmp_path / "pairs.csv", run, "--json")
+    status, text, shown = command("evaluate", tmp_path / "pairs.csv", run, "--preset", "paper", "--json")
     assert status == 0
     assert [line for line in shown.splitlines() if not line.startswith("sat-intervals: ")] == [
         "matching one",
