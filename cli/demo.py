@@ -2,8 +2,7 @@
 
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,8 +12,6 @@ from sat_intervals.cli.options import FILE, json_option, say_json
 if TYPE_CHECKING:
     import numpy as np
 
-    from sat_intervals.cli.console import Console
-    from sat_intervals.config import Config
     from sat_intervals.raster import Georeferencing
 
 
@@ -77,7 +74,11 @@ def demo(
         say_json({"run": report, "truth": figures})
     else:
         console.summary(report, out)
-        _judge(config, out, figures, console, run.quiet)
+        if figures["count"]:
+            console.say(
+                f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
+                f"at a mean width of {figures['mean_width']:.2f} px."
+            )
     run.check_strict(report["warnings"])
 
 
@@ -96,43 +97,3 @@ def _write(path: Path, pixels: "np.ndarray", nodata: float, place: "Georeferenci
     check_free(path, overwrite=overwrite)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_layer(path, pixels, nodata, place, {"SOFTWARE": "sat-intervals"})
-
-
-def _judge(config: "Config", out: Path, figures: dict[str, Any], console: "Console", quiet: bool) -> None:
-    """Print how often the interval contains the truth, and compare alpha with a coverage."""
-    if figures["count"]:
-        console.say(
-            f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
-            f"at a mean width of {figures['mean_width']:.2f} px."
-        )
-        if not quiet:
-            _compare(config, out, figures, console)
-
-
-def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Console") -> None:
-    """Match again with a coverage, or with alpha if the run has a coverage, and print widths and scores of both."""
-    from sat_intervals.config import Cluster, ConfigError, load_config, resolved
-    from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.run.pair import match_pair
-
-    own = config.interval
-    if own is None:
-        return
-    one, other_one = ("alpha", "coverage") if own.coverage is None else ("coverage", "alpha")
-    nominal = getattr(own, one)
-    names, interval = [f"{one} {nominal}", f"{other_one} {nominal}"], {other_one: nominal}
-    try:
-        # other machines do not see the folder
-        here = config.model_copy(update={"cluster": Cluster(workers=config.cluster.workers)})
-        other = resolved(load_config(here, {"interval": interval}))
-    except ConfigError:  # no built-in calibration, or a coverage that none has
-        return
-    with TemporaryDirectory(prefix="sat-intervals-") as folder:
-        console.progress("compared", 0, 1)
-        match_pair(out / "left.tif", out / "right.tif", folder, other)
-        beside = evaluate_run(folder, out / "truth.tif")["all"]
-    for name, of in zip(names, (figures, beside), strict=True):
-        console.say(
-            f"{name:<13} coverage {of['accuracy']:.3f}, median width {of['median_width']:.2f} px, mean "
-            f"{of['mean_width']:.2f} px, interval score {of['interval_score']:.2f} px"
-        )
