@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sat_intervals.cli.matching import RunArguments, SettingsArguments, local_option, run_options, settings_options
+from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import FILE, json_option, say_json
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     show_default=True,
     help="Height of a mountain under the city; 1 m is a disparity of 1 px.",
 )
-@local_option
 @json_option
 @settings_options
 @run_options
@@ -38,7 +37,6 @@ def demo(
     size: tuple[int, int],
     seed: int,
     relief: float,
-    local_range: bool,
     as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
@@ -62,8 +60,7 @@ def demo(
     with Console(run.quiet or as_json) as console:
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
-        search = {"minimum": scene.minimum, "maximum": scene.maximum} | ({"local": True} if local_range else {})
-        config = settings.load(disparity=search)
+        config = settings.load(disparity={"minimum": scene.minimum, "maximum": scene.maximum})
         check_not_replaced([settings.file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
             _write(path, pixels, value, somewhere, overwrite=run.overwrite)

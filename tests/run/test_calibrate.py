@@ -146,7 +146,9 @@ def test_calibrate__a_wrong_truth_is_one_line(scene, tmp_path, truth, words):
 def test_calibrate__mistaken_arguments_are_one_line(scene, tmp_path):
     output = "--output", tmp_path / "new.yaml"
     assert "classes of confidence" in one_line(invoke("calibrate", scene, *output, "--config", off(tmp_path)))
-    assert "given 2 times for 1 PAIRS" in one_line(invoke("calibrate", scene, *output, *2 * ("--truth", "a.tif")))
+    assert "given 2 times for 1 runs and pairs" in one_line(
+        invoke("calibrate", scene, *output, *2 * ("--truth", "a.tif"))
+    )
     assert "applies only with --dsm" in one_line(invoke("calibrate", scene, *output, "--coverage", 0.9))
     assert "existing folder" in one_line(invoke("calibrate", scene, "--output", tmp_path / "no" / "new.yaml"))
     assert "truth.tif" in one_line(invoke("calibrate", scene, "--output", scene / "truth.tif"))
