@@ -11,7 +11,7 @@ from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import FLAGS, INVALID, flag_attributes
-from sat_intervals.raster import POINT_FILES, RUN_FILES, grid_mapping, is_points_of, read_layers
+from sat_intervals.raster import POINT_FILES, RUN_FILES, grid_mapping, read_layers
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -68,9 +68,7 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals", "finished": run.report["finished"]}
     if run.config.preset:
         dataset.attrs["preset"] = run.config.preset
-    points = run.out / POINT_FILES[0].name
-    has_points = points.exists() and is_points_of(points, run.report["finished"])
-    for file in (*RUN_FILES, *(POINT_FILES if has_points else ())):
+    for file in (*RUN_FILES, *(POINT_FILES if run.has_current("points.tif") else ())):
         for number, band in enumerate(file.bands, start=1):
             lazy = indexing.LazilyIndexedArray(_Layer(run, file.name, number, file.dtype))
             attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
@@ -78,15 +76,10 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
     dataset["validity"].attrs = flag_attributes()
     if chunks is not None:
         dataset = dataset.chunk({"y": chunks, "x": chunks})
-    dataset["width"] = _width(dataset)
+    dataset["width"] = dataset.intervals.width()
     for variable in dataset.data_vars.values():
         variable.encoding["grid_mapping"] = _PLACE
     return dataset
-
-
-def _width(dataset: xr.Dataset) -> xr.DataArray:
-    width = dataset["upper"] - dataset["lower"]
-    return width.assign_attrs(long_name="width of the disparity interval", units="px")
 
 
 def _coordinates(run: Run) -> dict[Hashable, Any]:
@@ -130,7 +123,8 @@ class Intervals:
 
     def width(self) -> xr.DataArray:
         """Return the width of the intervals in pixels, NaN where there is none."""
-        return _width(self._dataset)
+        width = self._dataset["upper"] - self._dataset["lower"]
+        return width.assign_attrs(long_name="width of the disparity interval", units="px")
 
     def flags(self) -> xr.Dataset:
         """Return the decoded validity flags, see `decode_flags`."""
@@ -141,14 +135,11 @@ class Intervals:
 
         ``truth`` is the true disparity in pixels, as large as the dataset; NaN where unknown.
         """
-        dataset = self._dataset
-        if truth.shape != dataset["lower"].shape:
-            raise SatIntervalsError(
-                f"the truth has the shape {truth.shape}, the intervals {dataset['lower'].shape}: select the same part"
-            )
-        pixels = truth.data if isinstance(truth, xr.DataArray) else truth  # by place, not by labels
-        true = xr.DataArray(pixels, dims=dataset["lower"].dims)
-        lower, upper, validity = (dataset[name].drop_vars(dataset.coords) for name in ("lower", "upper", "validity"))
+        lower, upper, validity = (self._dataset[name].variable for name in ("lower", "upper", "validity"))
+        if truth.shape != lower.shape:
+            sizes = f"the truth has the shape {truth.shape}, the intervals {lower.shape}"
+            raise SatIntervalsError(f"{sizes}: select the same part")
+        true = xr.Variable(lower.dims, truth.data if isinstance(truth, xr.DataArray) else truth)
         judged = ((validity & np.uint16(INVALID)) == 0) & np.isfinite(true) & np.isfinite(lower)
         hits = judged & (lower <= true) & (true <= upper)
         counts = xr.Dataset({"hits": hits.sum(), "judged": judged.sum()}).compute()
@@ -159,9 +150,7 @@ class Intervals:
         rows, width = self._dataset["lower"].shape
         first, last = columns or (0, width - 1)
         if not (0 <= row < rows and 0 <= first <= last < width):
-            raise SatIntervalsError(
-                f"row {row}, columns {first} to {last} are outside the dataset: rows are 0 to {rows - 1}, columns 0 to "
-                f"{width - 1}"
-            )
+            part = f"row {row}, columns {first} to {last} are outside the dataset"
+            raise SatIntervalsError(f"{part}: rows are 0 to {rows - 1}, columns 0 to {width - 1}")
         down, across = self._dataset["lower"].dims
         return self._dataset.isel({down: row, across: slice(first, last + 1)}).compute()

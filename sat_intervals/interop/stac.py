@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import logging
 import os
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -13,7 +12,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, FLAGS, POINTS, SURFACE, Band
-from sat_intervals.raster import footprint, is_points_of, is_surface_of, read_layers, read_place, write_file
+from sat_intervals.raster import footprint, read_layers, read_place, write_file
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import strips
 
@@ -26,9 +25,6 @@ _VALIDITY = Band("validity", "", "; ".join(f"bit {flag.bit} {flag.name}: {flag.m
 _STRIP = 1 << 22  # pixels
 _SHA256 = "1220"  # code and length of a multihash
 _DIGITS = 7  # of degrees: 1 cm
-_BEGINNING = 1024  # bytes of a picture, with its notes
-
-_LOG = logging.getLogger(__name__)
 
 
 def write_item(out: str | Path, *, taken: str | None = None, identifier: str | None = None) -> Path:
@@ -97,33 +93,18 @@ def _link(run: Run, side: str) -> dict[str, str]:
 
 
 def _assets(run: Run) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the key and the content of each asset; files that are not of the run as it is now are left out."""
-    finished, out = run.report["finished"], run.out
+    """Yield the key and the content of each asset; points, surface and maps of other runs are left out."""
     yield "intervals", _raster(run, "intervals.tif", "Disparity, its interval, confidence", BANDS)
     yield "validity", _raster(run, "validity.tif", "Validity flags", (_VALIDITY,))
-    if _is_taken(out / "points.tif", "triangulate", finished):
+    if run.has_current("points.tif"):
         yield "points", _raster(run, "points.tif", "Longitude, latitude and height of every pixel", POINTS)
-    if _is_taken(out / "dsm.tif", "dsm", finished):
+    if run.has_current("dsm.tif"):
         yield "dsm", _raster(run, "dsm.tif", "Surface model with intervals", SURFACE)
     report = {"title": "Settings, inputs, counts, times, versions", "type": "application/json", "roles": ["metadata"]}
-    yield "report", report | _file(out / "run.json")
-    if _is_taken(picture := out / "overview.png", "plot", finished):
-        yield "overview", {"title": "Maps", "type": "image/png", "roles": ["overview"]} | _file(picture)
-
-
-def _is_taken(file: Path, command: str, finished: str) -> bool:
-    """Return whether the file of a command exists and is of the run that finished then; say so if it is not."""
-    is_of = {"triangulate": is_points_of, "dsm": is_surface_of, "plot": _is_picture_of}[command]
-    if not file.exists() or is_of(file, finished):
-        return file.exists()
-    _LOG.warning("%s is not of this run as it is now and is left out: rerun sat-intervals %s", file, command)
-    return False
-
-
-def _is_picture_of(picture: Path, finished: str) -> bool:
-    """Return whether a picture notes that it is of a run; a user's, or one of an earlier run, does not."""
-    with picture.open("rb") as stream:
-        return b"Comment\0" + finished.encode() in stream.read(_BEGINNING)
+    yield "report", report | _file(run.out / "run.json")
+    if run.has_current("overview.png"):
+        maps = {"title": "Maps", "type": "image/png", "roles": ["overview"]}
+        yield "overview", maps | _file(run.out / "overview.png")
 
 
 def _file(path: Path) -> dict[str, Any]:

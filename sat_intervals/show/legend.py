@@ -1,4 +1,4 @@
-"""Define the pixel classes of maps and reports, and their colours."""
+"""Define the pixel classes of maps and reports, their colours, and the ends of colour scales."""
 
 from typing import Any, NamedTuple
 
@@ -48,3 +48,12 @@ def class_counts(counts: dict[str, Any]) -> list[int]:
     """Return the number of pixels in each of PIXEL_CLASSES from the section ``counts`` of ``run.json``."""
     regularized = counts["low_confidence"]
     return [counts["valid"] - regularized, regularized, *counts["causes"].values()]
+
+
+def limits(values: np.ndarray, otherwise: tuple[float, float] = (0, 1), cut: float = 1) -> tuple[float, float]:
+    """Return the finite values of which ``cut`` percent are below and above; ``otherwise`` if there are none."""
+    known = values[np.isfinite(values)]
+    if known.size == 0:
+        return otherwise
+    low, high = (float(end) for end in np.percentile(known, (cut, 100 - cut), method="nearest"))
+    return (low, high) if low < high else (low - 0.5, high + 0.5)

@@ -8,9 +8,9 @@ from matplotlib.ticker import MaxNLocator
 
 from sat_intervals.products import INVALID, Bands
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, page, say_empty
 from sat_intervals.show.cost_curve import Curve, read_curve
-from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION
+from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION, limits
 from sat_intervals.tiling import Window
 
 _WIDTH, _STRIP = 12.0, 1.0  # inches: of the page, and height of the image above a profile
@@ -136,7 +136,7 @@ def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, 
     top, bottom = max(0, row - reach), min(results.region.height, row + reach + 1)
     window = Window(top, first, bottom - top, columns)
     image = results.read_small_left(window, fitting((window.height, window.width), (_STRIP, _WIDTH), dpi))
-    low, high = limits(image, (0, 1))
+    low, high = limits(image)
     extent = (first - 0.5, last + 0.5, bottom - 0.5, top - 0.5)
     panel.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, aspect="auto", interpolation="nearest")
     panel.axhline(row, color=ORANGE, lw=1.2, ls="--")
