@@ -68,17 +68,16 @@ def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int =
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
         above.plot(curve.disparities, curve.costs, color="black", lw=1, marker="o", ms=3, label="cost curve")
         below.plot(curve.disparities, curve.possibilities, color="black", lw=1, marker="o", ms=3, label="possibility")
-        if curve.lower is not None:
+        if curve.cut.any():
             _draw_cut(below, curve, results)
         if np.isfinite(pixel.lower):
             text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"
             # The marker shows an interval of zero width.
             bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "marker": "|", "ms": 9, "mew": 3, "label": text}
             below.plot([pixel.lower, pixel.upper], [-0.08, -0.08], **bar)
-        lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
+        lines = [("disparity", curve.disparity, "black", ":")]
+        lines += [("truth", float(pixel.truth), VERMILION, "-")] if np.isfinite(pixel.truth) else []
         for name, place, colour, style in lines:
-            if not np.isfinite(place):
-                continue
             shown = across[0] <= place <= across[1]
             label = f"{name} {place:.2f} px" + ("" if shown else ", outside the range shown")
             above.axvline(place, color=colour, lw=1, ls=style, label=label)
@@ -97,17 +96,12 @@ def _describe(row: int, column: int, pixel: Bands) -> str:
 
 def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     """Draw the alpha-cut of the possibilities and the interval derived from it."""
-    assert curve.lower is not None
-    assert curve.upper is not None
-    assert curve.level is not None
     interval = results.config.interval
     name = f"level {curve.level:.3f}" if interval is None or interval.alpha is None else f"alpha = {curve.level:g}"
     chart.axhline(curve.level, color=INK, lw=0.8, ls="--")
-    right = chart.get_yaxis_transform()
-    chart.text(1, curve.level, name, transform=right, ha="right", va="bottom", color=INK)
-    cut = curve.cut
-    chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
-    inside = curve.disparities[cut]
+    chart.text(1, curve.level, name, transform=chart.get_yaxis_transform(), ha="right", va="bottom", color=INK)
+    inside = curve.disparities[curve.cut]
+    chart.plot(inside, curve.possibilities[curve.cut], "o", color=BLUE, ms=6, label="cut")
     is_whole = results.config.subpixel_levels == 0
     wider = is_whole and (curve.lower < inside.min() or curve.upper > inside.max())
     ends = f"{curve.lower:.4g} to {curve.upper:.4g} px"
@@ -117,16 +111,13 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     chart.annotate("", (curve.lower, 0.05), (curve.upper, 0.05), arrowprops=arrow)
 
 
-def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] | None) -> None:
+def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float]) -> None:
     """Set axis labels, limits, grid and legend."""
-    chart.set(xlabel=across, ylabel=up)
-    if shown:
-        chart.set_xlim(shown)
+    chart.set(xlabel=across, ylabel=up, xlim=shown)
     chart.grid(axis="y", color="#e8e8e8", zorder=0)
     chart.spines[["top", "right"]].set_visible(False)
-    if chart.get_legend_handles_labels()[0]:
-        keys = _KEYS if len(chart.get_legend_handles_labels()[0]) < _KEYS else _KEYS // 2  # else too wide for the page
-        chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=keys, frameon=False, borderaxespad=0.2)
+    keys = _KEYS if len(chart.get_legend_handles_labels()[0]) < _KEYS else _KEYS // 2  # else too wide for the page
+    chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=keys, frameon=False, borderaxespad=0.2)
 
 
 def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, dpi: int) -> None:
