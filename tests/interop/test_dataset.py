@@ -1,8 +1,5 @@
 """Finished runs as lazy datasets."""
 
-import subprocess
-import sys
-
 import dask.array
 import numpy as np
 import pytest
@@ -31,7 +28,6 @@ def test_open__is_lazy_and_has_the_pixels_of_the_files(made):
     for name, band in zip(("disparity", "lower", "upper", "confidence"), bands, strict=True):
         assert_array_equal(dataset[name], band)
     assert_array_equal(dataset["validity"], validity)
-    assert_array_equal(dataset["width"], bands[2] - bands[1])
     part = dataset["disparity"][5:60:7, ::-3]
     assert_array_equal(part, bands[0][5:60:7, ::-3])
     assert_allclose(dataset["confidence"][3, 4], bands[3, 3, 4])
@@ -86,7 +82,8 @@ def test_accessor__coverage_is_the_accuracy_of_evaluate(made):
 
 def test_accessor__width_and_profile(made):
     dataset, _, bands, _, _ = made
-    assert_array_equal(dataset.intervals.width(), bands[2] - bands[1])
+    for width in (dataset["width"], dataset.intervals.width()):
+        assert_array_equal(width, bands[2] - bands[1])
     profile = dataset.intervals.profile(69, (3, 8))
     assert isinstance(profile["upper"].data, np.ndarray)
     assert_array_equal(profile["upper"], bands[2, 69, 3:9])
@@ -99,11 +96,3 @@ def test_accessor__width_and_profile(made):
 def test_open__refuses_what_is_no_run(tmp_path):
     with pytest.raises(SatIntervalsError, match="give the folder of a finished run"):
         sat_intervals.open(tmp_path)
-
-
-@pytest.mark.process
-def test_accessor__is_registered_on_first_use_only() -> None:
-    code = "import sat_intervals, xarray as xr; a = hasattr(xr.Dataset, 'intervals'); sat_intervals.open; "
-    code += "print(a, hasattr(xr.Dataset, 'intervals'))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "False True\n"

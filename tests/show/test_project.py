@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 from finished import PLACE, no_bands, random_bands, without_intervals, write_run, write_surface
-from helpers import fail, invoke
+from helpers import invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from rasterio.crs import CRS
@@ -20,7 +20,6 @@ from surfaces import write_raster
 
 from sat_intervals.products import INVALID
 from sat_intervals.raster import ControlPoint, Georeferencing
-from sat_intervals.show import project
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
 from sat_intervals.show.styles import difference
 
@@ -49,14 +48,6 @@ def layers_of(root):
         for group in root.findall("layer-tree-group/layer-tree-group")
         for layer in group
     ]
-
-
-def test_write_project__calls_no_failed_read_a_failed_write(run, monkeypatch):
-    out, _, _ = run
-    monkeypatch.setattr(project, "read_layers", fail)
-    with pytest.raises(OSError, match="Input/output error"):
-        project.write_project(out)
-    assert not (out / "project.qgz").exists()
 
 
 def test_write_project__lists_all_layers_by_group_with_relative_paths(run):
