@@ -27,7 +27,6 @@ NOTHING = "#dedede"  # pixels without a value
 INK = "#555555"
 GROUND = "easting (m)", "northing (m)"  # axes of a map
 _STRETCHED = 5.0  # largest ratio of the sides of a map; pixels of longer ones are not square
-_WIDEST = 90  # percentile of widths at the end of their scale: low-confidence areas are often as wide as the range
 _BARS, _LEAST_SHARE = 48, 0.001  # of a histogram of widths: most bars, least share shown
 
 _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left"}
@@ -111,12 +110,6 @@ def draw_layer(panel: Axes, frame: Frame, layer: Layer) -> Colorbar:
     bar.set_label(layer.unit if layer.power == 1 else f"{layer.unit}, square-root scale")
     bar.ax.tick_params(labelsize=8)
     return bar
-
-
-def widest(widths: np.ndarray) -> float:
-    """Return the end of the colour scale of interval widths, a percentile of the finite ones; 1 if there are none."""
-    known = widths[np.isfinite(widths)]
-    return (float(np.percentile(known, _WIDEST, method="nearest")) if known.size else 0.0) or 1.0
 
 
 def add_histogram(bar: Colorbar, widths: np.ndarray, end: float, step: float) -> None:

@@ -21,13 +21,13 @@ from sat_intervals.show.canvas import (
     map_size,
     page,
     say_empty,
-    widest,
 )
 from sat_intervals.show.legend import PIXEL_CLASSES, SKY, VERMILION, class_counts, classify, limits
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map
 _TEXT = 8.5  # inches, width of the text above a map
 _EDGE = "#888888"
+_WIDE = 10  # percent of widths beyond the end of their scale: low-confidence areas are often as wide as the range
 
 
 def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
@@ -39,7 +39,7 @@ def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
     valid = bands.valid
     disparity = np.where(valid, bands.disparity, np.nan)
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
-    search, end = results.config.disparity, widest(widths)
+    search, end = results.config.disparity, limits(widths, cut=_WIDE)[1]
     layers = (
         Layer("Disparity", "px", disparity, "viridis", limits(disparity, (search.minimum, search.maximum))),
         Layer("Interval width", "px", widths, "magma", (0, end), 0.5),

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from sat_intervals.products import INVALID, Bands
+from sat_intervals.products import INVALID
 from sat_intervals.results import Results
 from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, page, say_empty
 from sat_intervals.show.cost_curve import Curve, read_curve
@@ -61,10 +61,13 @@ def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int =
     """
     curve = read_curve(results, row, column)
     pixel = results.read_pixel(row, column)
+    title = f"Row {row}, column {column}, {'rejected' if pixel.validity & INVALID else 'valid'}"
+    if np.isfinite(pixel.confidence):
+        title += f", confidence {pixel.confidence:.2f}"
     search = results.config.disparity
     margin = max(1.0, 0.02 * search.count)
     across = (search.minimum - margin, search.maximum + margin)
-    with page(target, (9.0, 7.5), dpi, _describe(row, column, pixel)) as figure:
+    with page(target, (9.0, 7.5), dpi, title) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
         above.plot(curve.disparities, curve.costs, color="black", lw=1, marker="o", ms=3, label="cost curve")
         below.plot(curve.disparities, curve.possibilities, color="black", lw=1, marker="o", ms=3, label="possibility")
@@ -86,12 +89,6 @@ def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int =
         unit = "aggregated by SGM" if results.config.sgm else "not aggregated"
         _finish_chart(above, "", f"cost, {unit}", across)
         _finish_chart(below, "disparity (px)", "possibility", across)
-
-
-def _describe(row: int, column: int, pixel: Bands) -> str:
-    parts = [f"Row {row}, column {column}", "rejected" if pixel.validity & INVALID else "valid"]
-    parts += [f"confidence {pixel.confidence:.2f}"] if np.isfinite(pixel.confidence) else []
-    return ", ".join(parts)
 
 
 def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:

@@ -170,18 +170,13 @@ def _project(run: Run, layers: list[Layer]) -> Element:
             groups[layer.group] = SubElement(tree, "layer-tree-group", name=layer.group, checked=_CHECKED, expanded="1")
         key = re.sub(r"\W", "_", f"{layer.group}_{layer.name}".lower())
         source = _relative(layer.raster.source, run.out)
-        SubElement(
-            groups[layer.group],
-            "layer-tree-layer",
-            {"id": key, "name": layer.name, "source": source, "providerKey": "gdal", "expanded": "0"}
-            | {"checked": _CHECKED if layer.is_shown else "Qt::Unchecked"},
-        )
+        about = {"id": key, "name": layer.name, "source": source, "providerKey": "gdal", "expanded": "0"}
+        about["checked"] = _CHECKED if layer.is_shown else "Qt::Unchecked"
+        SubElement(groups[layer.group], "layer-tree-layer", about)
         _add_layer(listed, layer, key, source)
     canvas = SubElement(root, "mapcanvas", name="theMapCanvas")
-    SubElement(canvas, "units").text = "meters"
-    extent = SubElement(canvas, "extent")
-    for name, value in zip(("xmin", "ymin", "xmax", "ymax"), _extent(first), strict=True):
-        SubElement(extent, name).text = repr(value)
+    styles.add_texts(canvas, units="meters")
+    styles.add_texts(SubElement(canvas, "extent"), **_extent(first))
     _add_crs(SubElement(canvas, "destinationsrs"), first.place)
     properties = SubElement(root, "properties")
     SubElement(SubElement(properties, "Paths"), "Absolute", type="bool").text = "false"
@@ -192,9 +187,7 @@ def _project(run: Run, layers: list[Layer]) -> Element:
 
 def _add_layer(listed: Element, layer: Layer, key: str, source: str) -> None:
     element = SubElement(listed, "maplayer", type="raster")
-    for tag, text in (("id", key), ("datasource", source), ("layername", layer.name), ("provider", "gdal")):
-        SubElement(element, tag).text = text
-    SubElement(element, "abstract").text = layer.meaning
+    styles.add_texts(element, id=key, datasource=source, layername=layer.name, provider="gdal", abstract=layer.meaning)
     _add_crs(SubElement(element, "srs"), layer.raster.place)
     styles.add_style(element, layer.renderer, layer.blend)
 
@@ -208,8 +201,8 @@ def _add_crs(parent: Element, place: Georeferencing) -> None:
             SubElement(system, "authid").text = f"EPSG:{code}"
 
 
-def _extent(raster: Raster) -> tuple[float, float, float, float]:
-    """Return west, south, east, north of a raster; without georeferencing, QGIS counts rows downwards from 0."""
+def _extent(raster: Raster) -> dict[str, str]:
+    """Return the extent of a raster; without georeferencing, QGIS counts rows downwards from 0."""
     height, width = raster.shape
     place = raster.place
     if place.transform is not None:
@@ -219,9 +212,10 @@ def _extent(raster: Raster) -> tuple[float, float, float, float]:
     elif place.gcps:
         corners = [(point.x, point.y) for point in place.gcps]
     else:
-        corners = [(0.0, float(-height)), (float(width), 0.0)]
-    xs, ys = ([float(value) for value in values] for values in zip(*corners, strict=True))
-    return min(xs), min(ys), max(xs), max(ys)
+        corners = [(0.0, -height), (width, 0.0)]
+    xs, ys = zip(*corners, strict=True)
+    extent = {"xmin": min(xs), "ymin": min(ys), "xmax": max(xs), "ymax": max(ys)}
+    return {name: repr(float(value)) for name, value in extent.items()}
 
 
 def _relative(source: str | Path, folder: Path) -> str:

@@ -35,9 +35,8 @@ def shares(band: int) -> Element:
 
 def widths(band: int, values: np.ndarray, *, unit: str) -> Element:
     """Return a renderer of widths from 0 to their 98th percentile; small ones get more colours, by square roots."""
-    known = values[np.isfinite(values)]
-    last = float(np.percentile(known, 100 - _CUT)) if known.size else 0.0
-    return _ramped(band, (last or 1.0) * np.linspace(0, 1, len(MAGMA)) ** 2, MAGMA, unit)
+    places = limits(values, cut=_CUT)[1] * np.linspace(0, 1, len(MAGMA)) ** 2
+    return _ramped(band, places, MAGMA, unit)
 
 
 def _ramped(band: int, places: np.ndarray, ramp: Sequence[str], unit: str = "") -> Element:
@@ -57,9 +56,8 @@ def grey(band: int, values: np.ndarray) -> Element:
     """Return a renderer of an image, from the 2nd to the 98th percentile of its values."""
     renderer = _renderer("singlebandgray", grayBand=band, gradient="BlackToWhite")
     stretch = SubElement(renderer, "contrastEnhancement")
-    for name, end in zip(("minValue", "maxValue"), limits(values, cut=_CUT), strict=True):
-        SubElement(stretch, name).text = f"{end:.6g}"
-    SubElement(stretch, "algorithm").text = "StretchToMinimumMaximum"
+    first, last = limits(values, cut=_CUT)
+    add_texts(stretch, minValue=f"{first:.6g}", maxValue=f"{last:.6g}", algorithm="StretchToMinimumMaximum")
     return renderer
 
 
@@ -119,14 +117,11 @@ def difference(
     root = Element("VRTDataset", rasterXSize=str(shape[1]), rasterYSize=str(shape[0]))
     _add_place(root, place)
     band = SubElement(root, "VRTRasterBand", dataType="Float32", band="1", subClass="VRTDerivedRasterBand")
-    for tag, text in (("NoDataValue", "nan"), ("PixelFunctionType", "diff"), ("SourceTransferType", "Float32")):
-        SubElement(band, tag).text = text
+    add_texts(band, NoDataValue="nan", PixelFunctionType="diff", SourceTransferType="Float32")
     for number in (upper, lower):
         of_band = SubElement(band, "ComplexSource")
         SubElement(of_band, "SourceFilename", relativeToVRT="1").text = name
-        SubElement(of_band, "SourceBand").text = str(number)
-        SubElement(of_band, "ScaleOffset").text = "0"
-        SubElement(of_band, "ScaleRatio").text = f"{factor:g}"
+        add_texts(of_band, SourceBand=str(number), ScaleOffset="0", ScaleRatio=f"{factor:g}")
     return text_of(root)
 
 
@@ -144,6 +139,12 @@ def _add_place(root: Element, place: Georeferencing) -> None:
         rpcs = SubElement(root, "Metadata", domain="RPC")
         for key, value in place.creation_options()["rpcs"].items():
             SubElement(rpcs, "MDI", key=key).text = str(value)
+
+
+def add_texts(parent: Element, **texts: str) -> None:
+    """Add an element with a text for each name."""
+    for name, text in texts.items():
+        SubElement(parent, name).text = text
 
 
 def text_of(root: Element, head: str = "") -> bytes:

@@ -91,8 +91,3 @@ def test_accessor__width_and_profile(made):
     for row, columns in ((70, None), (-1, None), (0, (5, 90)), (0, (8, 3))):
         with pytest.raises(SatIntervalsError, match="are outside the dataset: rows are 0 to 69, columns 0 to 89"):
             dataset.intervals.profile(row, columns)
-
-
-def test_open__refuses_what_is_no_run(tmp_path):
-    with pytest.raises(SatIntervalsError, match="give the folder of a finished run"):
-        sat_intervals.open(tmp_path)
