@@ -57,3 +57,9 @@ def limits(values: np.ndarray, otherwise: tuple[float, float] = (0, 1), cut: flo
         return otherwise
     low, high = (float(end) for end in np.percentile(known, (cut, 100 - cut), method="nearest"))
     return (low, high) if low < high else (low - 0.5, high + 0.5)
+
+
+def widest(widths: np.ndarray, cut: float) -> float:
+    """Return the finite width that ``cut`` percent exceed; 1 if it is zero or there are none."""
+    known = widths[np.isfinite(widths)]
+    return float(np.percentile(known, 100 - cut, method="nearest") or 1.0) if known.size else 1.0

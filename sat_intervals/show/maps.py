@@ -22,7 +22,7 @@ from sat_intervals.show.canvas import (
     page,
     say_empty,
 )
-from sat_intervals.show.legend import PIXEL_CLASSES, SKY, VERMILION, class_counts, classify, limits
+from sat_intervals.show.legend import PIXEL_CLASSES, SKY, VERMILION, class_counts, classify, limits, widest
 
 _PANEL, _LARGE = 4.2, 8.0  # inches of the longer side of a map
 _TEXT = 8.5  # inches, width of the text above a map
@@ -39,7 +39,7 @@ def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
     valid = bands.valid
     disparity = np.where(valid, bands.disparity, np.nan)
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
-    search, end = results.config.disparity, limits(widths, cut=_WIDE)[1]
+    search, end = results.config.disparity, widest(widths, _WIDE)
     layers = (
         Layer("Disparity", "px", disparity, "viridis", limits(disparity, (search.minimum, search.maximum))),
         Layer("Interval width", "px", widths, "magma", (0, end), 0.5),

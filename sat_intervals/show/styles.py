@@ -8,7 +8,7 @@ import numpy as np
 
 from sat_intervals.products import FLAGS
 from sat_intervals.raster import Georeferencing
-from sat_intervals.show.legend import PIXEL_CLASSES, classify, limits
+from sat_intervals.show.legend import PIXEL_CLASSES, classify, limits, widest
 
 # Colours at equal steps of matplotlib's maps.
 VIRIDIS = "#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"
@@ -35,7 +35,7 @@ def shares(band: int) -> Element:
 
 def widths(band: int, values: np.ndarray, *, unit: str) -> Element:
     """Return a renderer of widths from 0 to their 98th percentile; small ones get more colours, by square roots."""
-    places = limits(values, cut=_CUT)[1] * np.linspace(0, 1, len(MAGMA)) ** 2
+    places = widest(values, _CUT) * np.linspace(0, 1, len(MAGMA)) ** 2
     return _ramped(band, places, MAGMA, unit)
 
 
