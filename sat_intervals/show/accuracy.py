@@ -13,7 +13,7 @@ from sat_intervals.show.canvas import (
     GROUND,
     INK,
     Frame,
-    Layer,
+    MapLayer,
     draw_layer,
     map_size,
     page,
@@ -64,7 +64,7 @@ def draw_error_map(given: Comparison, nmad: float, target: Path, dpi: int = DPI)
     height, width = map_size(errors.shape, 7.0)
     name = f"{given.surface.name} - {given.reference.name}"
     unit, empty = "height - reference (m), red: too high", "no common height"
-    layer = Layer("", unit, errors, "RdBu_r", (-end, end), if_empty=empty)
+    layer = MapLayer("", unit, errors, "RdBu_r", (-end, end), if_empty=empty)
     with page(target, (width + 1.8, height + 0.8), dpi, name) as figure:
         draw_layer(figure.subplots(), Frame(*extent, GROUND), layer)
 

@@ -47,7 +47,7 @@ class Frame(NamedTuple):
         return cls(-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
 
 
-class Layer(NamedTuple):
+class MapLayer(NamedTuple):
     """What a map shows, and its colour scale from ``ends[0]`` to ``ends[1]``; a power of 1/2 brightens small values."""
 
     title: str
@@ -98,7 +98,7 @@ def draw_map(panel: Axes, frame: Frame, values: np.ndarray, title: str, **option
     return panel.imshow(values, extent=frame[:4], aspect=aspect, interpolation="nearest", **options)
 
 
-def draw_layer(panel: Axes, frame: Frame, layer: Layer) -> Colorbar:
+def draw_layer(panel: Axes, frame: Frame, layer: MapLayer) -> Colorbar:
     """Draw a layer as a map with a colour bar, whose ends are pointed where values are beyond them."""
     values, ends = layer.values, layer.ends
     drawn = draw_map(panel, frame, values, layer.title, cmap=layer.colours, norm=PowerNorm(layer.power, *ends))

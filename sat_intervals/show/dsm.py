@@ -11,7 +11,7 @@ from sat_intervals.show.canvas import (
     DPI,
     GROUND,
     Frame,
-    Layer,
+    MapLayer,
     add_histogram,
     draw_layer,
     draw_map,
@@ -50,12 +50,12 @@ def draw_surface(surface: Path, target: Path, dpi: int = DPI) -> None:
     frame = Frame(left, *ends, top, GROUND)
     middle, end = _middle_and_end(halves)
     layers = [
-        Layer("Height", "m", height, "viridis", limits(height)),
-        Layer("Half width of the interval", "m", halves, "magma", (0, end), 0.5),
-        Layer("Agreement of runs", "1 where intervals overlap", bands["agreement"], "cividis", (0, 1)),
+        MapLayer("Height", "m", height, "viridis", limits(height)),
+        MapLayer("Half width of the interval", "m", halves, "magma", (0, end), 0.5),
+        MapLayer("Agreement of runs", "1 where intervals overlap", bands["agreement"], "cividis", (0, 1)),
     ]
     if not np.isfinite(bands["agreement"]).any():
-        layers[2] = Layer("Confidence", "0 to 1", bands["confidence"], "cividis", (0, 1))
+        layers[2] = MapLayer("Confidence", "0 to 1", bands["confidence"], "cividis", (0, 1))
     step = "" if drawn == shape else f", {drawn[0]} x {drawn[1]} of them drawn"
     filled = f"{100 * np.isfinite(height).mean():.1f} % filled"
     code = place.crs.to_epsg()

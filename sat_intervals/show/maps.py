@@ -13,7 +13,7 @@ from sat_intervals.show.canvas import (
     DPI,
     NOTHING,
     Frame,
-    Layer,
+    MapLayer,
     add_histogram,
     draw_layer,
     draw_map,
@@ -41,9 +41,9 @@ def draw_overview(results: Results, target: Path, dpi: int = DPI) -> None:
     widths = np.where(valid, bands.upper - bands.lower, np.nan)
     search, end = results.config.disparity, widest(widths, _WIDE)
     layers = (
-        Layer("Disparity", "px", disparity, "viridis", limits(disparity, (search.minimum, search.maximum))),
-        Layer("Interval width", "px", widths, "magma", (0, end), 0.5),
-        Layer("Confidence", "0 to 1", bands.confidence, "cividis", (0, 1)),
+        MapLayer("Disparity", "px", disparity, "viridis", limits(disparity, (search.minimum, search.maximum))),
+        MapLayer("Interval width", "px", widths, "magma", (0, end), 0.5),
+        MapLayer("Confidence", "0 to 1", bands.confidence, "cividis", (0, 1)),
     )
     frame = Frame.of(results.shape)
     size = columns * (width + 1.0), rows * (height + 0.6) + 0.3

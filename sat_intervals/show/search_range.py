@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, Frame, Layer, draw_layer, page
+from sat_intervals.show.canvas import DPI, INK, Frame, MapLayer, draw_layer, page
 from sat_intervals.show.legend import BLUE, SKY
 
 
@@ -40,7 +40,7 @@ def draw_range(results: Results, target: Path, dpi: int = DPI) -> None:
             used = "" if report.get("local_ranges") else ", not used"
             share = f": {100 * ranges.share:.0f} % searched"
             for title, ends in (("minimum" + used, ranges.minimum), ("maximum" + used + share, ranges.maximum)):
-                layer = Layer(f"Local {title}", "px", ends, "viridis", (search.minimum, search.maximum))
+                layer = MapLayer(f"Local {title}", "px", ends, "viridis", (search.minimum, search.maximum))
                 draw_layer(next(charts), frame, layer)
 
 

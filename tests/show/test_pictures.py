@@ -174,16 +174,10 @@ def test_draw_overview__shows_every_kind_in_its_colour(tmp_path):
     assert min(shares) > 0.005
 
 
-def with_several_flags(height, width):
-    """Bands and a validity band in which pixels have several flags."""
-    bands, validity, _ = random_bands(height, width)
+def test_class_counts__agree_with_the_map():
+    bands, validity, _ = random_bands(70, 90)
     validity |= np.random.default_rng(1).choice([0, *(flag.value for flag in FLAGS)], validity.shape).astype(np.uint16)
     bands[:3, validity & INVALID != 0] = np.nan
-    return bands, validity
-
-
-def test_class_counts__agree_with_the_map():
-    bands, validity = with_several_flags(70, 90)
     tally = Tally(31)
     tally.add(Bands(*bands, validity))
     counts = tally.report()
