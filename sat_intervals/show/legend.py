@@ -32,15 +32,14 @@ PIXEL_CLASSES = (
     PixelClass(SKY, "valid, low confidence", REGULARIZED),
     *(PixelClass(_INVALID[flag.name], flag.meaning, flag.value) for flag in FLAGS if flag.invalid),
 )
-FIRST_INVALID = 2
 
 
 def classify(validity: np.ndarray) -> np.ndarray:
     """Return the index into PIXEL_CLASSES of each pixel of a validity band, uint8; see `products.cause`."""
     causes = cause(validity)
     places = np.where(validity & REGULARIZED, 1, 0).astype(np.uint8)
-    for place in range(FIRST_INVALID, len(PIXEL_CLASSES)):
-        places[causes == PIXEL_CLASSES[place].flag] = place
+    for place, kind in enumerate(PIXEL_CLASSES[2:], start=2):
+        places[causes == kind.flag] = place
     return places
 
 

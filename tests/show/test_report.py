@@ -124,7 +124,7 @@ def test_write_report__shows_the_main_figures_without_scripts(tmp_path):
     assert f"<td>{100 * page['evaluation']['all']['accuracy']:.1f} % of the valid pixels with a truth</td>" in static
     shares = re.findall(r"<td>(\d+\.\d) % of the pixels</td>", static)
     assert sum(map(float, shares)) == pytest.approx(100, abs=0.4)
-    assert page["histograms"]["classes"] == np.bincount(classify(validity).ravel()).tolist()
+    assert page["classes"] == np.bincount(classify(validity).ravel()).tolist()
 
 
 # ---- In a browser ------------------------------------------------------------------------------------------

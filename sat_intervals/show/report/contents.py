@@ -11,7 +11,7 @@ import numpy as np
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.products import Bands
 from sat_intervals.results import Results
-from sat_intervals.show.legend import FIRST_INVALID, PIXEL_CLASSES, classify, limits
+from sat_intervals.show.legend import PIXEL_CLASSES, classify, limits
 
 _PIXELS = 500_000  # on the page, 5 to 8 bytes each when compressed and encoded
 _WIDTH_BARS, _CONFIDENCE_BARS = 60, 25
@@ -19,8 +19,8 @@ _STEPS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # bar widths of the hi
 _FINEST = 1 / 64  # pixels of disparity
 
 
-class Counts:
-    """Histograms of interval width, confidence and pixel class over all pixels, gathered strip by strip."""
+class Histograms:
+    """Histograms of interval width and confidence over all pixels, gathered strip by strip."""
 
     def __init__(self, count: int) -> None:
         """Start with empty histograms; ``count`` is the number of disparities searched."""
@@ -30,23 +30,20 @@ class Counts:
 
     def add(self, bands: Bands, low: np.ndarray) -> None:
         """Count the pixels of some rows; ``low`` is the mask of low confidence."""
-        classes = classify(bands.validity)
-        valid = classes < FIRST_INVALID
+        valid = bands.valid
         width, confidence = (bands.upper - bands.lower) / self._step, bands.confidence * _CONFIDENCE_BARS
-        self._counts["classes"] += np.bincount(classes.ravel(), minlength=len(PIXEL_CLASSES))
         self._counts["high"] += _counted(width[valid & ~low], self._width_bars)
         self._counts["low"] += _counted(width[valid & low], self._width_bars)
         self._counts["valid"] += _counted(confidence[valid], _CONFIDENCE_BARS)
         self._counts["rejected"] += _counted(confidence[~valid], _CONFIDENCE_BARS)
 
     def report(self) -> dict[str, Any]:
-        """Return counts per pixel class and per bar of ``step``; the last bar includes all values beyond."""
+        """Return counts per bar of ``step``; the last bar includes all values beyond."""
         counts = {name: bars.tolist() for name, bars in self._counts.items()}
         confidences = {name: counts[name] for name in ("valid", "rejected")}
         return {
             "width": {"step": self._step, "bars": {name: counts[name] for name in ("high", "low")}},
             "confidence": {"step": 1 / _CONFIDENCE_BARS, "bars": confidences},
-            "classes": counts["classes"],
         }
 
 
@@ -73,8 +70,7 @@ class Pixels:
         """Return layers of codes: a code means ``first + code * step``, the largest one a missing value."""
         *values, low = (np.concatenate(strips) for strips in zip(*self._strips, strict=True))
         bands = Bands(*values)
-        kind = classify(bands.validity)
-        valid = kind < FIRST_INVALID
+        kind, valid = classify(bands.validity), bands.valid
         missed = np.where(bands.truth > bands.upper, 1, np.where(bands.truth < bands.lower, 2, 0))
         disparities = {name: np.where(valid, getattr(bands, name), np.nan) for name in ("disparity", "lower", "upper")}
         if np.isfinite(bands.truth).any():
