@@ -14,18 +14,9 @@ from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS, Bands
-from sat_intervals.raster import (
-    Georeferencing,
-    Image,
-    check_not_replaced,
-    is_points_of,
-    is_surface_of,
-    open_image,
-    read_layers,
-    read_tags,
-    tags_beside,
-)
+from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.images import opened
+from sat_intervals.raster.published import is_points_of, is_surface_of, tags_beside
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers
 from sat_intervals.tiling import Window, strips
 

@@ -21,7 +21,8 @@ from sat_intervals.products import INVALID
 from sat_intervals.raster import read_layers
 from sat_intervals.results import open_results
 from sat_intervals.show.legend import classify
-from sat_intervals.show.report import contents, write_report
+from sat_intervals.show.report import contents
+from sat_intervals.show.report.page import write_report
 
 ROOT = Path(__file__).parents[2]
 
