@@ -203,7 +203,7 @@ def with_coverage(folder):
     row("---", "---", "---")
     pair, out = write_pair(folder, 2000), folder / "out"
     for preset in ("paper", "satellite"):
-        options = [("--preset", preset, *more) for more in ((), ("--coverage", 0.9))]
+        options = [("--preset", preset, level, 0.9) for level in ("--alpha", "--coverage")]
         for more in options:
             match(pair, out, 1, more=more)  # not counted
         ratios = []

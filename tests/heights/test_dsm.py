@@ -221,7 +221,7 @@ def test_make_surface__does_not_depend_on_its_tiles(tmp_path, monkeypatch):
 def with_coverage(out):
     """Say in the report of a run that it has a coverage."""
     report = json.loads((out / "run.json").read_text())
-    report["settings"] |= {"interval": {"alpha": None, "coverage": 0.9, "bounds": "subpixel"}}
+    report["settings"] |= {"interval": {"alpha": None, "coverage": 0.9}}
     (out / "run.json").write_text(json.dumps(report))
     return out
 

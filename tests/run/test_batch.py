@@ -46,10 +46,10 @@ def images(tmp_path_factory):
 
 
 def rows(folder, *, broken=False):
-    lines = ["name,left,right,minimum,maximum,sgm.p2"]
-    lines += [f"pair{seed},left{seed}.tif,right{seed}.tif,-18,40,{24 + seed}" for seed in (1, 2)]
+    lines = ["name,left,right,minimum,maximum,preset,sgm.p2"]
+    lines += [f"pair{seed},left{seed}.tif,right{seed}.tif,-18,40,paper,{24 + seed}" for seed in (1, 2)]
     if broken:
-        lines.insert(1, "broken,left1.tif,nowhere.tif,-18,40,")
+        lines.insert(1, "broken,left1.tif,nowhere.tif,-18,40,paper,")
     (folder / "pairs.csv").write_text("\n".join(lines) + "\n")
     return folder / "pairs.csv"
 
@@ -59,6 +59,7 @@ def test_match_batch__gives_every_pair_what_match_pair_gives(images, tmp_path):
     assert {name: end["state"] for name, end in report.items()} == {"pair1": "done", "pair2": "done"}
     for seed in (1, 2):
         settings = {
+            "preset": "paper",
             "disparity": {"minimum": -18, "maximum": 40},
             "sgm": {"p2": 24 + seed},
             "tiles": {"size": 64, "overlap": 20},
@@ -105,14 +106,14 @@ def test_match_batch__keeps_a_report_that_is_not_of_a_batch(images, tmp_path, te
 @pytest.mark.parametrize("place", ["option", "config"])
 def test_match_batch__takes_a_preset_of_all_pairs_or_of_one(images, tmp_path, place):
     lines = ["name,left,right,minimum,maximum,preset", "one,left1.tif,right1.tif,-18,40,"]
-    lines += ["two,left2.tif,right2.tif,-18,40,mountain"]
+    lines += ["two,left2.tif,right2.tif,-18,40,paper"]
     (images / "presets.csv").write_text("\n".join(lines) + "\n")
     config, overrides = {"tiles": {"size": 64, "overlap": 20}}, {}
     (overrides if place == "option" else config)["preset"] = "satellite"
     report = match_batch(read_batch(images / "presets.csv"), tmp_path, config, overrides=overrides)
     assert {name: end["state"] for name, end in report.items()} == {"one": "done", "two": "done"}
     settings = [open_run(tmp_path / name).config for name in ("one", "two")]
-    assert [(one.preset, one.sgm.p2) for one in settings] == [("satellite", 128), ("mountain", 464)]
+    assert [(one.preset, one.sgm.p2) for one in settings] == [("satellite", 128), ("paper", 32)]
 
 
 def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(images, tmp_path):
@@ -406,12 +407,12 @@ def test_match_jobs__yields_a_job_once_when_nothing_of_it_is_under_way(images, t
         (
             "a.csv",
             "name,left,right,sgm,sgm.p2\nx,l,r,null,3\n",
-            "row 1: sgm.p2 is '3': the row also gives sgm as a whole",
+            "row 1: sgm.p2 is '3': sgm is also given as a whole",
         ),
         (
             "a.csv",
             "name,left,right,sgm.p2,sgm\nx,l,r,3,null\n",
-            "row 1: sgm is 'null': the row also gives parts of sgm",
+            "row 1: sgm is 'null': parts of sgm are also given",
         ),
         ("a.csv", "name,left,right,sgm.p2,sgm.p2\nx,l,r,1,2\n", "column sgm.p2 appears twice"),
         ("a.csv", "name,left,right,cluster.kind\nx,l,r,slurm\n", "row 1: all pairs share one cluster"),

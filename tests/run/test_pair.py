@@ -61,11 +61,9 @@ def test_match_pair__compiles_the_tracing_of_path_states_for_several_tiles_only(
         match_pair(left, right, tmp_path / "many", in_tiles(settings, 64, "exact"))
 
 
-@pytest.mark.parametrize("interval", [{"alpha": 0.9, "bounds": "subpixel"}, {"coverage": 0.8}])
-def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_path, interval):
+def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_path):
     left, right, settings = pair
-    if "coverage" in interval:
-        interval = interval | {"calibration": calibration(load_config(settings), 30.5, 9.25, 0.8)}
+    interval = {"coverage": 0.8, "calibration": calibration(load_config(settings), 30.5, 9.25, 0.8)}
     settings = in_tiles(settings, 64, "exact", interval=interval)
     report = match_pair(left, right, tmp_path / "out", settings)
     with rasterio.open(left) as first, rasterio.open(right) as second:
@@ -79,18 +77,14 @@ def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_pa
     assert (lower % 0.5 != 0).mean() > 0.5
     with rasterio.open(tmp_path / "out" / "intervals.tif") as file:
         tags = file.tags()
-    if "coverage" in interval:
-        chosen = report["settings"]["interval"]["calibration"]
-        assert report["calibration"] == {
-            "name": "flat", "sha256": load_calibration(chosen).sha256, "coverage": 0.8,
-            "high": 30.5, "low": 9.25, "quantile": 0.8, "reached": True,
-        }  # fmt: skip
-        assert tags["CALIBRATION"] == f"flat {report['calibration']['sha256']}"
-        assert tags["COVERAGE"].startswith("0.8 (")
-        assert "ALPHA" not in tags
-    else:
-        assert report["calibration"] is None
-        assert "ALPHA" in tags
+    chosen = report["settings"]["interval"]["calibration"]
+    assert report["calibration"] == {
+        "name": "flat", "sha256": load_calibration(chosen).sha256, "coverage": 0.8,
+        "high": 30.5, "low": 9.25, "quantile": 0.8, "reached": True,
+    }  # fmt: skip
+    assert tags["CALIBRATION"] == f"flat {report['calibration']['sha256']}"
+    assert tags["COVERAGE"].startswith("0.8 (")
+    assert "ALPHA" not in tags
 
 
 def test_match_pair__another_calibration_does_not_resume_tiles(pair, tmp_path):

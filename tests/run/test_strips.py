@@ -255,7 +255,7 @@ def test_finish_strip__refuses_a_worker_with_other_codecs(tall, tmp_path, monkey
 # ---- Memory and space -------------------------------------------------------------------------------------------
 def wide_job(folder: Path, compression: str):
     write_layer(folder / "wide.tif", np.ones((600, 5000), np.uint8), 0, PLACE)
-    settings = {"disparity": {"minimum": 0, "maximum": 3}, "products": {"compression": compression}}
+    settings = {"preset": "paper", "disparity": {"minimum": 0, "maximum": 3}, "products": {"compression": compression}}
     settings |= {"tiles": {"overlap": 100}}  # no path states
     return prepare(folder / "wide.tif", folder / "wide.tif", folder / "out", settings)
 
