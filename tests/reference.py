@@ -183,15 +183,6 @@ def ambiguity(volume, eta_max, eta_step, cost_span):
     return result
 
 
-def percentile(histogram, percent):
-    """Section 4: of the values ``histogram`` counts, linear between order statistics; a Fraction."""
-    values = np.repeat(np.arange(len(histogram)), histogram)
-    position = Fraction(percent, 100) * (len(values) - 1)
-    below = math.floor(position)
-    above = min(below + 1, len(values) - 1)
-    return int(values[below]) + (position - below) * (int(values[above]) - int(values[below]))
-
-
 def normalize(amounts, searched, p1, p99):
     """Section 4: confidence float32, NaN where no candidate was searched."""
     result = np.full(amounts.shape, np.nan, np.float32)
@@ -372,7 +363,7 @@ def neighbourhood(runs, i, depth):
 
 
 def quantile(values, share):
-    """Section 8: linear interpolation between order statistics, as a Fraction."""
+    """Sections 4 and 8: linear interpolation between order statistics, as a Fraction."""
     ordered = sorted(Fraction(float(value)) for value in values)
     position = share * (len(ordered) - 1)
     below = math.floor(position)
@@ -392,11 +383,6 @@ def regularize(lower, upper, low, depth, share):
             lower[pixel] = float(quantile([old_lower[p] for p in pixels], 1 - share))
             upper[pixel] = float(quantile([old_upper[p] for p in pixels], share))
     return lower, upper
-
-
-def widen(lower, upper, disparity):
-    """Section 8: widen the interval so that lower <= disparity <= upper."""
-    return np.minimum(lower, disparity), np.maximum(upper, disparity)
 
 
 # ---- 9. Validity -------------------------------------------------------------------------------------------
@@ -444,18 +430,15 @@ def match_view(view, minimum, maximum, config):
     window, radius = config.cost.window, config.cost.window // 2
     columns = view.left.shape[1]
     facing = columns + maximum - minimum
-    left_state = cut(view.left_state, 0, columns, radius, NO_DATA)
-    right_state = cut(view.right_state, minimum, facing, radius, NO_DATA)
-    volume = census_cost(
-        cut(view.left, 0, columns, radius, 0),
-        cut(view.right, minimum, facing, radius, 0),
-        left_state,
-        right_state,
-        window,
+    left, right = cut(view.left, 0, columns, radius, 0), cut(view.right, minimum, facing, radius, 0)
+    states = (
+        cut(view.left_state, 0, columns, radius, NO_DATA),
+        cut(view.right_state, minimum, facing, radius, NO_DATA),
     )
+    volume = census_cost(left, right, *states, window)
     if config.sgm is not None:
         volume = aggregate(volume, window, int(config.sgm.p1), int(config.sgm.p2))
-    return volume, window_state(left_state, window), window_state(right_state, window)
+    return volume, *(window_state(state, window) for state in states)
 
 
 def facing_winners(view, volume, config):
@@ -481,8 +464,7 @@ def percentiles_of(amounts, searched, config):
     largest = float(len(etas(settings.eta_max, settings.eta_step)) * config.disparity.count)
     if settings.normalization == "range":
         return 0.0, largest
-    histogram = np.bincount(amounts[searched])
-    p1, p99 = float(percentile(histogram, 1)), float(percentile(histogram, 99))
+    p1, p99 = (float(quantile(amounts[searched], Fraction(percent, 100))) for percent in (1, 99))
     return (p1, p99) if p1 < p99 else (0.0, largest)
 
 
@@ -499,8 +481,7 @@ def cuts_of(volume, cost_span, config):
 def match_arrays(left, right, left_state, right_state, config):
     """All sections on one small pair; ``config`` has the YAML's sections as attributes, None = switched off.
 
-    Returns ``disparity``, ``lower``, ``upper``, ``confidence`` (float32) and ``validity`` (uint16) as written
-    to the files, and the raw products they come from.
+    Returns ``disparity``, ``lower``, ``upper``, ``confidence`` (float32) and ``validity`` (uint16) as in the files.
     """
     left_state = left_state | np.where(np.isfinite(left), 0, NO_DATA).astype(np.uint8)
     right_state = right_state | np.where(np.isfinite(right), 0, NO_DATA).astype(np.uint8)
@@ -510,7 +491,6 @@ def match_arrays(left, right, left_state, right_state, config):
     cost_span = span(config.cost.window, config.sgm and int(config.sgm.p2))
 
     is_subpixel = config.interval is not None and config.interval.coverage is not None
-
     winner = winner_takes_all(volume)
     searched = winner != NONE
     disparity, refined = vfit(volume, winner, minimum)
@@ -531,9 +511,7 @@ def match_arrays(left, right, left_state, right_state, config):
     below, above = (searched & ~untextured & end for end in (winner <= 1, winner >= count - 2))
     if count > 8:
         flags[below | above] |= RANGE_END
-    raw = SimpleNamespace(volume=volume, winner=winner, disparity=disparity, lower=lower, upper=upper, validity=flags)
 
-    flags = flags.copy()
     if config.cross_check is not None:
         seen = facing_winners(view, volume, config)
         flags |= cross_check(absolute(winner, minimum), seen, minimum, config.cross_check.tolerance)
@@ -544,8 +522,7 @@ def match_arrays(left, right, left_state, right_state, config):
         amounts = ambiguity(volume, config.ambiguity.eta_max, config.ambiguity.eta_step, cost_span)
         amounts[untextured] = len(etas(config.ambiguity.eta_max, config.ambiguity.eta_step)) * config.disparity.count
         confidence = normalize(amounts, searched, *percentiles_of(amounts, searched, config))
-    has_coverage = config.interval is not None and config.interval.coverage is not None
-    if (config.disparity.open_ends or has_coverage) and count > 8:
+    if (config.disparity.open_ends or is_subpixel) and count > 8:
         confidence[below | above] = 0
         flags[below] |= OPEN_BELOW
         flags[above] |= OPEN_ABOVE
@@ -559,28 +536,23 @@ def match_arrays(left, right, left_state, right_state, config):
         if config.interval is not None:
             lower, upper = (median(bound, kept, config.median.size) for bound in (lower, upper))
     if config.regularization is not None:
-        settings = config.regularization
-        quantile = settings.quantile
-        if is_subpixel:
-            quantile = config.cuts.quantile
-        if quantile is not None and is_subpixel:
+        share = config.cuts.quantile if is_subpixel else config.regularization.quantile
+        if share is not None and is_subpixel:
             lower, upper = (
                 np.where(low, rounded(8 * bound) / 8, bound) for rounded, bound in ((np.floor, lower), (np.ceil, upper))
             )
-        if quantile is not None:
-            lower, upper = regularize(lower, upper, low, settings.depth, quantile)
+        if share is not None:
+            lower, upper = regularize(lower, upper, low, config.regularization.depth, share)
         flags |= np.where(low, REGULARIZED, 0).astype(np.uint16)
     if config.interval is not None:
-        lower, upper = widen(lower, upper, disparity)
+        lower, upper = np.minimum(lower, disparity), np.maximum(upper, disparity)
     if is_subpixel:
         lower, upper = np.floor(64 * lower) / 64, np.ceil(64 * upper) / 64
 
     hidden = INVALID & ~REJECTED if config.products.keep_rejected else INVALID
     shown = (flags & hidden) == 0
     disparity, lower, upper = (np.where(shown, band, np.float32(np.nan)) for band in (disparity, lower, upper))
-    return SimpleNamespace(
-        disparity=disparity, lower=lower, upper=upper, confidence=confidence, validity=flags, raw=raw
-    )
+    return SimpleNamespace(disparity=disparity, lower=lower, upper=upper, confidence=confidence, validity=flags)
 
 
 # ---- Inputs for the tests ----------------------------------------------------------------------------------
@@ -629,20 +601,10 @@ def states(draw, shape):
 
 def scene_of(patches, *, window, minimum, count, states=None, p1=8, p2=32, regularized=True):
     """Two padded patches with their states, by default valid, a window, a search range and penalties."""
-    left, right = patches
-    left_state, right_state = states or [np.zeros(patch.shape, np.uint8) for patch in patches]
-    return SimpleNamespace(
-        left=left,
-        right=right,
-        left_state=left_state,
-        right_state=right_state,
-        window=window,
-        minimum=minimum,
-        count=count,
-        p1=p1,
-        p2=p2,
-        regularized=regularized,
-    )
+    states = states or [np.zeros(patch.shape, np.uint8) for patch in patches]
+    images = dict(zip(("left", "right", "left_state", "right_state"), (*patches, *states), strict=True))
+    settings = {"window": window, "minimum": minimum, "count": count, "p1": p1, "p2": p2, "regularized": regularized}
+    return SimpleNamespace(**images, **settings)
 
 
 @st.composite

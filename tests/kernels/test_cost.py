@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sat_intervals.kernels.cost import Codes, census
-from sat_intervals.products import MASKED, NO_DATA
 
 bounded = settings(max_examples=40, derandomize=True, deadline=None)
 WINDOWS = (3, 5, 7, 9, 11)
@@ -53,30 +52,6 @@ def test_census__distances_equal_reference(window, dtype, data):
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-def test_census__every_bit_counts(window):
-    # One brighter neighbour at a time: each sets one bit, and no two the same.
-    flat = np.zeros((window, window), np.float32)
-    spots = [place for place in np.ndindex(flat.shape) if place != (window // 2, window // 2)]
-    codes = []
-    for place in spots:
-        pixels = flat.copy()
-        pixels[place] = 1
-        codes.append(tuple(census(pixels, usable(flat), window).words.ravel().tolist()))
-    assert len(set(codes)) == window * window - 1
-    assert all(sum(word.bit_count() for word in code) == 1 for code in codes)
-
-
-@pytest.mark.parametrize("window", WINDOWS)
-def test_census__types_and_shapes(window):
-    pixels = np.zeros((window + 3, window + 1), np.float32)
-    codes = census(pixels, usable(pixels), window)
-    assert codes.words.dtype == (np.uint32 if window <= 5 else np.uint64)
-    assert codes.words.shape == (1 if window <= 7 else 2, 4, 2)
-    assert codes.state.dtype == np.uint8
-    assert codes.state.shape == (4, 2)
-
-
-@pytest.mark.parametrize("window", WINDOWS)
 @bounded
 @given(data=st.data())
 def test_census__state_is_the_union_of_the_window(window, data):
@@ -84,27 +59,6 @@ def test_census__state_is_the_union_of_the_window(window, data):
     state = data.draw(hnp.arrays(np.uint8, shape, elements=st.integers(0, 3), fill=st.just(0)))
     codes = census(np.zeros(shape, np.float32), state, window)
     np.testing.assert_array_equal(codes.state, reference.window_state(state, window))
-
-
-def test_census__state_worked_example():
-    # Window 3 on 4 x 5: no data at (0, 0), a mask at (2, 4) and both at (3, 2).
-    state = np.zeros((4, 5), np.uint8)
-    state[0, 0], state[2, 4], state[3, 2] = NO_DATA, MASKED, NO_DATA | MASKED
-    codes = census(np.zeros((4, 5), np.float32), state, 3)
-    assert codes.state.tolist() == [[1, 0, 2], [3, 3, 3]]
-
-
-@bounded
-@given(
-    pixels=hnp.arrays(np.float32, (9, 13), elements=GREY, fill=GREY),
-    offset=st.integers(-1000, 1000),
-    factor=st.sampled_from([0.25, 1, 3]),
-    window=st.sampled_from(WINDOWS[:4]),
-)
-def test_census__unchanged_by_offset_and_gain(pixels, offset, factor, window):
-    codes = census(pixels, usable(pixels), window)
-    changed = census(pixels * np.float32(factor) + np.float32(offset), usable(pixels), window)
-    np.testing.assert_array_equal(codes.words, changed.words)
 
 
 def test_census__compares_float64_in_float64():
@@ -120,16 +74,3 @@ def test_census__reads_strided_patches():
     part = wide[2:, 1:21:2]
     codes, copied = census(part, usable(part), 5), census(part.copy(), usable(part), 5)
     np.testing.assert_array_equal(codes.words, copied.words)
-
-
-@bounded
-@given(scene=reference.scenes(windows=WINDOWS))
-def test_census__costs_equal_reference(scene):
-    left = census(scene.left, scene.left_state, scene.window)
-    right = census(scene.right, scene.right_state, scene.window)
-    cost = reference.census_cost(scene.left, scene.right, scene.left_state, scene.right_state, scene.window)
-    columns = cost.shape[1]
-    for k in range(scene.count):
-        facing = Codes(right.words[:, :, k : k + columns], right.state[:, k : k + columns])
-        here = np.where((left.state | facing.state) == 0, distance(left, facing), reference.IMPOSSIBLE_COST)
-        np.testing.assert_array_equal(here, cost[:, :, k])

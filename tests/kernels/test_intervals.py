@@ -1,7 +1,5 @@
 """Alpha-cuts, the regularisation of intervals, and the whole method against their slow twins."""
 
-from decimal import Decimal
-from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -62,31 +60,11 @@ def test_match_costs__interval_worked_example():
     assert upper.tolist() == [[2], [3], [3]]
 
 
-def test_match_costs__interval_without_refinement_is_the_cut():
-    raw = of_curves(CURVES, -2, refine=False)
-    assert raw.lower.tolist() == [[-1], [-2], [-1]]
-    assert raw.upper.tolist() == [[0], [0], [1]]
-    lower, upper = reference.alpha_cut(np.array(CURVES)[:, np.newaxis], "0.9", 24, False)
-    assert lower.tolist() == [[1], [0], [1]]
-    assert upper.tolist() == [[2], [2], [3]]
-
-
 def test_match_costs__ties_belong_to_the_cut():
     # Alpha .75: (1 - .75) * 24 = 6 above the least belongs, 7 does not.
     assert of_curves([[3, 9, 20]], 0, alpha="0.75").upper.tolist() == [[1]]
     assert of_curves([[3, 10, 9]], 0, alpha="0.75").upper.tolist() == [[2]]
     assert of_curves([[3, 10, 20]], 0, alpha="0.75", refine=False).upper.tolist() == [[0]]
-
-
-@pytest.mark.parametrize("cost_span", [24, 448, 1600, 2880, 4656])
-@pytest.mark.parametrize("alpha", [*ALPHAS, "0.7", "0.95", "0.999"])
-def test_cut_level__says_the_same_as_possibility(alpha, cost_span):
-    # S - min S <= level is possibility >= alpha. (In floats (1 - .9) * 1600 is 159.99.)
-    level = reference.cut_level(alpha, cost_span)
-    for above in range(cost_span + 1):
-        possibility = 1 - reference.Fraction(above, cost_span)
-        assert (above <= level) == (possibility >= Decimal(alpha))
-    assert reference.cut_level("0.9", 1600) == 160
 
 
 def check_against_reference(scene, alpha, refine):
@@ -109,17 +87,6 @@ def test_match_costs__interval_equals_reference(refine, scene, alpha):
 def test_match_costs__interval_equals_reference_at_every_count(count, data):
     scene = data.draw(reference.scenes(counts=(count,), rows=3, columns=6))
     check_against_reference(scene, data.draw(st.sampled_from(ALPHAS)), True)
-
-
-@few
-@given(scene=reference.scenes(), refine=st.booleans())
-def test_match_costs__a_smaller_alpha_never_narrows(scene, refine):
-    alphas = ["0.99", "0.95", "0.9", "0.7", "0.4", "0.1"]
-    raws = [matched(scene, alpha=alpha, refine=refine)[0] for alpha in alphas]
-    for narrow, wide in pairwise(raws):
-        # The extension belongs to the least cost, which does not move.
-        assert (wide.lower <= narrow.lower).all()
-        assert (wide.upper >= narrow.upper).all()
 
 
 @few
@@ -181,16 +148,6 @@ def test_match_costs__a_higher_level_never_narrows_and_the_disparity_is_inside(s
     assert (raw.upper[found] <= 64 * (scene.count - 1)).all()
 
 
-@few
-@given(scene=reference.scenes())
-def test_match_costs__without_interval(scene):
-    (raw, _), (whole, _) = matched(scene, alpha=None), matched(scene)
-    assert (raw.lower == N).all()
-    assert (raw.upper == N).all()
-    for name in ("winner", "disparity", "cost", "ambiguity", "validity"):
-        np.testing.assert_array_equal(getattr(raw, name), getattr(whole, name))
-
-
 # ---- Regularisation ----------------------------------------------------------------------------------------
 def test_regularize__worked_example():
     # Low pixels (x) make five segments a to e, depth 1, quantile .9.
@@ -212,32 +169,6 @@ def test_regularize__worked_example():
         np.testing.assert_allclose(result[0], new_lower, rtol=1e-6)
         np.testing.assert_allclose(result[1], new_upper, rtol=1e-6)
         assert result[0].dtype == result[1].dtype == np.float32
-
-
-def test_regularize__reaches_back_into_the_same_row():
-    # Two steps lead from one leg of the U to the other; one step does not.
-    #     x . x     0 . 8
-    #     x x x     4 4 4
-    low = np.array([[1, 0, 1], [1, 1, 1]], bool)
-    bounds = np.array([[0, 99, 8], [4, 4, 4]], np.float32)
-    for depth, first, last in ((0, (0, 0), (8, 8)), (1, (0, 4), (4, 8)), (2, (0, 8), (0, 8))):
-        for lower, upper in (
-            regularize(bounds, bounds, low, 0, depth, 1.0, (0, 2), 2),
-            reference.regularize(bounds, bounds, low, depth, 1.0),
-        ):
-            assert (lower[0, 0], upper[0, 0]) == first
-            assert (lower[0, 2], upper[0, 2]) == last
-            assert (lower[0, 1], upper[0, 1]) == (99, 99)
-
-
-def test_regularize__corners_do_not_touch():
-    #     x .     1 9
-    #     . x     9 5
-    low = np.eye(2, dtype=bool)
-    bounds = np.array([[1, 9], [9, 5]], np.float32)
-    lower, upper = regularize(bounds, bounds, low, 0, 2, 0.9, (0, 2), 2)
-    np.testing.assert_array_equal(lower, bounds)
-    np.testing.assert_array_equal(upper, bounds)
 
 
 def test_regularize__long_segments():
@@ -306,18 +237,6 @@ def test_regularize__keeps_order_and_what_is_not_low(strip, depth, quantile):
     np.testing.assert_array_equal(new_lower[~low], lower[~low])
     np.testing.assert_array_equal(new_upper[~low], upper[~low])
     assert (new_lower[low] <= new_upper[low]).all()
-
-
-@few
-@given(strip=strips(), depth=st.integers(0, 3))
-def test_regularize__a_larger_quantile_never_narrows(strip, depth):
-    lower, upper, low = strip
-    results = [
-        regularize(lower, upper, low, MINIMUM, depth, quantile, (0, len(low)), 2) for quantile in (0.5, 0.8, 1.0)
-    ]
-    for narrow, wide in pairwise(results):
-        assert (wide[0][low] <= narrow[0][low]).all()
-        assert (wide[1][low] >= narrow[1][low]).all()
 
 
 # ---- The whole method --------------------------------------------------------------------------------------
