@@ -33,16 +33,11 @@ class Area(NamedTuple):
     mirrored: bool = False
 
     @classmethod
-    def of(cls, base: Window, config: Config) -> "Area":
-        """Make the area of left pixels and the right pixels that face them."""
+    def of(cls, base: Window, config: Config, mirrored: bool = False) -> "Area":
+        """Make the area of left (right) pixels and the right (left) pixels that face them."""
         search = config.disparity
-        return cls(base, facing(base, search.minimum, search.maximum), search.minimum)
-
-    @classmethod
-    def mirror(cls, base: Window, config: Config) -> "Area":
-        """Make the area of right pixels and the left pixels that face them."""
-        search = config.disparity
-        return cls(base, facing(base, -search.maximum, -search.minimum), -search.maximum, mirrored=True)
+        ends = (-search.maximum, -search.minimum) if mirrored else (search.minimum, search.maximum)
+        return cls(base, facing(base, *ends), ends[0], mirrored)
 
     @property
     def disparities(self) -> int:
@@ -126,7 +121,6 @@ def _of_area(area: Area, views: Views, arrays: Sequence[np.ndarray], radius: int
     return base, there
 
 
-# ---- Texture -----------------------------------------------------------------------------------------------
 def _varies(view: View, radius: int) -> np.ndarray:
     """Pixels whose window varies along any of its rows: bool, without a margin of ``radius``."""
     height, width = view.window.height - 2 * radius, view.window.width - 2 * radius
@@ -158,7 +152,6 @@ def textureless(views: Views, area: Area, costs: Costs, config: Config, cells: C
     return flat
 
 
-# ---- Census ------------------------------------------------------------------------------------------------
 def _hamming(views: Views, areas: Sequence[Area], radius: int) -> list[Costs]:
     codes = [census(view.pixels, view.state, 2 * radius + 1) for view in views]
     words, states = ([getattr(code, name) for code in codes] for name in Codes._fields)
@@ -168,7 +161,6 @@ def _hamming(views: Views, areas: Sequence[Area], radius: int) -> list[Costs]:
     ]
 
 
-# ---- MC-CNN ------------------------------------------------------------------------------------------------
 def _correlations(
     views: Views, areas: Sequence[Area], statistics: PairStatistics, network: Network
 ) -> list[np.ndarray]:
@@ -207,7 +199,6 @@ def _features(view: View, state: np.ndarray, rows: slice, statistics: ImageStati
     return features
 
 
-# ---- Penalties ---------------------------------------------------------------------------------------------
 def _gradients(area: Area, views: Views, config: Config, statistics: PairStatistics | None) -> Gradients | None:
     """Gradients that the penalties of an area follow; None for constant penalties."""
     sgm = config.sgm

@@ -126,7 +126,7 @@ def path_window(frame: Frame, config: Config) -> Window:
 def frame_area(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> Area:
     """Area that a tile reads: `path_window` and one more pixel on each side where another tile follows."""
     window = path_window(frame, config).grown(1, 1).clipped(_supported(frame, config))
-    return Area.mirror(window, config) if frame.mirrored else Area.of(window, narrowed(ranges, window, config))
+    return Area.of(window, narrowed(ranges, window, config), frame.mirrored)
 
 
 def _supported(frame: Frame, config: Config) -> Window:
@@ -153,7 +153,7 @@ def _right_area(frame: Frame, overlap: int, config: Config) -> Area:
     search, whole = config.disparity, frame.whole
     reach = facing(frame.core, search.minimum, search.maximum)
     rows = Window(whole.row, reach.column - overlap, whole.height, reach.width + 2 * overlap)
-    return Area.mirror(reach.grown(overlap, overlap).clipped(rows), config)
+    return Area.of(reach.grown(overlap, overlap).clipped(rows), config, mirrored=True)
 
 
 def patch_windows(frame: Frame, config: Config, ranges: LocalRanges | None = None) -> tuple[Window, Window]:

@@ -98,11 +98,8 @@ def confidence_scale(settings: Ambiguity, histogram: np.ndarray) -> ConfidenceSc
 
 def halo(config: Config) -> int:
     """Number of rows above and below that the final bands of a row depend on."""
-    return _median_radius(config) + (config.regularization.depth if config.regularization else 0)
-
-
-def _median_radius(config: Config) -> int:
-    return config.median.size // 2 if config.median else 0
+    radius = config.median.size // 2 if config.median else 0
+    return radius + (config.regularization.depth if config.regularization else 0)
 
 
 def postprocess_rows(rows: RawRows, first: int, last: int, scale: ConfidenceScale, config: Config) -> Bands:

@@ -10,8 +10,7 @@ import numpy as np
 
 from sat_intervals.kernels.cost import Codes, census
 from sat_intervals.match.search_range import Matches, Step, match_level, reduced, settings
-from sat_intervals.match.whole import match_whole
-from sat_intervals.products import NO_DATA
+from sat_intervals.match.whole import cut, match_whole
 from sat_intervals.tiling import View, Views, Window, facing
 
 # Side of a window in pixels of the image, and windows along each side of the image; side in pixels of the part of a
@@ -185,19 +184,21 @@ def coarse_rows(left: np.ndarray, right: np.ndarray, matches: Matches) -> float:
     first, last = int(index[known].min()) - 1, int(index[known].max()) + 1
     margin, facing = _CENSUS // 2, Window(part.row, part.column + first, height, width + last - first)
     codes = (
-        census(*_padded(left, part.grown(margin, margin)), _CENSUS),
-        census(*_padded(right, facing.grown(margin + ROWS, margin)), _CENSUS),
+        census(*_cut(_view(left), part.grown(margin, margin)), _CENSUS),
+        census(*_cut(_view(right), facing.grown(margin + ROWS, margin)), _CENSUS),
     )
     offsets = row_offsets(*codes, index - first, known)
     return float(np.median(offsets)) * matches.step.rows if offsets.size else 0.0
 
 
-def _padded(image: np.ndarray, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels and states of a window of an image with NaN where not usable; the window may leave the image."""
-    inside = window.clipped(Window(0, 0, *image.shape))
-    pixels = np.full((window.height, window.width), np.nan, np.float32)
-    pixels[inside.relative_to(window).slices] = image[inside.slices]
-    return np.nan_to_num(pixels), np.isnan(pixels).view(np.uint8)
+def _cut(view: View, window: Window) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and states of a window, which may leave the view."""
+    return cut(view, window)[1:]
+
+
+def _view(image: np.ndarray) -> View:
+    """View of an image with NaN where not usable."""
+    return View(Window(0, 0, *image.shape), np.nan_to_num(image), np.isnan(image).view(np.uint8))
 
 
 def look_in_tile(views: Views, core: Window, minimum: int, maximum: int) -> list[Look]:
@@ -217,16 +218,6 @@ def look_in_tile(views: Views, core: Window, minimum: int, maximum: int) -> list
         ]
         looks.append(look(sample, *(_cut(view, window) for view, window in zip(views, windows, strict=True))))
     return [found for found in looks if found is not None]
-
-
-def _cut(view: View, window: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels and states of a window, which may leave the view."""
-    inside = window.clipped(view.window)
-    pixels = np.zeros((window.height, window.width), view.pixels.dtype)
-    state = np.full(pixels.shape, NO_DATA, np.uint8)
-    here, there = inside.relative_to(window).slices, inside.relative_to(view.window).slices
-    pixels[here], state[here] = view.pixels[there], view.state[there]
-    return pixels, state
 
 
 def summary(looks: Iterable[Look | None]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sat_intervals.kernels.matching import Raw
+from sat_intervals.kernels.matching import BOUNDS, Raw
 from sat_intervals.products import NO_DISPARITY
 from sat_intervals.tiling import Grid, Window
 
@@ -20,18 +20,11 @@ TOP, BOTTOM, LEFT, RIGHT = range(4)
 def seam_lines(raw: Raw, output: Window, core: Window, size: int) -> np.ndarray:
     """Return the outermost lines of the core, and those of the ring around it, which belong to the neighbours.
 
-    Parameters
-    ----------
-    raw
-        Products of the pixels of ``output``: ``core`` and, along inner borders, one pixel around it.
-    size
-        Length of the longest line.
-
-    Returns
-    -------
-    int16 ``(side, own or ring, winner or bound, size)``, bounds of all levels; NO_DISPARITY where there is no pixel.
+    ``raw`` are products of ``output``, which is ``core`` and, along inner borders, one pixel around it; ``size`` is the
+    length of the longest line. Returns int16 ``(side, own or ring, winner or bound, size)``, bounds of all levels;
+    NO_DISPARITY where there is no pixel.
     """
-    bounds = (raw.lower, raw.upper, raw.lower_low, raw.upper_low)
+    bounds = (getattr(raw, name) for name in BOUNDS)
     products = [raw.winner, *(bound.view(np.int16) for bound in bounds if bound.size)]
     lines = np.full((4, 2, len(products), size), NO_DISPARITY, np.int16)
     inner = core.relative_to(output)
@@ -57,27 +50,15 @@ class _Difference(NamedTuple):
 
     def shares(self) -> dict[str, Any]:
         pixels = max(self.pixels, 1)
-        return {
-            "pixels": self.pixels,
-            "winner_share": self.winner / pixels,
-            "bounds_share": self.bounds / pixels,
-        }
+        return {"pixels": self.pixels, "winner_share": self.winner / pixels, "bounds_share": self.bounds / pixels}
 
 
 def seam_report(lines: np.ndarray, grid: Grid) -> dict[str, Any]:
     """Return the shares of pixels along inner borders whose raw winner or bounds differ between neighbours.
 
-    Parameters
-    ----------
-    lines
-        ``(grid rows, grid columns, side, own or ring, product, size)``, see `seam_lines`.
-    grid
-        The tiles.
-
-    Returns
-    -------
-    ``borders``; ``pixels`` with a winner in either tile; ``winner_share`` and ``bounds_share`` over all borders;
-    ``worst``, the same for the border with the largest ``bounds_share``, None without inner borders.
+    ``lines`` are those of all tiles, ``(grid rows, grid columns, side, own or ring, product, size)``, see `seam_lines`.
+    Returns ``borders``; ``pixels`` with a winner in either tile; ``winner_share`` and ``bounds_share`` over all
+    borders; ``worst``, the same for the border with the largest ``bounds_share``, None without inner borders.
     """
     borders = dict(_borders(lines, grid))
     total = _Difference(*(sum(counts) for counts in zip((0, 0, 0), *borders.values(), strict=True)))

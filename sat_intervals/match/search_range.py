@@ -4,9 +4,7 @@ A level has its step: the images averaged over ``rows x columns`` pixels. The co
 one within what the level before found. Disparities of a level are in its own pixels; times the step they are in pixels.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -105,9 +103,8 @@ class Found:
 
 def with_range(config: Config, found: Found) -> Config:
     """The settings with a range that was found."""
-    disparity = config.disparity.model_copy(
-        update={"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
-    )
+    ends = {"minimum": found.minimum, "maximum": found.maximum, "open_ends": True}
+    disparity = config.disparity.model_copy(update=ends)
     return config.model_copy(update={"disparity": disparity})
 
 
@@ -137,10 +134,7 @@ def finest_step(rows: int, columns: int) -> Step:
 
 def _most_rows(rows: int) -> int:
     """Largest power of two that leaves `_ROWS` rows, at least 1."""
-    step = 1
-    while rows >= 2 * step * _ROWS:
-        step *= 2
-    return step
+    return 1 << max(1, rows // _ROWS).bit_length() - 1
 
 
 def reduced(pixels: np.ndarray, state: np.ndarray, step: Step) -> np.ndarray:
@@ -159,12 +153,12 @@ def _added(array: np.ndarray, axis: int, size: int) -> np.ndarray:
     """Sums of ``size`` rows (axis 0) or columns (1); adding whole arrays is faster than a sum over an axis."""
     if size == 1:
         return array
-    stop = array.shape[axis] // size * size
-    parts = [array[first:stop:size] if axis == 0 else array[:, first:stop:size] for first in range(size)]
-    total = parts[0].copy()
-    for part in parts[1:]:
-        total += part
-    return total
+    turned = array.swapaxes(0, axis)
+    stop = len(turned) // size * size
+    total = turned[:stop:size].copy(order="K")
+    for first in range(1, size):
+        total += turned[first:stop:size]
+    return total.swapaxes(0, axis)
 
 
 def _coarser(image: np.ndarray, step: Step) -> np.ndarray:
@@ -242,8 +236,8 @@ def _local(matches: Matches, minimum: int, maximum: int, shape: tuple[int, int])
     usable = in_cells(np.isfinite(matches.images[0]), False).sum(axis=(1, 3))
     kept = in_cells(matches.kept, False)
     disparity = in_cells(matches.disparity, 0)
-    low = _around(np.where(kept, disparity, np.inf).min(axis=(1, 3)), np.minimum)
-    high = _around(np.where(kept, disparity, -np.inf).max(axis=(1, 3)), np.maximum)
+    low = _with_neighbours(np.where(kept, disparity, np.inf).min(axis=(1, 3))).min(axis=(2, 3))
+    high = _with_neighbours(np.where(kept, disparity, -np.inf).max(axis=(1, 3))).max(axis=(2, 3))
     unknown = ((kept.sum(axis=(1, 3)) < _UNDERSTOOD * usable) & (usable > 0)) | (low > high)
     size = matches.step.columns
     least = np.floor(np.where(unknown, minimum, low * size - _LOCAL_MARGIN[0] * size - _LOCAL_MARGIN[1]))
@@ -252,19 +246,15 @@ def _local(matches: Matches, minimum: int, maximum: int, shape: tuple[int, int])
     return LocalRanges(least, most, _CELL * matches.step.rows, _CELL * size)
 
 
-def _around(values: np.ndarray, choose: Callable[..., np.ndarray]) -> np.ndarray:
-    """Smallest or largest of each value and its eight neighbours."""
-    padded = np.pad(values, 1, mode="edge")
-    parts = [padded[r : r + values.shape[0], c : c + values.shape[1]] for r in range(3) for c in range(3)]
-    return reduce(choose, parts)
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
+    """Each value and its eight neighbours: ``(rows, columns, 3, 3)``."""
+    return np.lib.stride_tricks.sliding_window_view(np.pad(values, 1, mode="edge"), (3, 3))
 
 
 def settings(first: int, last: int) -> Config:
     """Settings that a level is matched with over the disparities ``first .. last``: Census, no intervals."""
-    confidence = {"eta_step": 0.1, "normalization": "range"}
-    search = {"minimum": first, "maximum": last}
-    off = {"interval": None, "regularization": None}
-    return load_config({"preset": "paper", "disparity": search, "ambiguity": confidence} | off)
+    changes = {"ambiguity": {"eta_step": 0.1, "normalization": "range"}, "interval": None, "regularization": None}
+    return load_config({"preset": "paper", "disparity": {"minimum": first, "maximum": last}} | changes)
 
 
 def _matches_of(left: np.ndarray, right: np.ndarray, search: np.ndarray | None, speckle: int) -> Matches:

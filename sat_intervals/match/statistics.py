@@ -52,14 +52,11 @@ class Tally:
         return int(self._sums[wanted].sum())
 
     def report(self) -> dict[str, Any]:
-        """Counts of pixels; ``ambiguous``: valid, with the whole search range as interval.
+        """Counts of pixels, and the median width in pixels, to 0.01, None where there is no interval.
 
-        ``range_ends``: valid pixels with the flag range_end and without range_incomplete, by the end.
-
-        ``flags`` counts a pixel under each of its flags. ``causes`` counts each invalid pixel once, see
-        `products.cause`: with ``valid`` they sum to ``pixels``.
-
-        The median width in pixels, to 0.01, is None where there is no interval.
+        ``ambiguous``: valid, with the whole search range as interval. ``range_ends``: valid, with the flag range_end
+        and without range_incomplete, by the end. ``flags`` counts a pixel under each of its flags, ``causes`` each
+        invalid pixel once, see `products.cause`: with ``valid`` they sum to ``pixels``.
         """
         upto = np.cumsum(self._widths)
         median = float(np.searchsorted(upto, upto[-1] / 2) * _WIDTH_STEP) if upto[-1] else None

@@ -36,11 +36,16 @@ def match_whole(
 
 
 def _view(image: np.ma.MaskedArray, window: Window) -> View:
-    """Pixels and states of a window, which may extend beyond the image."""
-    pixels = np.zeros((window.height, window.width), image.dtype)
+    """View of a window, which may leave the image."""
+    state = np.where(np.ma.getmaskarray(image), NO_DATA, 0).astype(np.uint8)
+    return cut(View(Window(0, 0, *image.shape), image.filled(0), state), window)
+
+
+def cut(view: View, window: Window) -> View:
+    """Cut a window, which may leave the view, out of it; beyond it there is no data."""
+    pixels = np.zeros((window.height, window.width), view.pixels.dtype)
     state = np.full(pixels.shape, NO_DATA, np.uint8)
-    inside = window.clipped(Window(0, 0, *image.shape))
-    part, here = image[inside.slices], inside.relative_to(window).slices
-    pixels[here] = part.filled(0)
-    state[here] = np.where(np.ma.getmaskarray(part), NO_DATA, 0)
+    inside = window.clipped(view.window)
+    here, there = inside.relative_to(window).slices, inside.relative_to(view.window).slices
+    pixels[here], state[here] = view.pixels[there], view.state[there]
     return View(window, pixels, state)

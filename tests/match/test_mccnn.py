@@ -160,7 +160,7 @@ def test_compare__costs_equal_reference(network_file, weights, mirrored):
     left, right = masked_images(rows=150)
     config = settings(-6, 3, network_file, sgm=None)
     statistics = PairStatistics(ImageStatistics(490.0, 75.0), ImageStatistics(510.0, 85.0))
-    area = Area.mirror(Window(5, 2, 140, 30), config) if mirrored else Area.of(Window(5, 2, 140, 30), config)
+    area = Area.of(Window(5, 2, 140, 30), config, mirrored)
     (found,) = costs_of(left, right, [area], config, statistics)
     volume = cost_volume(found.costs, kernel_settings(config))
 
@@ -211,7 +211,7 @@ def test_compare__a_right_area_is_a_left_one_of_swapped_images(network_file):
     statistics = PairStatistics(ImageStatistics(490.0, 75.0), ImageStatistics(510.0, 85.0))
     config, swapped = (settings(*ends, network_file) for ends in ((-6, 3), (-3, 6)))
     window = Window(3, -4, 20, 30)
-    both = [Area.of(Window(3, 1, 20, 25), config), Area.mirror(window, config)]
+    both = [Area.of(Window(3, 1, 20, 25), config), Area.of(window, config, mirrored=True)]
     _, found = costs_of(left, right, both, config, statistics)
     swapped_statistics = PairStatistics(statistics.right, statistics.left)
     (expected,) = costs_of(right, left, [Area.of(window, swapped)], swapped, swapped_statistics)
