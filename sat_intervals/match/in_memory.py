@@ -46,17 +46,18 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     config = resolved(load_config(config))
     if missed := unreached(config):
         _LOG.warning("%s", missed)
-    images = _image(left, "left"), _image(right, "right")
-    _check_rows(*images)
+    pixels = _pixels(left, "left"), _pixels(right, "right")
+    _check_rows(*pixels)
     ranges = None
     if config.disparity.grid:
         raise SatIntervalsError("a raster of local ranges needs files: use match_pair, or disparity local")
     if config.disparity.is_auto or config.disparity.local:
-        found = _found(*images)
+        found = _found(_image(pixels[0]), _image(pixels[1]))
         config = with_range(config, found) if config.disparity.is_auto else config
         if config.disparity.local:
             ranges = found.local.clipped(config.disparity.minimum, config.disparity.maximum)
-    _check_fit(*images, config)
+    _check_fit(*pixels, config)
+    images = _image(pixels[0]), _image(pixels[1])
     statistics = None
     if config.cost.needs_statistics:
         statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
@@ -70,8 +71,8 @@ def match_arrays(left: Array, right: Array, config: Config | Mapping[str, Any]) 
     return dataset
 
 
-def _image(array: Array, side: str) -> np.ma.MaskedArray:
-    """Pixels of an array as floats, no data masked; raise if it is not an image."""
+def _pixels(array: Array, side: str) -> np.ma.MaskedArray:
+    """Pixels of an array as given; raise if it is not an image."""
     values = np.ma.asanyarray(array.data if isinstance(array, xr.DataArray) else array)
     if values.ndim != 2 or values.dtype.kind not in "uif":
         raise SatIntervalsError(
@@ -84,8 +85,13 @@ def _image(array: Array, side: str) -> np.ma.MaskedArray:
             f"the {side} array has {values.dtype} values that float64 cannot represent, which would lose texture: "
             "subtract an offset"
         )
-    dtype = np.float32 if np.can_cast(values.dtype, np.float32) else np.float64
-    return np.ma.masked_invalid(values.astype(dtype))
+    return values
+
+
+def _image(pixels: np.ma.MaskedArray) -> np.ma.MaskedArray:
+    """Convert pixels to float and mask no data."""
+    dtype = np.float32 if np.can_cast(pixels.dtype, np.float32) else np.float64
+    return np.ma.masked_invalid(pixels.astype(dtype))
 
 
 def _found(left: np.ma.MaskedArray, right: np.ma.MaskedArray) -> Found:

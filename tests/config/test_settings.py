@@ -247,11 +247,8 @@ REFUSED = [
     # section, its keys, the message
     ("disparity", {"minimum": 5}, "disparity: minimum 5 is above maximum 0, swap them"),
     ("disparity", {"minimum": -16001}, "disparity.minimum is -16001, allowed: integer >= -16000, <= 16000"),
-    ("disparity", {"maximum": 16001}, "disparity.maximum is 16001, allowed: integer >= -16000, <= 16000"),
     ("disparity", {"maximum": "5"}, "disparity.maximum is '5', allowed: integer >= -16000, <= 16000"),
-    ("disparity", {"maximum": 5.0}, "disparity.maximum is 5.0, allowed: integer >= -16000, <= 16000"),
     ("disparity", {"maximum": True}, "disparity.maximum is true, allowed: integer >= -16000, <= 16000"),
-    ("disparity", {"maximum": None}, "disparity.maximum is null, allowed: integer >= -16000, <= 16000"),
     ("disparity", None, "disparity is null, allowed: section of minimum, maximum, open_ends"),
     ("cost", None, "cost is null, allowed: section of method, window"),
     ("cost", {"method": "sad"}, "cost.method is 'sad', allowed: census or mccnn"),
@@ -261,15 +258,12 @@ REFUSED = [
     ("sgm", {"penalty": "mc_cnn_fast"}, "sgm.penalty is mc_cnn_fast, allowed: constant with cost.method census"),
     ("sgm", {"p1": 8.5}, "sgm.p1 is 8.5, allowed: whole numbers with census"),
     ("cost", {"window": 4}, "cost.window is 4, allowed: integer >= 3, <= 11, odd"),
-    ("cost", {"window": 1}, "cost.window is 1, allowed: integer >= 3, <= 11, odd"),
-    ("cost", {"window": 13}, "cost.window is 13, allowed: integer >= 3, <= 11, odd"),
     ("cost", {"windows": 5}, "unknown key 'cost.windows', did you mean window? (known: method, window)"),
     ("sgm", {"p1": 0}, "sgm.p1 is 0, allowed: number > 0"),
     ("sgm", {"p1": 129}, "sgm: p1 129 is above p2 128, the penalty of a larger step"),
     ("sgm", {"p2": 8144}, "sgm.p2 is 8144, allowed: <= 8143 with cost.window 7, so that costs summed over"),
     ("sgm", [8, 32], "sgm is [8, 32], allowed: section of penalty, p1, p2, span or null"),
     ("ambiguity", {"eta_max": 0}, "ambiguity.eta_max is 0, allowed: number > 0, <= 1"),
-    ("ambiguity", {"eta_max": 1.1}, "ambiguity.eta_max is 1.1, allowed: number > 0, <= 1"),
     ("ambiguity", {"eta_max": float("nan")}, "ambiguity.eta_max is NaN, allowed: number > 0, <= 1"),
     ("ambiguity", {"eta_step": 0.0001}, "ambiguity.eta_step is 0.0001, allowed: number >= 0.001, <= 1"),
     ("ambiguity", {"eta_step": 0.8}, "ambiguity: eta_step 0.8 is above eta_max 0.7"),
@@ -282,7 +276,6 @@ REFUSED = [
     ("ambiguity", {"p1": 1, "p99": float("inf")}, "ambiguity.p99 is inf, allowed: number >= 0 or null"),
     ("ambiguity", {"p1": 1, "p99": True}, "ambiguity.p99 is true, allowed: number >= 0 or null"),
     ("ambiguity", {"p1": 9}, "ambiguity: p1 is 9.0, p99 is null: give both or none"),
-    ("ambiguity", {"p99": 9}, "ambiguity: p1 is null, p99 is 9.0: give both or none"),
     ("ambiguity", {"p1": 9, "p99": 1}, "ambiguity: p1 9.0 is above p99 1.0, swap them"),
     (
         "ambiguity",
@@ -292,38 +285,26 @@ REFUSED = [
     ("ambiguity", None, "regularization needs ambiguity, set to null: give ambiguity or set"),
     ("interval", None, "regularization needs interval, set to null: give interval or set"),
     ("interval", {"alpha": 0}, "interval.alpha is 0, allowed: number > 0, <= 1 or null"),
-    ("interval", {"alpha": 1.01}, "interval.alpha is 1.01, allowed: number > 0, <= 1 or null"),
     ("interval", {"alpha": "0.9"}, "interval.alpha is '0.9', allowed: number > 0, <= 1 or null"),
-    ("interval", {"alpha": True}, "interval.alpha is true, allowed: number > 0, <= 1 or null"),
     (
         "interval",
         {"coverage": None},
         "interval: alpha and coverage are null: give one of them, or set interval to null",
     ),
-    ("refinement", {"method": "quadratic"}, "refinement.method is 'quadratic', allowed: vfit"),
     ("cross_check", {"method": "slow"}, "cross_check.method is 'slow', allowed: fast or accurate"),
-    ("cross_check", {"tolerance": -1}, "cross_check.tolerance is -1, allowed: integer >= 0"),
     ("median", {"size": 2}, "median.size is 2, allowed: integer >= 3, <= 11, odd"),
-    ("median", {"size": 1}, "median.size is 1, allowed: integer >= 3, <= 11, odd"),
     ("regularization", {"threshold": 1.5}, "regularization.threshold is 1.5, allowed: number >= 0, <= 1"),
-    ("regularization", {"kernel": 4}, "regularization.kernel is 4, allowed: integer >= 1, <= 101, odd"),
-    ("regularization", {"depth": -1}, "regularization.depth is -1, allowed: integer >= 0"),
-    ("regularization", {"quantile": 0.4}, "regularization.quantile is 0.4, allowed: number >= 0.5, <= 1"),
     ("tiles", {"size": 100}, "tiles.size is 100, allowed: integer >= 64, <= 16384, multiple of 64"),
-    ("tiles", {"size": 0}, "tiles.size is 0, allowed: integer >= 64, <= 16384, multiple of 64"),
-    ("tiles", {"overlap": 0}, "tiles.overlap is 0, allowed: integer >= 1, <= 4096 or exact"),
     ("tiles", {"overlap": "none"}, "tiles.overlap is 'none', allowed: integer >= 1, <= 4096 or exact"),
     ("tiles", {"overlap": 2}, "tiles.overlap is 2, allowed: >= 4 with cost.window 7"),
     ("tiles", None, "tiles is null, allowed: section of size, overlap"),
     ("products", {"keep_rejected": 1}, "products.keep_rejected is 1, allowed: true or false"),
-    ("products", None, "products is null, allowed: section of keep_rejected, compression"),
     (
         "regularisation",
         {},
         "unknown key 'regularisation', did you mean regularization? (known: preset, disparity, cost",
     ),
     ("preset", "papr", "preset is 'papr', allowed: satellite or satellite-mccnn or paper or mccnn"),
-    ("preset", None, "preset is null, allowed: satellite or"),
     ("preset", ["paper"], "preset is ['paper'], allowed: satellite or"),
     ("sgm", {"p2": 40, "span": 9}, "sgm.span is given, but with cost.method census it follows from p2: leave it out"),
     (7, {}, "unknown key '7' (known: preset, disparity, cost, sgm"),
@@ -428,12 +409,6 @@ def test_cost_span__is_the_theoretical_one(window: int, sgm: tuple[int, int] | N
     assert settings(cost={"window": window}, sgm=penalties).cost_span == span
 
 
-def test_cut_level__keeps_ties_that_binary_floats_lose() -> None:
-    config = settings(cost={"window": 11}, sgm={"p1": 20, "p2": 80}, interval={"alpha": 0.9})
-    assert int((1 - 0.9) * config.cost_span) == 159
-    assert config.cut_level == 160
-
-
 def test_ambiguity_levels__are_70_exact_multiples() -> None:
     config = settings()
     assert config.ambiguity_levels == tuple(i * 1408 // 100 for i in range(70))
@@ -484,25 +459,12 @@ def test_thresholds__are_none_where_their_step_is_off() -> None:
     assert config.ambiguity_weights is None
 
 
-@given(st.integers(-16000, 16000), st.integers(-16000, 16000))
-def test_count__is_the_number_of_candidates(one: int, other: int) -> None:
-    disparity = Disparity(minimum=min(one, other), maximum=max(one, other))
-    assert disparity.count == len(range(disparity.minimum, disparity.maximum + 1))
-
-
-@pytest.mark.parametrize("section", ["disparity.grid", "cost.weights"])
-def test_load_config__names_the_file_that_the_system_finds_above_the_target_of_a_link(tmp_path, monkeypatch, section):
+def test_load_config__names_the_file_that_the_system_finds_above_the_target_of_a_link(tmp_path, monkeypatch):
     """In one spelling from any working directory, so that a run can be resumed from another one."""
     (tmp_path / "job" / "lists").mkdir(parents=True)
     (tmp_path / "lists").symlink_to("job/lists")
-    found = set()
-    for folder, name in (
-        (tmp_path, "lists/../a.tif"),
-        (tmp_path / "job" / "lists", "../a.tif"),
-        (tmp_path, "job/a.tif"),
-    ):
-        monkeypatch.chdir(folder)
-        given = {"disparity": {"minimum": 0, "maximum": 9, "grid": name}, "cost": {"method": "mccnn", "weights": name}}
-        config = load_config(given)
-        found.add(config.disparity.grid if section == "disparity.grid" else config.cost.weights)
-    assert found == {str(tmp_path / "job" / "a.tif")}
+    places = {".": "lists/../a.tif", "job/lists": "../a.tif", "job": "a.tif"}
+    for folder, name in places.items():
+        monkeypatch.chdir(tmp_path / folder)
+        config = settings(disparity={"grid": name}, cost={"method": "mccnn", "weights": name})
+        assert config.disparity.grid == config.cost.weights == str(tmp_path / "job" / "a.tif")

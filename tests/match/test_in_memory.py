@@ -54,13 +54,11 @@ def test_match_arrays__takes_masked_pixels_as_no_data(scene, expected):
 WAYS = {
     "nan": with_nan,
     "inf": lambda image: with_nan(image, value=np.inf),
-    "-inf": lambda image: with_nan(image, value=-np.inf),
     "float64": lambda image: with_nan(image, np.float64),
     "big-endian": lambda image: with_nan(image, ">f4"),
     "columns first": lambda image: np.asfortranarray(with_nan(image)),
     "list": lambda image: with_nan(image).tolist(),
     "mask over nan": lambda image: np.ma.masked_array(with_nan(image), np.ma.getmaskarray(image)),
-    "big-endian integers": lambda image: image.astype(">u2"),
     "long integers": lambda image: image.astype(np.int64),
     "DataArray": lambda image: xr.DataArray(with_nan(image)),
     "chunked DataArray": lambda image: xr.DataArray(with_nan(image)).chunk(7),
@@ -137,13 +135,6 @@ def test_match_arrays__takes_what_load_config_takes(scene, expected):
         match_arrays(left, right, {"disparity": None})
 
 
-def test_match_arrays__of_one_pixel_is_one_invalid_pixel(scene):
-    config = scene[2]
-    found = match_arrays(np.ones((1, 1)), np.ones((1, 1)), config)
-    assert np.isnan(found["disparity"]).all()
-    assert (found["validity"] & 1 == 1).all()
-
-
 def test_match_arrays__needs_no_section_that_can_be_off(scene):
     left, right, _ = scene
     off = dict.fromkeys(("sgm", "ambiguity", "interval", "refinement", "cross_check", "median", "regularization"), None)
@@ -162,14 +153,10 @@ IMAGE = np.zeros((5, 8), np.float32)
         (IMAGE[:4], IMAGE, "the left array has 4 rows, the right 5, but rows must correspond"),
         (IMAGE[np.newaxis], IMAGE, "the left array has 3 dimensions of float32: give 2"),
         (IMAGE, IMAGE[0], "the right array has 1 dimensions of float32: give 2"),
-        (IMAGE, np.float32(1), "the right array has 0 dimensions"),
         (IMAGE + 1j, IMAGE, "the left array has 2 dimensions of complex64: .*real numbers"),
-        (IMAGE, IMAGE > 0, "the right array has 2 dimensions of bool"),
-        (IMAGE, IMAGE.astype("datetime64[s]"), r"the right array has 2 dimensions of datetime64\[s\]"),
         (IMAGE, IMAGE.astype(str), "the right array has 2 dimensions of <U"),
         (None, IMAGE, "the left array has 0 dimensions of object"),
         (IMAGE[:0], IMAGE[:0], r"nothing to match: shapes \(0, 8\) and \(0, 8\)"),
-        (IMAGE, IMAGE[:, :0], r"nothing to match: shapes \(5, 8\) and \(5, 0\)"),
     ],
 )
 def test_match_arrays__refuses_what_is_no_pair_of_images(left, right, message):

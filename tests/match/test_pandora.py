@@ -202,21 +202,6 @@ def test_match_arrays__raw_bounds_equal_pandoras(peer: Peer, ours: xr.Dataset, b
     np.testing.assert_array_equal(ours[bound].data[peer.whole], getattr(peer, bound)[peer.whole])
 
 
-@pytest.mark.parametrize(("bound", "outwards"), [("lower", -1), ("upper", 1)])
-def test_match_arrays__unrefined_bounds_extend_to_pandoras(
-    peer: Peer, pair: Pair, ours_unrefined: xr.Dataset, bound: str, outwards: int
-) -> None:
-    # Pandora has no switch for the extension, so it is made here, on Pandora's own costs: a bound that costs
-    # as little as the winner moves out by 1, not beyond the search range. What can differ is as in the test
-    # above.
-    whole, search = peer.whole, pair.config.disparity
-    cut, costs = ours_unrefined[bound].data[whole].astype(int), peer.volume[whole]
-    cost_at_bound = costs[np.arange(cut.size), cut - search.minimum]
-    extended = np.clip(cut + outwards, search.minimum, search.maximum)
-    expected = np.where(cost_at_bound == costs.min(axis=1), extended, cut)
-    np.testing.assert_array_equal(expected, getattr(peer, bound)[whole])
-
-
 def test_match_arrays__disparities_equal_pandoras_but_for_rounding(peer: Peer, ours: xr.Dataset) -> None:
     # Pandora rounds the shift to float32 and then its sum with the winner, we round once. Agreed are 1e-3 px.
     tolerance = 2 * np.spacing(np.float32(64))
