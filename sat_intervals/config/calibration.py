@@ -4,17 +4,17 @@ import hashlib
 import json
 import os
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator
 
 from sat_intervals.config.files import read_mapping
-from sat_intervals.config.sections import ConfigError
+from sat_intervals.config.sections import ConfigError, StrictModel
 from sat_intervals.products import IMPOSSIBLE_COST
 
 # Coverages of a calibration; others are interpolated.
@@ -22,13 +22,6 @@ COVERAGES = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.975, 0.99)
 MAKE_ONE = "make one with sat-intervals calibrate and give it by --calibration"
 # Keys of settings that no calibration has.
 SETTINGS = {"preset", "disparity", "cost", "sgm", "interval"}
-
-
-class StrictModel(BaseModel):
-    """Content of a file; other types and unknown keys are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
 
 _Model = TypeVar("_Model", bound=StrictModel)
 
@@ -68,7 +61,7 @@ class Calibration(CalibrationFile):
     name: str
     key: dict[str, Any]
     levels: tuple[Levels, ...] = Field(strict=False)
-    provenance: dict[str, Any] = {}
+    provenance: dict[str, Any] = Field(default_factory=dict)
 
     @field_validator("levels")
     @classmethod
@@ -97,11 +90,11 @@ def load_calibration(source: "str | os.PathLike[str] | Mapping[str, Any] | Calib
         return checked(Calibration, source, "calibration")
     if not isinstance(source, str | os.PathLike):
         raise ConfigError(f"calibration is {source!r}, allowed: a file, the name of a built-in one, or its content")
-    file = dict(_built_in_files()).get(str(source), Path(source))
+    file = _built_in_files().get(str(source), Path(source))
     try:
         values = read_mapping(file, f"keys {', '.join(Calibration.model_fields)}")
     except OSError as error:
-        known = ", ".join(name for name, _ in _built_in_files()) or "none"
+        known = ", ".join(_built_in_files())
         raise ConfigError(f"calibration {file}: {error.strerror} (built in: {known}): {MAKE_ONE}") from error
     if "classes" in values:
         raise ConfigError(f"{file} is a calibration of heights: give it to dsm --calibration")
@@ -121,17 +114,14 @@ def checked(model: type[_Model], values: Mapping[str, Any], where: str) -> _Mode
         raise ConfigError(f"{where}: {place}: {why}") from error
 
 
-def _built_in_files() -> Iterator[tuple[str, Path]]:
-    folder = resources.files("sat_intervals.configs") / "calibrations"
-    if folder.is_dir():
-        for file in sorted(folder.iterdir(), key=lambda file: file.name):
-            if file.name.endswith(".yaml"):
-                yield file.name.removesuffix(".yaml"), Path(str(file))
+def _built_in_files() -> dict[str, Path]:
+    files = sorted(Path(str(file)) for file in (resources.files("sat_intervals.configs") / "calibrations").iterdir())
+    return {file.stem: file for file in files if file.suffix == ".yaml"}
 
 
 def built_in(key: Mapping[str, Any], preset: str) -> Calibration:
     """Return the built-in calibration of settings with this key; if there is none, the error names the nearest."""
-    names = [name for name, _ in _built_in_files()]
+    names = list(_built_in_files())
     for name in sorted(names, key=lambda name: name != preset):  # that of the preset first: reading takes 20 ms
         if (calibration := _built_in(name)).key == key:
             return calibration

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
-from sat_intervals.config.calibration import SETTINGS, CalibrationFile, StrictModel, checked, differences
+from sat_intervals.config.calibration import SETTINGS, CalibrationFile, checked, differences
 from sat_intervals.config.files import read_mapping
-from sat_intervals.config.sections import ConfigError
+from sat_intervals.config.sections import ConfigError, StrictModel
 
 _MAKE_ONE = "make one with sat-intervals calibrate --dsm"
 # Tags of a surface that its intervals depend on.

@@ -54,10 +54,14 @@ else:
     Pixels = Annotated[int, Field(ge=-16000, le=16000)] | Literal["auto"]
 
 
-class Section(BaseModel):
-    """Base class of sections: immutable; unknown keys, wrong types and NaN are refused."""
+class StrictModel(BaseModel):
+    """Immutable content of a file; unknown keys, wrong types and NaN are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Section(StrictModel):
+    """Base class of sections."""
 
     @model_validator(mode="before")
     @classmethod
