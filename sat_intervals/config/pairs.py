@@ -94,7 +94,11 @@ def find_pairs(paths: Iterable[str | Path]) -> list[Pair]:
     for path in map(Path, paths):
         pairs += _of_table(path) if path.suffix == ".csv" else [_of_folder(path)]
     check_names(pair.name for pair in pairs)
-    for pair, count in Counter(map(_without_name, pairs)).items():
+    nameless = (
+        replace(pair, name="", group="", **{side: getattr(pair, side).resolve() for side in ("left", "right", "truth")})
+        for pair in pairs
+    )
+    for pair, count in Counter(nameless).items():
         if count > 1:
             raise SatIntervalsError(f"the pair of {pair.left} is given {count} times: give it once")
     return pairs
@@ -119,12 +123,6 @@ def check_names(names: Iterable[str], where: str = "") -> None:
     for name, count in Counter(names).items():
         if count > 1:
             raise SatIntervalsError(f"{where}{count} pairs or runs are called {name}: give each its own name")
-
-
-def _without_name(pair: Pair) -> Pair:
-    """Return a pair with resolved paths and without name and group, for comparison."""
-    left, right, truth = (path.resolve() for path in (pair.left, pair.right, pair.truth))
-    return replace(pair, name="", group="", left=left, right=right, truth=truth)
 
 
 def group_beside(image: str | Path) -> str:

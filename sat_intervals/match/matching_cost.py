@@ -112,13 +112,12 @@ def _of_area(area: Area, views: Views, arrays: Sequence[np.ndarray], radius: int
 
     ``arrays``, ``(..., columns)``, belong to the left and the right view without a margin of ``radius``.
     """
-    sides = (area.mirrored, area.base), (not area.mirrored, area.facing)
-    first = [wanted.column - views[side].window.column - radius for side, wanted in sides]
-    base, there = (
-        np.ascontiguousarray(arrays[side][..., column : column + wanted.width])
-        for column, (side, wanted) in zip(first, sides, strict=True)
-    )
-    return base, there
+
+    def crop(side: bool, wanted: Window) -> np.ndarray:
+        first = wanted.column - views[side].window.column - radius
+        return np.ascontiguousarray(arrays[side][..., first : first + wanted.width])
+
+    return crop(area.mirrored, area.base), crop(not area.mirrored, area.facing)
 
 
 def _varies(view: View, radius: int) -> np.ndarray:
