@@ -1,7 +1,8 @@
 """Reopen a finished run from its folder: report, bands, input images and truth."""
 
 import json
-from collections.abc import Iterable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,23 @@ from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS, Bands
-from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, tags_beside
+from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.images import opened
+from sat_intervals.raster.published import is_points_of, is_surface_of, tags_beside
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers
 from sat_intervals.tiling import Window, strips
 
 # Pixels in a strip, and band count of each file.
 _STRIP = 1 << 23
 _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
+# Files that later commands add to a run: the command, and whether a file is of the run that finished at a time.
+_ADDED: dict[str, tuple[str, Callable[[Path, str], bool]]] = {
+    "points.tif": ("triangulate", is_points_of),
+    "dsm.tif": ("dsm", is_surface_of),
+    "overview.png": ("plot", lambda file, finished: read_tags(file).get("Comment") == finished),
+}
+
+_LOG = logging.getLogger(__name__)
 
 
 class _Report(BaseModel):
@@ -66,6 +76,14 @@ class Run:
     def windows(self) -> Iterator[Window]:
         """Yield full-width windows of the results from the top."""
         return strips(*self.shape, _STRIP)
+
+    def has_current(self, name: str) -> bool:
+        """Return whether the folder has a file of a later command, made of this run; warn if it is of another one."""
+        command, is_of = _ADDED[name]
+        if not (file := self.out / name).exists() or is_of(file, self.report["finished"]):
+            return file.exists()
+        _LOG.warning("%s is of another run or of earlier points and is left out: rerun sat-intervals %s", file, command)
+        return False
 
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
         """Raise if an output would replace a file of the run, one of its inputs, the truth, or one of ``inputs``."""

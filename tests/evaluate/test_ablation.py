@@ -182,7 +182,7 @@ def test_ablate_pair__reproduces_the_reference(shared_data, year):
     scenes = []
     for pair in find_pairs(sorted(shared_data.glob(f"mb{year}_*"))):
         search = {"minimum": pair.minimum, "maximum": pair.maximum}
-        accurate = {"disparity": search, "cross_check": {"method": "accurate"}}
+        accurate = {"preset": "paper", "disparity": search, "cross_check": {"method": "accurate"}}
         scenes.append(SceneMetrics(pair.name, pair.group, ablate_pair(pair, accurate)))
     ours, paper, known = table_2(scenes)
     assert (ours.label, paper.label, known.label) == (f"middlebury{year}", "paper", "reference")

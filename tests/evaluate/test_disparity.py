@@ -442,7 +442,7 @@ def test_command__matches_pairs_and_prints_a_table(pair, run, tmp_path):
     reports = json.loads(text)
     assert list(reports) == ["one", "two", str(run)]
     assert reports["one"] == reports[str(run)]
-    status, text, shown = command("evaluate", pair, other, "--quiet")
+    status, text, shown = command("evaluate", pair, other, "--preset", "paper", "--quiet")
     assert status == 0
     assert not [line for line in shown.splitlines() if not line.startswith("sat-intervals: ")]
     label, scenes, reached, accuracy, *_ = text.splitlines()[2].split()

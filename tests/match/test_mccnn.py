@@ -351,7 +351,7 @@ def test_match_batch__measures_each_pair_and_goes_on_after_one_that_it_cannot(tm
         PairOfBatch(name, str(tmp_path / "left.tif"), str(tmp_path / f"{other}.tif"), settings=SEARCH)
         for name, other in (("broken", "cut"), ("whole", "right"))
     ]
-    cost = {"cost": {"method": "mccnn", "weights": str(network_file)}}
+    cost = {"preset": "mccnn", "cost": {"weights": str(network_file)}}
     report = match_batch(pairs, tmp_path / "out", cost)
     assert {name: end["state"] for name, end in report.items()} == {"broken": "failed", "whole": "done"}
     assert "cut.tif could not be measured" in report["broken"]["error"]
