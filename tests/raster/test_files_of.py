@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from sat_intervals.raster import InputError, files_of, open_image
+from sat_intervals.errors import InputError
+from sat_intervals.raster import files_of, open_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

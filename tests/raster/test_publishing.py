@@ -8,7 +8,7 @@ import pytest
 from helpers import contents
 
 from sat_intervals.raster import OutputError, check_free, check_space, new_file, write_file
-from sat_intervals.raster.publishing import unfinished, way_out
+from sat_intervals.raster.publishing import unfinished
 
 
 def test_new_file__is_not_there_before_it_is_whole(tmp_path):
@@ -121,8 +121,3 @@ def test_check_space__says_what_is_free_and_needed(tmp_path):
     check_space(tmp_path, 1, "files")
     with pytest.raises(OutputError, match=r"MB free, files may need 1,000,000,000,000.0 MB: free disk space"):
         check_space(tmp_path, 10**18, "files")
-
-
-def test_way_out__fits_the_error():
-    assert way_out(PermissionError()) == "choose another name or folder"
-    assert way_out(OSError(28, "No space left on device")) == "free disk space or choose another folder"

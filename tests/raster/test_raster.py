@@ -25,6 +25,7 @@ from rasterio.rpc import RPC
 from rasterio.transform import Affine
 from rio_cogeo.cogeo import cog_validate
 
+from sat_intervals.errors import InputError
 from sat_intervals.products import BANDS, FLAGS, INVALID, MASKED, NO_DATA
 from sat_intervals.raster import (
     POINT_FILES,
@@ -32,7 +33,6 @@ from sat_intervals.raster import (
     File,
     Georeferencing,
     Image,
-    InputError,
     OutputError,
     OutputWriter,
     check_pair,
