@@ -43,13 +43,6 @@ def test_new_file__keeps_what_was_there_if_the_block_fails(tmp_path, error):
     assert contents(tmp_path) == {str(path): b"before"}
 
 
-def test_new_file__replaces_a_link_and_not_its_target(tmp_path):
-    (tmp_path / "mine").write_text("mine")
-    (tmp_path / "a.txt").symlink_to("mine")
-    write_file(tmp_path / "a.txt", b"new")
-    assert contents(tmp_path) == {str(tmp_path / "a.txt"): b"new", str(tmp_path / "mine"): b"mine"}
-
-
 def test_new_file__of_a_second_writer_is_refused(tmp_path):
     path = tmp_path / "a.txt"
     with new_file(path) as temporary:
