@@ -102,16 +102,3 @@ def job_script(settings: Cluster, out: Path) -> str:
         with suppress(OSError):
             folder.rmdir()
     return script
-
-
-def check_accepted(cluster: Any) -> None:
-    """Raise if the batch system refused all jobs."""
-    if getattr(cluster, "refusals", None) and not cluster.submitted:
-        raise SatIntervalsError(
-            f"the batch system refuses the job: {' '.join(cluster.refusals[0].split())}: check the section cluster"
-        )
-
-
-def logs_of(cluster: Any) -> str:
-    """Return where jobs write their logs, as the end of a message; empty for other clusters."""
-    return f": see the queue, and the logs of the jobs in {cluster.logged}" if hasattr(cluster, "logged") else ""

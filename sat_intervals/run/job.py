@@ -48,7 +48,8 @@ class Job:
     """All that is needed to match any tile of a pair and to assemble its files; picklable.
 
     ``requested`` is the section ``disparity`` as given, ``found`` the result of the search for a range, ``local`` the
-    local ranges, which workers read from the store. `calibrate` makes no files of its tiles: ``has_files`` is False.
+    local ranges, which workers read from the store. With ``overwrite``, files and another run in ``out`` may be
+    replaced. `calibrate` makes no files of its tiles: ``has_files`` is False.
     """
 
     left: Image
@@ -61,14 +62,19 @@ class Job:
     found: Found | None = None
     ranges_digest: str | None = None
     local: LocalRanges | None = None
+    overwrite: bool = False
     has_files: bool = True
 
     @property
     def manifest(self) -> dict[str, Any]:
         """Return all that decides the bytes of a tile, and where the tiles are."""
         made = _manifest(self.config, self.inputs, self.store.grid.region, self.ranges_digest)
-        is_home = self.store.folder == folder_at(home_of(self.out))
-        return made | {PLACE: None if is_home else str(self.store.folder)}
+        return made | {PLACE: None if self.is_home else str(self.store.folder)}
+
+    @property
+    def is_home(self) -> bool:
+        """Return whether the tiles are in the folder of the run."""
+        return self.store.folder == folder_at(home_of(self.out))
 
     @property
     def hands_states_on(self) -> bool:
@@ -90,9 +96,9 @@ class Job:
         """Return the settings that decide the bytes of the files."""
         return self.config.model_dump(mode="json", exclude={"cluster", "preset"})
 
-    def begin(self, *, overwrite: bool = False) -> bool:
+    def begin(self) -> bool:
         """Open the store and return True; False if the run is complete. Call it while the folder is locked."""
-        step = next_step(self.out, self.manifest, self.name, self.settings, overwrite=overwrite)
+        step = next_step(self.out, self.manifest, self.name, self.settings, overwrite=self.overwrite)
         if step == "complete":
             return False
         if step == "start anew":
@@ -120,7 +126,7 @@ class Job:
         parts = self.has_files * part_bytes(files, region.height, region.width)
         before = share * (tiles + handed) + max(0, parts - sum(self.store.folder.sizes(PARTS).values()))
         final = self.has_files * file_bytes(files, region.height, region.width)
-        if self.store.folder == folder_at(home_of(self.out)):
+        if self.is_home:
             check_space(self.out, round(before + final), "tiles, files and their parts")
             return
         check_space(self.out, final, "files")
@@ -207,7 +213,7 @@ def prepare(
     folder = folder_at(f"{folder_at(store)}/{'-'.join(filter(None, (pair, run)))}" if store else home_of(out))
     kept = Store(folder, Grid(region, config.tiles.size), run)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
-    return Job(left, right, config, kept, out, inputs, requested, found, ranges, local)
+    return Job(left, right, config, kept, out, inputs, requested, found, ranges, local, overwrite)
 
 
 def _before(out: Path) -> dict[str, Any]:

@@ -30,25 +30,20 @@ _OF = "RANGES_OF"
 
 def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
     """Return settings with the search range as numbers, what ``find`` found if needed, and local ranges, if any."""
-    search = config.disparity
-    raster = read_ranges(search.grid, left) if search.grid else None
+    search, found, local = config.disparity, None, None
     if search.grid:
         tags_beside(search.grid, identity(left.path))
-    found = None
-    if raster is None and (search.is_auto or search.local):
+        local = read_ranges(search.grid, left)
+        config = _with_range_of(config, local) if search.is_auto else config
+    elif search.is_auto or search.local:
         found = find()
-    if search.is_auto:
-        config = with_range(config, found) if found else _with_range_of(config, raster)
-    if not search.is_local:
-        return config, found, None
-    local = raster if raster else found.local if found else None
-    assert local is not None
-    return config, found, local.clipped(config.disparity.minimum, config.disparity.maximum)
+        local = found.local if search.local else None
+        config = with_range(config, found) if search.is_auto else config
+    return config, found, local and local.clipped(config.disparity.minimum, config.disparity.maximum)
 
 
-def _with_range_of(config: Config, raster: LocalRanges | None) -> Config:
+def _with_range_of(config: Config, raster: LocalRanges) -> Config:
     """Return settings with the hull of a raster of ranges as search range."""
-    assert raster is not None
     known = raster.minimum <= raster.maximum
     if not known.any():
         raise SatIntervalsError(f"{config.disparity.grid} has no data: give another raster, or the search range")

@@ -1,7 +1,8 @@
 """Finish strips of a run on workers: final bands, compressed as parts of the files, and overviews, as a binary tree."""
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,7 +17,7 @@ from sat_intervals.match.statistics import Tally
 from sat_intervals.progress import Progress
 from sat_intervals.raster import BLOCK, RUN_FILES, codec_versions, compressed, factors, run_files
 from sat_intervals.run.job import Job
-from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason
+from sat_intervals.run.workers import Task, Workers, check_not_full, computing, picklable_errors, reason, results
 from sat_intervals.store.arrays import DamagedFileError
 from sat_intervals.store.manifest import digest
 from sat_intervals.store.tiles import PARTS, DamagedTilesError
@@ -51,7 +52,7 @@ def part_name(key: PartKey) -> str:
 
 
 def finish_strips(
-    job: Job, client: Callable[[], Workers], scale: ConfidenceScale, progress: Progress
+    job: Job, workers: Workers, scale: ConfidenceScale, progress: Progress
 ) -> dict[PartKey, dict[str, Any]]:
     """Make the parts of a run that are missing, once its tiles are done; return ``meta`` of all parts."""
     counts, height = rows_of_levels(job.store.grid.region), job.store.grid.region.height
@@ -70,14 +71,14 @@ def finish_strips(
                 waiting.remove(key)
                 yield _task(job, key, counts, scale, of)
 
-    for outcome in client().outcomes(tasks()) if waiting else ():
-        if outcome is not None and outcome.error is not None:
-            _fail(job, outcome.label, outcome.error)
-        if outcome is not None and outcome.result is not None:
-            damaged.append(outcome.result)  # the other strips are finished before tiles are matched again
-        elif outcome is not None:
-            done.add(outcome.label)
+    def look(_: int) -> None:
         progress("bands", min(height, BLOCK * sum(level == 0 for level, _ in done)), height)
+
+    for key, damage in results(workers, tasks(), partial(_fail, job), look) if waiting else ():
+        if damage is None:
+            done.add(key)
+        else:
+            damaged.append(damage)  # the other strips are finished before tiles are matched again
     if damaged:
         raise DamagedTilesError(damaged[0])
     found = {key: job.store.meta(PARTS, part_name(key), of) for key in keys}

@@ -14,8 +14,7 @@ from distributed import Client
 from distributed import Future as DaskFuture
 from distributed.client import ClosedClientError
 
-from sat_intervals.errors import RunError
-from sat_intervals.run.batch_system import check_accepted, logs_of
+from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.run.workers import CHECK_EVERY, Outcome, Task, in_flight
 
 WORKERS_GONE = 300.0  # seconds after the last worker left, at which a run ends
@@ -59,8 +58,13 @@ class DaskWorkers:
 
     def _check_wait(self, now: float) -> None:
         """Raise if no worker will come; otherwise warn every minute. Nothing limits the wait for the first one."""
-        check_accepted(self._client.cluster)
-        where = logs_of(self._client.cluster)
+        system: Any = self._client.cluster
+        where = ""
+        if hasattr(system, "logged"):  # see `batch_system`
+            where = f": see the queue, and the logs of the jobs in {system.logged}"
+            if system.refusals and not system.submitted:
+                refusal = " ".join(system.refusals[0].split())
+                raise SatIntervalsError(f"the batch system refuses the job: {refusal}: check the section cluster")
         if self._seen is not None and now - self._seen > WORKERS_GONE:
             raise RunError(
                 f"the last worker ended and none has started for {WORKERS_GONE:.0f} s{where}; rerun the same command: "

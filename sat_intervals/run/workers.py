@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from queue import Empty, SimpleQueue
 from threading import BoundedSemaphore
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 from sat_intervals.config import Cluster, ConfigError
 from sat_intervals.errors import RunError, SatIntervalsError
@@ -44,6 +44,23 @@ class Workers(Protocol):
 
     def outcomes(self, tasks: Iterator[Task | None]) -> Iterator[Outcome | None]:
         """Run tasks, a bounded number at once; yield outcomes, and None regularly. A task None waits for others."""
+
+
+def results(
+    workers: Workers,
+    tasks: Iterator[Task | None],
+    failed: Callable[[Any, BaseException], NoReturn],
+    look: Callable[[int], None],
+) -> Iterator[tuple[Any, Any]]:
+    """Yield label and result of each task; ``failed`` raises for an error, ``look`` is given the number done."""
+    done = 0
+    for outcome in workers.outcomes(tasks):
+        if outcome is not None:
+            if outcome.error is not None:
+                failed(outcome.label, outcome.error)
+            done += 1
+            yield outcome.label, outcome.result
+        look(done)
 
 
 def readers(settings: Cluster) -> int:
