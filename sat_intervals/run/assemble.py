@@ -47,28 +47,19 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
         parts = finish_strips(job, workers, scale, progress)
     files, place = run_files(job.config.products.compression), job.left.georeferencing.shifted(region)
     with (
-        _resumable(),
+        _tiles_kept(job),
         OutputWriter(job.out, files, region.height, region.width, place, tags_of(job.config)) as writer,
     ):
         with logged_stage(seconds, "files"):
             _copy_parts(job, writer, parts, workers, progress)
             made = writer.build()
         with logged_stage(seconds, "inputs"):
-            _check_inputs(job)
+            check_unchanged(job.inputs, job.left, job.right, job.config)
         report = report_of(job, tables, scale, parts.values(), seconds)
         for line in report["warnings"]:
             _LOG.warning("%s", line)
         _publish(job, writer, made, report)
     return report
-
-
-def _check_inputs(job: Job) -> None:
-    """Compare the inputs with those of the start; if one differs, the tiles are of both and must go."""
-    try:
-        check_unchanged(job.inputs, job.left, job.right, job.config)
-    except ChangedInputError:
-        remove_tiles(job.out)
-        raise
 
 
 def _publish(job: Job, writer: OutputWriter, made: Mapping[str, Path], report: dict[str, Any]) -> None:
@@ -95,10 +86,13 @@ def end_tiles(job: Job, *, keep_tiles: bool) -> None:
 
 
 @contextmanager
-def _resumable() -> Iterator[None]:
-    """Turn an OutputError into a RunError: all tiles are done, so the run can be resumed."""
+def _tiles_kept(job: Job) -> Iterator[None]:
+    """Turn an OutputError into a RunError, since the run can be resumed; delete tiles of inputs that have changed."""
     try:
         yield
+    except ChangedInputError:
+        remove_tiles(job.out)
+        raise
     except OutputError as error:
         raise RunError(f"{error}; rerun the same command: it resumes from the tiles, which are all done") from error
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from sat_intervals.config import Config, load_config, named_files, read_yaml
 from sat_intervals.config.pairs import REPORT, PairOfBatch
+from sat_intervals.config.presets import merged
 from sat_intervals.errors import RunError, SatIntervalsError
 from sat_intervals.match.warm_up import compile_kernels
 from sat_intervals.progress import Progress
@@ -26,11 +27,11 @@ from sat_intervals.run.pair import (
     Matched,
     check_failures,
     complete_before,
-    find_on,
     match_and_assemble,
     match_jobs,
     measure_images,
 )
+from sat_intervals.run.search_range import search_range
 from sat_intervals.run.state import OUTPUTS
 from sat_intervals.run.status import read_report
 from sat_intervals.run.workers import Workers
@@ -69,12 +70,12 @@ def match_batch(
         report = _Report(out)
         report.note({pair.name: {"state": "waiting"} for pair in pairs})
         with Connection(common.cluster, out) as connection:
-            find = partial(find_on, connection, {}, progress)
+            find = partial(search_range, connection, progress=progress)
             jobs: dict[str, Job] = {}
             for number, pair in enumerate(pairs):
                 progress("pairs", number, len(pairs))
                 try:
-                    own = {**(overrides or {}), **_merged(overrides or {}, pair.settings)}
+                    own = merged(overrides or {}, pair.settings)
                     settings = load_config(sections, own, preset_wins=True, file=file)
                     job = _prepared(pair, out, settings, overwrite=overwrite, find=find)
                     stack.enter_context(locked(job.out))
@@ -90,8 +91,9 @@ def match_batch(
             for name, how in _matched(jobs, connection, progress, keep_tiles=keep_tiles):
                 report.note({name: how})
         for pair in pairs:
-            if (how := _finished(pair, report.states[pair.name], finish)) is not report.states[pair.name]:
-                report.note({pair.name: how})
+            how = report.states[pair.name]
+            if how["state"] != "failed" and (more := _more(pair, how["finished"], finish)):
+                report.note({pair.name: {**how, **more}})
     return report.states
 
 
@@ -147,15 +149,12 @@ def _failed(error: Exception) -> dict[str, Any]:
     return {"state": "failed", "error": str(error) or type(error).__name__}
 
 
-def _finished(pair: PairOfBatch, how: dict[str, Any], finish: Finish) -> dict[str, Any]:
-    """Return the state of a pair after its last step."""
-    if how["state"] == "failed":
-        return how
+def _more(pair: PairOfBatch, finished: str, finish: Finish) -> Mapping[str, Any]:
+    """Return what the last step of a pair adds to its state."""
     try:
-        more = finish(pair, how["finished"])
-        return {**how, **more} if more else how
+        return finish(pair, finished)
     except Exception as error:  # one pair's failure must not stop the others
-        return {**how, **_failed(error)}
+        return _failed(error)
 
 
 def _raise_file_limit() -> None:
@@ -166,22 +165,14 @@ def _raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
-def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sections of both; the second wins, key by key."""
-    return {
-        name: {**first[name], **section} if name in first and isinstance(section, Mapping) else section
-        for name, section in second.items()
-    }
-
-
 def _matched(
     jobs: Mapping[str, Job], workers: Workers, progress: Progress, *, keep_tiles: bool
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Match the tiles of all jobs; assemble finished jobs in a thread meanwhile."""
     if not jobs:
         return
-    for config in {_kernels(job.config): job.config for job in jobs.values()}.values():
-        compile_kernels(config)
+    for job in jobs.values():
+        compile_kernels(job.config)
     assembling: dict[Future[dict[str, Any]], str] = {}
     with _thread() as (thread, check):
         measured = {}
@@ -220,12 +211,6 @@ def _thread() -> Iterator[tuple[ThreadPoolExecutor, Progress]]:
             is_stopped.set()
             thread.shutdown(wait=False, cancel_futures=True)
             raise
-
-
-def _kernels(config: Config) -> str:
-    """Return a key of the kernels that a configuration needs."""
-    search, sgm, cross_check = config.disparity, config.sgm, config.cross_check
-    return repr((config.cost, search.local, search.grid, sgm and sgm.penalty, cross_check and cross_check.method))
 
 
 def _assembled(workers: Workers, progress: Progress, matched: Matched, *, keep_tiles: bool) -> dict[str, Any]:

@@ -29,9 +29,9 @@ class Connection:
         settings = self._settings
         if settings.kind == "threads":
             return self._stack.enter_context(closing(Threads(cores_of_process(settings), readers(settings))))
-        from sat_intervals.run import cluster, submit
+        from sat_intervals.run.submit import DaskWorkers, connected
 
-        return submit.DaskWorkers(self._stack.enter_context(cluster.connected(settings, self._out)))
+        return DaskWorkers(self._stack.enter_context(connected(settings, self._out)))
 
     def __enter__(self) -> Self:
         return self

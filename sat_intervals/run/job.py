@@ -1,6 +1,7 @@
 """Prepare a pair for matching: images, search range, inputs, tiles, and the state of its folder."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
@@ -40,6 +41,7 @@ Search = Callable[[Image, Image], Found]
 _NOT_OF_TILES = {"preset", "median", "regularization", "products", "cluster"}
 # Files of `ONCE`.
 _STATISTICS, _RANGE = "statistics", "range"
+_REMOTE = "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
 _NO_TILES = Grid(Window(0, 0, 0, 0), 1)
 
 
@@ -111,7 +113,8 @@ class Job:
                 found, ranges = self.found and self.found.report(), self.local and self.local.report()
                 self.store.write(ONCE, _RANGE, of=origin_of(self.inputs), found=found, ranges=ranges)
         except OSError as error:
-            raise _unusable(self.store, error) from error
+            way_out = "make room, check its rights or choose another folder" if self.store.folder.is_local else _REMOTE
+            raise StoreError(f"{self.store.folder} cannot be used: {error.strerror or error}: {way_out}") from error
         self._check_space()
         return True
 
@@ -200,7 +203,9 @@ def prepare(
     if not config.disparity.is_auto:
         check_tiles(fitted_to_jobs(config), region)
     check_folder(out, overwrite=overwrite)
-    before = _before(out)
+    before: dict[str, Any] = {}  # manifest or report of an earlier run
+    with suppress(StoreError):
+        before = read_manifest(home_of(out)) or read_report(out) or {}
     inputs = describe_inputs(left, right, config, identities(before.get("inputs", {})))
     config, found, local = searched(config, left, lambda: _found(out, before, inputs, find, left, right))
     checked_pair(left, right, config)
@@ -214,14 +219,6 @@ def prepare(
     kept = Store(folder, Grid(region, config.tiles.size), run)
     check_not_replaced(read, [out / name for name in OUTPUTS], [home_of(out)])
     return Job(left, right, config, kept, out, inputs, requested, found, ranges, local, overwrite)
-
-
-def _before(out: Path) -> dict[str, Any]:
-    """Return the manifest of an earlier run in a folder, or its report; empty without both."""
-    try:
-        return read_manifest(home_of(out)) or read_report(out) or {}
-    except StoreError:
-        return {}
 
 
 def _found(
@@ -250,24 +247,12 @@ def origin_of(inputs: Mapping[str, Any]) -> str:
 def remove_tiles(out: Path) -> None:
     """Delete the tiles of the run in a folder, wherever they are, the manifest last."""
     home = home_of(out)
-    try:
-        manifest = read_manifest(home)
-    except StoreError:
-        manifest = None
-    if manifest:
-        Store(place_of(home, manifest), _NO_TILES, "").remove()
+    with suppress(StoreError):
+        if manifest := read_manifest(home):
+            Store(place_of(home, manifest), _NO_TILES, "").remove()
     Store(folder_at(home), _NO_TILES, "").remove()
     (home / MANIFEST).unlink(missing_ok=True)
     folder_at(home).remove_if_empty()
-
-
-def _unusable(store: Store, error: OSError) -> StoreError:
-    """Return the error for a store that cannot be written."""
-    remote = (
-        "check URL and credentials, and pip install the package of its file system ('sat-intervals[remote]' for S3)"
-    )
-    way_out = "make room, check its rights or choose another folder" if store.folder.is_local else remote
-    return StoreError(f"{store.folder} cannot be used: {error.strerror or error}: {way_out}")
 
 
 _version = cache(lambda: version("sat-intervals"))  # reading it takes 2 ms, and each tile compares manifests

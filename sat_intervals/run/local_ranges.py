@@ -24,8 +24,6 @@ from sat_intervals.tiling import Window
 
 # Side of the cells that a raster of ranges is reduced to, in pixels, and rows that are written at a time.
 _CELL, _STRIP = 64, 256
-# Tag of the rasters of `write_ranges`: the image.
-_OF = "RANGES_OF"
 
 
 def searched(config: Config, left: Image, find: Callable[[], Found]) -> tuple[Config, Found | None, LocalRanges | None]:
@@ -53,8 +51,8 @@ def _with_range_of(config: Config, raster: LocalRanges) -> Config:
 
 def write_ranges(path: Path, ranges: LocalRanges, left: Image) -> None:
     """Write local ranges as `read_ranges` reads them: minimum and maximum of each pixel of the left image."""
-    shape, tags = (left.height, left.width), {_OF: left.path, **tag_of_left(identity(left.path))}
-    tags["SOFTWARE"] = "sat-intervals"
+    shape, tags = (left.height, left.width), tag_of_left(identity(left.path))
+    tags |= {"RANGES_OF": left.path, "SOFTWARE": "sat-intervals"}
     with OutputWriter(path.parent, [ranges_file(path.name)], *shape, left.georeferencing, tags) as writer:
         for row in range(0, left.height, _STRIP):
             window = Window(row, 0, min(_STRIP, left.height - row), left.width)

@@ -219,7 +219,9 @@ class _Gauge:
                 assert rows.low is not None  # checked
                 disparity, kept = rows.disparity[inner], rows.validity[inner] & INVALID == 0
                 if rung + cut == 0:
-                    self._count(truth, np.where(kept, disparity, np.nan), parts)
+                    known = np.isfinite(truth)
+                    for counts, chosen in ((self._known, known), (self._good, kept & (abs(disparity - truth) <= 1))):
+                        counts += np.bincount(parts[chosen], minlength=counts.size)
                 kept &= np.isfinite(truth)
                 low, high = kept & rows.low[inner], kept & ~rows.low[inner]
                 for scheme, quantile in enumerate((None, *QUANTILES)):
@@ -231,12 +233,6 @@ class _Gauge:
                     lower, upper = widened(lower, upper, middle, config)
                     tolerance, number = self._subject.tolerance, len(self._tables)
                     self._tables[:, rung + cut, scheme] += measure(lower, upper, true, tolerance, part, number)
-
-    def _count(self, truth: np.ndarray, disparity: np.ndarray, parts: np.ndarray) -> None:
-        known = np.isfinite(truth)
-        good = known & (np.abs(disparity - truth) <= 1)
-        for counts, chosen in ((self._known, known), (self._good, good)):
-            counts += np.bincount(parts[chosen], minlength=counts.size)
 
 
 def _strips(job: Job) -> Iterator[tuple[int, RawRows, int, int, ConfidenceScale]]:

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -76,7 +75,11 @@ def match_pair(
     """
     config, out, seconds = load_config(config), Path(out), dict[str, float]()
     with Connection(config.cluster, out) as connection:
-        find = partial(find_on, connection, seconds, progress)
+
+        def find(left: Image, right: Image) -> Found:
+            with logged_stage(seconds, "start.range"):
+                return search_range(connection, left, right, progress)
+
         with logged_stage(seconds, "start"):
             job = prepare(left, right, out, config, window=window, overwrite=overwrite, find=find)
         with locked(out):
@@ -97,12 +100,6 @@ def complete_before(job: Job) -> dict[str, Any]:
     report = open_run(job.out).report
     _LOG.warning("the run in %s was already complete", job.out)
     return report
-
-
-def find_on(connection: Connection, seconds: dict[str, float], progress: Progress, left: Image, right: Image) -> Found:
-    """Find the search range of a pair on a cluster; see `search_range`. The time is added to ``seconds``."""
-    with logged_stage(seconds, "start.range"):
-        return search_range(connection, left, right, progress)
 
 
 def match_and_assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Progress) -> dict[str, Any]:

@@ -116,24 +116,15 @@ def _work(grid: Grid, whole: Window, config: Config) -> int:
     """Return the pixels visited per SGM sweep, averaged over both: the patch without the rows after its core."""
     if config.tiles.overlap == "exact":
         return _path_pixels(grid.region, grid.region, whole, config)
-    overlap = config.tiles.margin
-    total = 0
-    for row, rows in _kinds(grid.rows, -(-overlap // grid.size)):
-        for column, columns in _kinds(grid.columns, -(-overlap // grid.size)):
-            core = grid.tile(row, column).core
-            patch = core.grown(overlap, overlap).clipped(grid.region)
-            total += rows * columns * (patch.width * (core.height + patch.height) // 2)
-    return total
 
+    def patch(core: Window) -> Window:
+        return core.grown(config.tiles.margin, config.tiles.margin).clipped(grid.region)
 
-def _kinds(count: int, reach: int) -> Iterator[tuple[int, int]]:
-    """Yield places along one axis of the grid and how many are alike: inner ones far from both ends are grouped."""
-    ends = reach + 1
-    if count <= 2 * ends:
-        yield from ((place, 1) for place in range(count))
-    else:
-        yield from ((place, 1) for place in (*range(ends), *range(count - ends, count)))
-        yield ends, count - 2 * ends
+    rows, columns = (
+        [grid.tile(i, 0).core for i in range(grid.rows)],
+        [grid.tile(0, i).core for i in range(grid.columns)],
+    )
+    return sum(core.height + patch(core).height for core in rows) * sum(patch(core).width for core in columns) // 2
 
 
 def _expected(left: Image, right: Image, config: Config, workers: int, grid: Grid) -> tuple[float, float]:

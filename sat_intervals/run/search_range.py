@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -34,19 +34,12 @@ _RETRIES = 2
 _TASK = 500  # bytes of the window and the task of a block
 
 
-class _Block(NamedTuple):
-    """A block of an image at the finest level, and the smallest of its usable pixels."""
-
-    pixels: np.ndarray
-    smallest: float
-
-
-def reduce_block(image: Image, block: Window, step: Step) -> _Block:
-    """Reduce a block of an image; runs on a worker."""
+def reduce_block(image: Image, block: Window, step: Step) -> tuple[np.ndarray, float]:
+    """Return a block of an image at the finest level, and its smallest usable pixel; runs on a worker."""
     with picklable_errors():
         pixels, state = read_window(image, block)
         smallest = pixels.min(where=state == 0, initial=np.inf)
-        return _Block(reduced(pixels, state, step), float(smallest))
+        return reduced(pixels, state, step), float(smallest)
 
 
 def look_at(left: Image, right: Image, sample: Sample) -> Look | None:
@@ -99,10 +92,10 @@ def _reduced(workers: Workers, image: Image, step: Step, progress: Progress) -> 
     ]
     small = np.full((image.height // step.rows, image.width // step.columns), np.nan, np.float32)
     smallest = np.inf
-    for number, found in _results(workers, reduce_block, [(image, each, step) for each in windows], progress):
+    for number, (pixels, least) in _results(workers, reduce_block, [(image, each, step) for each in windows], progress):
         row, column = windows[number].row // step.rows, windows[number].column // step.columns
-        small[row : row + found.pixels.shape[0], column : column + found.pixels.shape[1]] = found.pixels
-        smallest = min(smallest, found.smallest)
+        small[row : row + pixels.shape[0], column : column + pixels.shape[1]] = pixels
+        smallest = min(smallest, least)
     return small, smallest
 
 

@@ -19,6 +19,7 @@ CHECK_EVERY = 2.0  # seconds after which the caller is asked for more tasks, if 
 _FULL_DISK = errno.ENOSPC, errno.EDQUOT
 
 _LOG = logging.getLogger(__name__)
+_turns = cache(BoundedSemaphore)  # one for each number
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,6 @@ def is_remote(settings: Cluster) -> bool:
 def computing(settings: Cluster) -> AbstractContextManager[Any]:
     """Return a context for the kernels of a tile or strip: no more threads are in it at once than without `readers`."""
     return _turns(cores_of_process(settings)) if readers(settings) else nullcontext()
-
-
-@cache
-def _turns(count: int) -> BoundedSemaphore:
-    return BoundedSemaphore(count)
 
 
 def cores_of_process(settings: Cluster) -> int:
