@@ -37,7 +37,7 @@ def read_manifest(home: Path) -> dict[str, Any] | None:
         manifest[PLACE]
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (LookupError, TypeError, ValueError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise StoreError(
             f"{home / MANIFEST} is damaged: start again with --overwrite, or restore it to resume"
         ) from error
