@@ -13,9 +13,7 @@ from sat_intervals.raster.identity import identity
 from sat_intervals.store.manifest import differences
 
 
-def describe_inputs(
-    left: Image, right: Image, config: Config, known: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Any]:
+def describe_inputs(left: Image, right: Image, config: Config, known: Mapping[str, Any]) -> dict[str, Any]:
     """Return what identifies images and weights; see `identity` for ``known``."""
     inputs = {"left": describe(left, known), "right": describe(right, known)}
     if isinstance(config.cost, Mccnn):

@@ -120,10 +120,8 @@ def _work(grid: Grid, whole: Window, config: Config) -> int:
     def patch(core: Window) -> Window:
         return core.grown(config.tiles.margin, config.tiles.margin).clipped(grid.region)
 
-    rows, columns = (
-        [grid.tile(i, 0).core for i in range(grid.rows)],
-        [grid.tile(0, i).core for i in range(grid.columns)],
-    )
+    rows = [grid.tile(row, 0).core for row in range(grid.rows)]
+    columns = [grid.tile(0, column).core for column in range(grid.columns)]
     return sum(core.height + patch(core).height for core in rows) * sum(patch(core).width for core in columns) // 2
 
 

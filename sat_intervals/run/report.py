@@ -60,11 +60,7 @@ def _calibration(config: Config) -> dict[str, Any] | None:
 
 
 def report_of(
-    job: Job,
-    tables: Tables,
-    scale: ConfidenceScale,
-    parts: Iterable[Mapping[str, Any]],
-    seconds: dict[str, float],
+    job: Job, tables: Tables, scale: ConfidenceScale, parts: Iterable[Mapping[str, Any]], seconds: dict[str, float]
 ) -> dict[str, Any]:
     """Return the content of run.json."""
     grid, config, statistics = job.store.grid, job.config, job.statistics()
@@ -72,8 +68,8 @@ def report_of(
     for part in parts:
         tally.merge(part.get("counts", {}))
     counts, quality = tally.report(), quality_of(job, tables.records)
-    for stage in ("read", "match", "write"):
-        seconds[f"tiles.{stage}"] = sum(record["seconds"][stage] for record in tables.records.values())
+    of_tiles = [record["seconds"] for record in tables.records.values()]
+    seconds |= {f"tiles.{stage}": sum(each[stage] for each in of_tiles) for stage in ("read", "match", "write")}
     seconds["total"] = sum(value for stage, value in seconds.items() if "." not in stage)
     return {
         "run": job.name,

@@ -24,13 +24,7 @@ class StoreError(SatIntervalsError):
 
 
 def read_manifest(home: Path) -> dict[str, Any] | None:
-    """Read the manifest in the folder of a run's tiles, None without one.
-
-    Raises
-    ------
-    StoreError
-        It is damaged.
-    """
+    """Read the manifest in the folder of a run's tiles, None without one; raise StoreError if it is damaged."""
     try:
         manifest = json.loads((home / MANIFEST).read_bytes())
         grid_of(manifest)
