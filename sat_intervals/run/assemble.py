@@ -47,7 +47,7 @@ def assemble(job: Job, workers: Workers, seconds: dict[str, float], progress: Pr
         parts = finish_strips(job, workers, scale, progress)
     files, place = run_files(job.config.products.compression), job.left.georeferencing.shifted(region)
     with (
-        _tiles_kept(job),
+        _resumable(job),
         OutputWriter(job.out, files, region.height, region.width, place, tags_of(job.config)) as writer,
     ):
         with logged_stage(seconds, "files"):
@@ -86,7 +86,7 @@ def end_tiles(job: Job, *, keep_tiles: bool) -> None:
 
 
 @contextmanager
-def _tiles_kept(job: Job) -> Iterator[None]:
+def _resumable(job: Job) -> Iterator[None]:
     """Turn an OutputError into a RunError, since the run can be resumed; delete tiles of inputs that have changed."""
     try:
         yield

@@ -133,20 +133,6 @@ def test_batch__goes_on_after_a_failing_pair_and_then_does_only_what_is_missing(
     assert shown.stdout == "".join(f"{tmp_path / 'out' / name}: complete\n" for name in report)
 
 
-def test_match_batch__takes_no_result_of_another_image_for_that_of_a_pair(images, tmp_path):
-    for file in images.glob("*.tif"):
-        shutil.copy(file, tmp_path)
-    pairs = read_batch(rows(tmp_path))
-    match_batch(pairs, tmp_path / "out")
-    scene = make_scene(80, 140, seed=3)
-    write_layer(tmp_path / "left1.tif", scene.left, 0, PLACE)
-    report = match_batch(pairs, tmp_path / "out")
-    assert {name: end["state"] for name, end in report.items()} == {"pair1": "failed", "pair2": "done before"}
-    assert "inputs.left.sha256 was" in report["pair1"]["error"]
-    again = match_batch(pairs, tmp_path / "out", overwrite=True)
-    assert {end["state"] for end in again.values()} == {"done"}
-
-
 def test_match_batch__reads_the_settings_of_all_pairs_once(images, tmp_path, monkeypatch):
     file, prepared = tmp_path / "settings.yaml", batch.prepare
     file.write_text("sgm: {p1: 5}")

@@ -92,20 +92,6 @@ def test_match_pair__subpixel_bounds_in_tiles_equal_those_of_arrays(pair, tmp_pa
         assert "ALPHA" in tags
 
 
-def test_match_pair__another_calibration_does_not_resume_tiles(pair, tmp_path):
-    left, right, settings = pair
-    key = load_config(settings)
-
-    def job(low):
-        interval = {"coverage": 0.9, "calibration": calibration(key, 36, low, 0.9)}
-        return prepare(left, right, tmp_path / "out", in_tiles(settings, 64, interval=interval))
-
-    job(12).begin()
-    with pytest.raises(SatIntervalsError, match="--overwrite"):
-        job(13).begin()
-    job(12).begin()
-
-
 def test_match_pair__warns_of_images_without_texture(pair, tmp_path, caplog):
     left, right, settings = pair
     match_pair(left, right, tmp_path / "textured", settings, window=Window(20, 60, 64, 64))
