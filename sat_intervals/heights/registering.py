@@ -6,10 +6,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from sat_intervals.heights.fusion import cells_of_run
 from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
 from sat_intervals.heights.points import read_points
 from sat_intervals.kernels.registration import REACH, Blocks, sampled
+from sat_intervals.kernels.splat import mean_heights
 from sat_intervals.raster import HeightRaster, Projection
 from sat_intervals.results import Run
 from sat_intervals.tiling import Grid, Tile, Window
@@ -48,7 +48,7 @@ def blocks_of_points(run: Run, places: np.ndarray, projection: Projection, pixel
         x, y, height = places[numbers.ravel() == group][: 4 * _POINTS].T
         cells = Cells.over(Extent(x.min(), y.min(), x.max(), y.max()).grown((REACH + 1) * pixel), pixel)
         window = Window(0, 0, cells.rows, cells.columns)
-        surface = cells_of_run(cloud.splat(cells, window, pixel, threading.Event()), "mean").height
+        surface = mean_heights(cloud.splat(cells, window, pixel, threading.Event()))
         if np.isfinite(surface).any():
             parts.append((*_in_cells(cells, x, y), height))
             surfaces.append(surface)
