@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sat_intervals.evaluate.metrics import Intervals, share
 from sat_intervals.match.histogram import Histogram
 
 # Errors and widths are counted up to this many metres.
@@ -37,9 +38,9 @@ class Accuracy:
 
     def __init__(self, nominal: float | None) -> None:
         self._nominal = nominal
-        self._count = self._bounded = self._inside = 0
-        self._sum = self._squares = self._width = self._missed = 0.0
-        self._errors, self._widths = Histogram(-LARGEST, LARGEST, 1000), Histogram(0, LARGEST, 100)
+        self._count = 0
+        self._sum = self._squares = 0.0
+        self._errors, self._intervals = Histogram(-LARGEST, LARGEST, 1000), Intervals(LARGEST, nominal)
 
     def add(self, errors: Errors) -> None:
         """Add cells."""
@@ -47,36 +48,28 @@ class Accuracy:
         self._sum += float(errors.error.sum())
         self._squares += float(np.square(errors.error).sum())
         self._errors.add(errors.error)
-        bounded = errors.of(np.isfinite(errors.width))
-        self._bounded += bounded.error.size
-        self._inside += int((bounded.missed == 0).sum())
-        self._width += float(bounded.width.sum())
-        self._missed += float(bounded.missed.sum())
-        self._widths.add(bounded.width)
+        bounded = np.isfinite(errors.width)
+        self._intervals.add(errors.missed[bounded], errors.width[bounded])
 
     def report(self) -> dict[str, Any]:
         """Return all figures, None without cells: metres, and shares of cells with an interval."""
         deviation, low, high = self._errors.deviation(), self._errors.quantile(0.05), self._errors.quantile(0.95)
-        median = self._widths.median()
-        is_scored = self._nominal is not None and self._nominal < 1
+        intervals = self._intervals.report()
+        halves = {
+            name: None if (width := intervals[f"{name}_width"]) is None else width / 2 for name in ("mean", "median")
+        }
         return {
             "count": self._count,
-            "bias": _mean(self._sum, self._count),
+            "bias": share(self._sum, self._count),
             "median": self._errors.median(),
             "nmad": None if deviation is None else _NORMAL * deviation,
-            "rmse": None if not self._count else float(np.sqrt(self._squares / self._count)),
+            "rmse": float(np.sqrt(self._squares / self._count)) if self._count else None,
             "le90": self._errors.quantile_of_absolutes(0.9),
             "p95_p5": None if low is None or high is None else high - low,
-            "with_interval": self._bounded,
-            "coverage": _mean(self._inside, self._bounded),
-            "mean_half_width": _mean(self._width / 2, self._bounded),
-            "median_half_width": None if median is None else median / 2,
-            "interval_score": _mean(self._width + 2 / (1 - self._nominal) * self._missed, self._bounded)
-            if is_scored and self._nominal is not None
-            else None,
+            "with_interval": intervals["count"],
+            "coverage": intervals["accuracy"],
+            "mean_half_width": halves["mean"],
+            "median_half_width": halves["median"],
+            "interval_score": intervals["interval_score"],
             "needed_half_width": None if self._nominal is None else self._errors.quantile_of_absolutes(self._nominal),
         }
-
-
-def _mean(total: float, count: int) -> float | None:
-    return total / count if count else None

@@ -19,7 +19,6 @@ from sat_intervals.evaluate.comparison import (
     Comparison,
     check_common,
     compared,
-    moved_by,
     open_comparison,
     registered,
     tiles,
@@ -75,11 +74,11 @@ def calibrate_surface(
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)
     coverage = _checked_coverage(given.surface, tags, coverage)
-    found = registered(given) if registers else None
-    moved = moved_by(given, found and found.report())
+    moved = registered(given) if registers else given
+    is_moved = moved.registration is not None
     sample, cells_of_height = _sample(moved)
-    warnings = [NOT_MOVED] if registers and found is None else []
-    warnings += _datum_warnings(given, sample, moved.shift[2], is_registered=found is not None)
+    warnings = [NOT_MOVED] if registers and not is_moved else []
+    warnings += _datum_warnings(moved, sample)
     sample = sample.of(np.isfinite(sample.width))
     fit = fitted(sample, cells_of_height, coverage)
     if fit is None:
@@ -98,7 +97,7 @@ def calibrate_surface(
         "software": f"sat-intervals {version('sat-intervals')}",
         "surface": str(given.surface),
         "reference": str(given.reference),
-        "shift": None if found is None else [round(float(value), 3) for value in moved.shift],
+        "shift": [round(value, 3) for value in moved.shift] if is_moved else None,
         "before": _figures(sample, sample.lower, sample.upper),
         "expected": _expected(sample, cells_of_height, coverage),
         "warnings": warnings,
@@ -106,7 +105,7 @@ def calibrate_surface(
     return HeightCalibration(
         name=name,
         coverage=coverage,
-        registered=found is not None,
+        registered=is_moved,
         surface=surface_key(tags, given.cell),
         classes=classes,
         provenance=provenance,
@@ -160,9 +159,9 @@ def _part(place: np.ndarray) -> np.ndarray:
     return np.asarray(_BLOCKS * (place - first) // count)
 
 
-def _datum_warnings(given: Comparison, sample: Sample, up: float, *, is_registered: bool) -> list[str]:
+def _datum_warnings(given: Comparison, sample: Sample) -> list[str]:
     """Return a warning if the heights differ by as much as two datums do; raise if the reference was not moved."""
-    median = float(np.median(sample.height - sample.reference)) + up if sample.height.size else None
+    median = float(np.median(sample.height - sample.reference)) + given.shift[2] if sample.height.size else None
     check_common(given, sample.height.size, median)
     if median is None or abs(median) <= _DATUM:
         return []
@@ -170,7 +169,7 @@ def _datum_warnings(given: Comparison, sample: Sample, up: float, *, is_register
         f"heights of {given.surface} and {given.reference} differ by {median:.1f} m in the median, as heights "
         "above a geoid and heights above the ellipsoid do"
     )
-    if is_registered:
+    if given.registration:
         return [f"{line}; the margins do not include it"]
     raise SatIntervalsError(f"{line}: make the surface with --geoid, convert the reference, or leave out --no-register")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import LARGEST
-from sat_intervals.kernels.registration import REACH, Blocks, Registration, register
+from sat_intervals.kernels.registration import REACH, block_side, put_together, register, spread_blocks, thinned
 from sat_intervals.raster import (
     GROUND,
     Georeferencing,
@@ -27,13 +27,13 @@ NOT_MOVED = "the reference was not moved: too few common heights"
 """Warning of a registration that was asked for and not possible."""
 # Heights compared at a time, some hundred bytes each.
 _TILE = 1 << 20
-# Blocks of each side that register, their sides in cells, and points of a block.
-_BLOCKS, _SMALLEST, _LARGEST_BLOCK, _POINTS = 8, 16, 256, 1000
+# Smallest side of the blocks that register, in cells.
+_SMALLEST = 16
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A surface model and its reference, moved by ``shift`` (metres: easting, northing, height).
+    """A surface model and its reference, moved by the shift of ``registration``, see `Registration.report`.
 
     ``resolution`` is the size of the reference's pixels in metres, ``finer`` the number of its heights along a cell.
     """
@@ -44,7 +44,12 @@ class Comparison:
     place: Georeferencing
     resolution: float
     finer: int
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    registration: dict[str, Any] | None = None
+
+    @property
+    def shift(self) -> tuple[float, float, float]:
+        """Return metres that the reference is moved by: easting, northing, height."""
+        return tuple(self.registration["shift"]) if self.registration else (0.0, 0.0, 0.0)
 
     @property
     def cell(self) -> float:
@@ -85,8 +90,10 @@ class Comparison:
         return np.where(wrong, np.nan, heights + up)
 
 
-def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
-    """Open a surface model and its reference."""
+def open_comparison(
+    surface: str | Path, reference: str | Path, registration: dict[str, Any] | None = None
+) -> Comparison:
+    """Open a surface model and its reference, which a registration moves."""
     surface, reference = Path(surface), Path(reference)
     shape, place = read_place(surface)
     if not is_surface(surface):
@@ -96,12 +103,7 @@ def open_comparison(surface: str | Path, reference: str | Path) -> Comparison:
     assert place.pixel_size is not None
     resolution = resolution_of(reference, place)
     finer = max(1, round(place.pixel_size[0] / resolution))
-    return Comparison(surface, reference, shape, place, resolution, finer)
-
-
-def moved_by(given: Comparison, registration: dict[str, Any] | None) -> Comparison:
-    """Return a comparison with the reference moved by the registration of a report."""
-    return given if registration is None else replace(given, shift=tuple(registration["shift"]))
+    return Comparison(surface, reference, shape, place, resolution, finer, registration)
 
 
 def check_common(given: Comparison, count: int, median: float | None) -> None:
@@ -148,29 +150,19 @@ def compared(given: Comparison, window: Window) -> ComparedCells:
     return ComparedCells(height[known], lower[known], upper[known], reference[known], known)
 
 
-def registered(given: Comparison) -> Registration | None:
-    """Return the shift from the reference to the surface; None with too few heights."""
-    part = covered_window(given.reference, given.place, given.shape)
-    side = min(_LARGEST_BLOCK, max(_SMALLEST, min(part.height, part.width) // _BLOCKS))
-    grid = Grid(part, side)
+def registered(given: Comparison) -> Comparison:
+    """Return the comparison with the reference moved to the surface; the same with too few heights for that."""
+    covered = covered_window(given.reference, given.place, given.shape)
+    side = block_side(covered.height, covered.width, _SMALLEST)
     size = side + 2 * (REACH + 1)
-    surfaces: list[np.ndarray] = []
-    parts: list[tuple[np.ndarray, ...]] = []
-    rows, columns = (range(0, count, max(1, -(-count // _BLOCKS))) for count in (grid.rows, grid.columns))
-    for core in (grid.tile(row, column).core for row in rows for column in columns):
+    parts = []
+    for core in spread_blocks(covered, side):
         height = read_layers(given.surface, core)[0].astype(np.float64)
         row, column = np.nonzero(np.isfinite(height))
-        if not row.size:
-            continue
-        chosen = slice(None, None, -(-row.size // _POINTS))
-        row, column = row[chosen], column[chosen]
-        around = Window(core.row - REACH - 1, core.column - REACH - 1, size, size)
-        surface = given.heights(around, smooth=True)
-        if np.isfinite(surface).any():
-            places = (column + REACH + 1.0, row + REACH + 1.0, height[row, column])
-            parts.append((np.full(row.size, len(surfaces)), *places))
-            surfaces.append(surface.astype(np.float32))
-    if not parts:
-        return None
-    block, x, y, heights = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return register(Blocks(np.stack(surfaces), given.cell, block, x, y, heights, 1))
+        if row.size:
+            chosen = thinned(row.size)
+            row, column = row[chosen], column[chosen]
+            surface = given.heights(Window(core.row - REACH - 1, core.column - REACH - 1, size, size), smooth=True)
+            parts.append((surface, column + REACH + 1.0, row + REACH + 1.0, height[row, column]))
+    found = register(put_together(parts, given.cell, moves=1))
+    return given if found is None else replace(given, registration=found.report())

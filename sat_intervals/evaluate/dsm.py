@@ -13,7 +13,6 @@ from sat_intervals.evaluate.comparison import (
     Comparison,
     check_common,
     compared,
-    moved_by,
     open_comparison,
     registered,
     tiles,
@@ -32,37 +31,26 @@ _MOST_CLASSES = 64
 _SAMPLES, _AT_ONCE = 4000, 256
 
 
-def nominal_of(surface: Path) -> float | None:
-    """Return the coverage, or alpha, that the intervals of a surface were made for; None if its runs differ."""
-    tags = read_tags(surface)
-    level = tags.get("COVERAGE", tags.get("ALPHA"))
-    return None if level is None else float(level)
-
-
 def evaluate_surface(
     surface: str | Path, reference: str | Path, classes: str | Path | None = None, *, registers: bool = True
 ) -> dict[str, Any]:
-    """Evaluate the heights and intervals of a surface model.
+    """Evaluate the heights and intervals of a surface model against heights above the same datum, in any CRS.
 
-    The reference has heights above the same datum in any CRS. If it is n times finer than the cells, each cell is
-    compared with n x n heights; else with the one nearest to its centre, or interpolated there if the reference was
-    moved. ``classes`` is a raster of whole numbers, such as land cover. With ``registers`` the reference is moved by
-    its constant shift from the surface first.
+    With ``registers`` the reference is first moved by its constant shift from the surface. If it is n times finer than
+    the cells, each cell is compared with n x n heights; else with the one nearest to its centre, or interpolated there
+    if the reference was moved. ``classes`` is a raster of whole numbers, such as land cover.
 
-    Returns
-    -------
-    For ``all`` heights, by ``slope`` of the reference (degrees), by ``width`` of the interval (metres) and by
-    ``classes``: the figures of `Accuracy.report`. ``before``: those of all heights with the reference in its place.
-    ``from`` and ``to`` are the limits of a class, ``class`` its number. ``registration``, see `Registration.report`;
-    None without, or with too few heights (see ``warnings``). ``nominal``: coverage or alpha of the surface; None if
-    unknown.
+    Returns figures of `Accuracy.report` for ``all`` heights, ``before`` registration, by ``slope`` of the reference
+    (degrees), ``width`` of the interval (metres) and ``classes``; ``registration``, see `Registration.report`;
+    ``nominal``, the level of the intervals, and what it is (``nominal_is``): ``coverage``, ``alpha``, or None.
     """
     given = open_comparison(surface, reference)
-    nominal = nominal_of(given.surface)
+    tags = read_tags(given.surface)
+    nominal_is = next((name for name in ("coverage", "alpha") if name.upper() in tags), None)
+    nominal = float(tags[nominal_is.upper()]) if nominal_is else None
     if classes is not None:
         read_place(Path(classes))
-    found = registered(given) if registers else None
-    moved = moved_by(given, found and found.report())
+    moved = registered(given) if registers else given
     before, whole = Accuracy(nominal), Accuracy(nominal)
     slopes, widths = ([Accuracy(nominal) for _ in ends[1:]] for ends in (SLOPES, WIDTHS))
     kinds: dict[int, Accuracy] = {}
@@ -81,7 +69,7 @@ def evaluate_surface(
     in_place = before.report() if moved is not given else report
     check_common(given, in_place["count"], in_place["median"])
     coverage = report["coverage"]
-    warnings = [NOT_MOVED] if registers and found is None else []
+    warnings = [NOT_MOVED] if registers and moved is given else []
     if nominal and coverage is not None and coverage < _POOR * nominal:
         warnings.append(
             f"the intervals contain {100 * coverage:.0f} % of the reference heights, where {100 * nominal:.0f} % are "
@@ -89,7 +77,8 @@ def evaluate_surface(
         )
     return {
         "nominal": nominal,
-        "registration": found and found.report(),
+        "nominal_is": nominal_is,
+        "registration": moved.registration,
         "warnings": warnings,
         "before": in_place,
         "all": report,

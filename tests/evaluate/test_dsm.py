@@ -100,7 +100,7 @@ def test_evaluate_surface__registers_on_relief_and_says_what_it_moved(tmp_path):
 
 def test_evaluate_surface__registers_a_reference_of_a_small_part_of_the_surface(tmp_path, monkeypatch):
     # Of the blocks of 16 cells every third was tried, and none of them is in the reference.
-    monkeypatch.setattr("sat_intervals.evaluate.comparison._LARGEST_BLOCK", 16)
+    monkeypatch.setattr("sat_intervals.kernels.registration._LARGEST", 16)
     row, column = np.indices((320, 320)).astype(np.float64)
     truth = relief(row, column)
     model = write_surface(tmp_path / "dsm.tif", truth, truth - 0.5, truth + 0.5)

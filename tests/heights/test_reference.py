@@ -20,7 +20,7 @@ from sat_intervals.products import OCCLUSION
 from sat_intervals.raster import Projection, Vertical
 
 with suppress(SatIntervalsError):  # without shareloc all tests here are skipped
-    from sat_intervals.heights.reference import Reference, SensorFiles, make_truth
+    from sat_intervals.heights.reference import Reference, make_truth
     from sat_intervals.heights.triangulate import triangulate
 
 pytestmark = [
@@ -103,7 +103,7 @@ def run_of(folder, height, views=VIEWS):
     disparity = (views[1] - views[0]) * (height - DATUM)
     bands = np.stack([disparity, disparity - 1, disparity + 1, np.ones_like(disparity)]).astype(np.float32)
     out = write_run(folder, bands, np.zeros(disparity.shape, np.uint16))
-    files = SensorFiles(*cameras(folder, ROWS, COLUMNS, views=views))
+    files = cameras(folder, ROWS, COLUMNS, views=views)
     triangulate(out, *files)
     return out, files, disparity
 
