@@ -15,7 +15,6 @@ from sat_intervals.config import HeightCalibration, WidthClass, surface_key
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.comparison import (
-    NOT_MOVED,
     Comparison,
     check_common,
     compared,
@@ -74,10 +73,9 @@ def calibrate_surface(
     given = open_comparison(surface, reference)
     tags = read_tags(given.surface)
     coverage = _checked_coverage(given.surface, tags, coverage)
-    moved = registered(given) if registers else given
+    moved, warnings = registered(given) if registers else (given, [])
     is_moved = moved.registration is not None
     sample, cells_of_height = _sample(moved)
-    warnings = [NOT_MOVED] if registers and not is_moved else []
     warnings += _datum_warnings(moved, sample)
     sample = sample.of(np.isfinite(sample.width))
     fit = fitted(sample, cells_of_height, coverage)

@@ -23,8 +23,6 @@ from sat_intervals.raster import (
 )
 from sat_intervals.tiling import Grid, Window
 
-NOT_MOVED = "the reference was not moved: too few common heights"
-"""Warning of a registration that was asked for and not possible."""
 # Heights compared at a time, some hundred bytes each.
 _TILE = 1 << 20
 # Smallest side of the blocks that register, in cells.
@@ -57,30 +55,20 @@ class Comparison:
         assert self.place.pixel_size is not None
         return self.place.pixel_size[0]
 
-    def heights(
-        self, window: Window, finer: int = 1, *, smooth: bool = False, needed: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Read the moved reference in a window of cells, which may reach beyond the surface, ``finer`` per side."""
-        shape = finer * window.height, finer * window.width
-        smooth = smooth or self.shift[:2] != (0.0, 0.0)
-        return self.heights_at(self.place.shifted(window), shape, finer, smooth=smooth, needed=needed)
+    def cells(self, window: Window, finer: int = 1) -> tuple[Georeferencing, tuple[int, int]]:
+        """Return place and shape of a window of cells, perhaps beyond the surface, with ``finer`` per side of each."""
+        return self.place.shifted(window).refined(finer), (finer * window.height, finer * window.width)
 
-    def heights_at(
-        self,
-        place: Georeferencing,
-        shape: tuple[int, int],
-        finer: int = 1,
-        *,
-        smooth: bool = False,
-        needed: np.ndarray | None = None,
+    def heights(
+        self, place: Georeferencing, shape: tuple[int, int], *, smooth: bool = False, needed: np.ndarray | None = None
     ) -> np.ndarray:
-        """Read the moved reference in ``shape`` cells at a place, ``finer`` of them along each side of its cells.
+        """Read the moved reference at the centres of ``shape`` cells; if ``smooth`` or moved sideways, interpolate.
 
         Heights that no ground has are NaN, and errors where they are ``needed``: undeclared no data, or another unit.
         """
         east, north, up = self.shift
-        cells = place.moved(-east, -north).refined(finer)
-        heights = read_heights(self.reference, cells, shape, Window(0, 0, *shape), smooth=smooth)
+        cells, whole, is_between = place.moved(-east, -north), Window(0, 0, *shape), (east, north) != (0.0, 0.0)
+        heights = read_heights(self.reference, cells, shape, whole, smooth=smooth or is_between)
         wrong = (heights < GROUND[0]) | (heights > GROUND[1])
         if needed is not None and (found := heights[wrong & needed]).size:
             raise SatIntervalsError(
@@ -145,13 +133,13 @@ def compared(given: Comparison, window: Window) -> ComparedCells:
         np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
         for band in read_layers(given.surface, window)[:3].astype(np.float64)
     )
-    reference = given.heights(window, finer, needed=np.isfinite(height))
+    reference = given.heights(*given.cells(window, finer), needed=np.isfinite(height))
     known = np.isfinite(reference) & np.isfinite(height)
     return ComparedCells(height[known], lower[known], upper[known], reference[known], known)
 
 
-def registered(given: Comparison) -> Comparison:
-    """Return the comparison with the reference moved to the surface; the same with too few heights for that."""
+def registered(given: Comparison) -> tuple[Comparison, list[str]]:
+    """Return the comparison with the reference moved to the surface; the same and a warning with too few heights."""
     covered = covered_window(given.reference, given.place, given.shape)
     side = block_side(covered.height, covered.width, _SMALLEST)
     size = side + 2 * (REACH + 1)
@@ -162,7 +150,10 @@ def registered(given: Comparison) -> Comparison:
         if row.size:
             chosen = thinned(row.size)
             row, column = row[chosen], column[chosen]
-            surface = given.heights(Window(core.row - REACH - 1, core.column - REACH - 1, size, size), smooth=True)
+            around = Window(core.row - REACH - 1, core.column - REACH - 1, size, size)
+            surface = given.heights(*given.cells(around), smooth=True)
             parts.append((surface, column + REACH + 1.0, row + REACH + 1.0, height[row, column]))
     found = register(put_together(parts, given.cell, moves=1))
-    return given if found is None else replace(given, registration=found.report())
+    if found is None:
+        return given, ["the reference was not moved: too few common heights"]
+    return replace(given, registration=found.report()), []

@@ -10,7 +10,7 @@ import numpy as np
 
 from sat_intervals.config import Config, Regularization
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.metrics import Criteria, Evaluated, Metrics
+from sat_intervals.evaluate.metrics import Criteria, Metrics
 from sat_intervals.kernels.areas import area_maximum
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.match.histogram import bias_histogram
@@ -102,9 +102,9 @@ def evaluate(
     for rows, first, last in with_halo(strips(), criteria.depth):
         chosen = rows.known & rows.valid
         is_whole = is_whole and bool((rows.truth[chosen] % 1 == 0).all())
-        kept.add(_evaluated(rows, chosen, first, last, criteria))
+        kept.add(*_evaluated(rows, chosen, first, last, criteria))
         if with_rejected:
-            written.add(_evaluated(rows, rows.known, first, last, criteria))
+            written.add(*_evaluated(rows, rows.known, first, last, criteria))
     report = kept.report()
     return {
         **report,
@@ -125,8 +125,10 @@ def _median_bias(strips: Iterable[Bands]) -> float:
     return histogram.median() or 0.0
 
 
-def _evaluated(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Criteria) -> Evaluated:
-    """Return the chosen pixels of rows ``[first, last)``; the other rows complete their low-confidence areas."""
+def _evaluated(
+    rows: Bands, chosen: np.ndarray, first: int, last: int, criteria: Criteria
+) -> tuple[Bands, np.ndarray, np.ndarray]:
+    """Return the chosen pixels of rows ``[first, last)``, see `Metrics.add`; the other rows complete their areas."""
     truth = rows.truth.astype(np.float64) + criteria.bias
     low = low_confidence(rows.confidence, criteria.threshold, criteria.kernel)
     error = np.where(chosen, np.abs(truth - rows.disparity), np.nan)
@@ -135,7 +137,7 @@ def _evaluated(rows: Bands, chosen: np.ndarray, first: int, last: int, criteria:
     chosen = chosen[inner]
     disparity, lower, upper, confidence = (band[inner][chosen].astype(np.float64) for band in rows[:4])
     pixels = Bands(disparity, lower, upper, confidence, rows.validity[inner][chosen], truth[inner][chosen])
-    return Evaluated(pixels, low[inner][chosen], area_error[inner][chosen])
+    return pixels, low[inner][chosen], area_error[inner][chosen]
 
 
 def _read_strips(run: Run, truth: Layer, mask: Layer | None) -> Iterator[Bands]:

@@ -4,7 +4,7 @@ Medians come from histograms with these steps: widths 0.01, overestimation 0.001
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -32,18 +32,6 @@ class Criteria:
     tolerance: float = 0.0
     bias: float = 0.0
     nominal: float | None = None
-
-
-class Evaluated(NamedTuple):
-    """Pixels with an interval and a known truth, one element per pixel; bands are float64 but the flags.
-
-    ``low`` is low confidence (paper eq. 13), ``area_error`` the largest ``|truth - disparity|`` over the evaluated
-    pixels of its area, NaN if not low.
-    """
-
-    bands: Bands
-    low: np.ndarray
-    area_error: np.ndarray
 
 
 class Intervals:
@@ -120,18 +108,21 @@ class Metrics:
         self._deciles = _Deciles()
         self._wrong = {"bad1": 0, "bad3": 0, "truth_outside_range": 0}
 
-    def add(self, pixels: Evaluated) -> None:
-        """Add pixels."""
-        disparity, lower, upper, confidence, _, truth, _ = pixels.bands
-        low, criteria = pixels.low, self._criteria
-        inside = (lower - criteria.tolerance <= truth) & (truth <= upper + criteria.tolerance)
-        outside = np.maximum(lower - criteria.tolerance - truth, truth - upper - criteria.tolerance)
-        missed = np.where(inside, 0.0, outside)
-        width = upper - lower
+    def add(self, bands: Bands, low: np.ndarray, area_error: np.ndarray) -> None:
+        """Add pixels with an interval and a known truth: bands of one float64 per pixel.
+
+        ``low`` is low confidence (paper eq. 13), ``area_error`` the largest ``|truth - disparity|`` over the evaluated
+        pixels of its area, NaN if not low.
+        """
+        disparity, lower, upper, confidence, _, truth, _ = bands
+        criteria = self._criteria
+        lowest, highest, width = lower - criteria.tolerance, upper + criteria.tolerance, upper - lower
+        inside = (lowest <= truth) & (truth <= highest)
+        missed = np.where(inside, 0.0, np.maximum(lowest - truth, truth - highest))
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
             self._areas[name].add(missed[chosen], width[chosen])
         wide = low & (width > 0)
-        self._ratios.add(pixels.area_error[wide] / width[wide])
+        self._ratios.add(area_error[wide] / width[wide])
         self._deciles.add(confidence, inside, width)
         error = np.abs(disparity - truth)
         self._wrong["bad1"] += int((error > 1).sum())

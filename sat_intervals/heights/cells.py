@@ -4,7 +4,7 @@ import math
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,24 +26,20 @@ _STEPS, _WIDEST = 50, 1000
 WIDE = 20.0
 
 
-class Strip(NamedTuple):
-    """Bands of SURFACE ``(6, rows, columns)``, and the number of cells left out as poor."""
-
-    bands: np.ndarray
-    poor: int
-
-
 def strips(
     threads: ThreadPoolExecutor, clouds: Sequence[PointCloud], cells: Cells, radius: float, choices: SurfaceChoices
-) -> Iterator[tuple[int, Strip]]:
-    """Yield first row and content of full-width strips from the top; an error stops the running tiles."""
+) -> Iterator[tuple[int, np.ndarray, int]]:
+    """Yield full-width strips from the top: first row, bands of SURFACE ``(6, rows, columns)``, number of poor cells.
+
+    An error stops the running tiles.
+    """
     ended = threading.Event()
 
-    def tile(window: Window) -> Strip:
+    def tile(window: Window) -> tuple[np.ndarray, int]:
         bands = fused([cloud.splat(cells, window, radius, ended) for cloud in clouds])
         if choices.calibration is not None:
             calibrate(bands, choices.calibration)
-        return Strip(bands, without_poor_cells(bands, choices.max_width, choices.min_confidence))
+        return bands, without_poor_cells(bands, choices.max_width, choices.min_confidence)
 
     rows, columns = min(_TILE_ROWS, max(_LOWEST, _STRIP_CELLS // cells.columns)), _TILE_COLUMNS
     if choices.bounds == "median":
@@ -57,11 +53,11 @@ def strips(
             for column in range(0, cells.columns, columns)
         )
         try:
-            tiles = list(threads.map(tile, windows))
+            bands, poor = zip(*threads.map(tile, windows), strict=True)
         except BaseException:
             ended.set()
             raise
-        yield row, Strip(np.concatenate([part.bands for part in tiles], axis=2), sum(part.poor for part in tiles))
+        yield row, np.concatenate(bands, axis=2), sum(poor)
 
 
 def _smaller(rows: int, columns: int, cells: float) -> tuple[int, int]:
@@ -78,12 +74,12 @@ class Tally:
         self._poor = self._filled = self._shared = self._disagreeing = self._bounded = self._wide = 0
         self._widths = Histogram(0, _WIDEST, _STEPS)
 
-    def add(self, strip: Strip) -> None:
-        """Add cells."""
-        height, lower, upper, *_, agreement = strip.bands
+    def add(self, bands: np.ndarray, poor: int) -> None:
+        """Add cells, and the number of those left out as poor."""
+        height, lower, upper, *_, agreement = bands
         width = upper - lower
         width = width[np.isfinite(width)]
-        self._poor += strip.poor
+        self._poor += poor
         self._filled += int(np.isfinite(height).sum())
         self._shared += int(np.isfinite(agreement).sum())
         self._disagreeing += int((agreement == 0).sum())

@@ -63,12 +63,13 @@ def calibrate(bands: np.ndarray, calibration: HeightCalibration) -> None:
 
 def without_poor_cells(bands: np.ndarray, max_width: float | None, min_confidence: float | None) -> int:
     """Set the cells of wider intervals or lower confidence to NaN, in place; return their number."""
-    band = dict(zip((band.name for band in SURFACE), bands, strict=True))
-    poor = np.zeros(bands.shape[1:], np.bool_)
+    height, lower, upper, _, confidence, _ = bands
+    poor = np.zeros(height.shape, np.bool_)
     if max_width is not None:
-        poor |= np.isfinite(band["height"]) & ~(band["height_upper"] - band["height_lower"] <= max_width)
+        poor |= ~(upper - lower <= max_width)
     if min_confidence is not None:
-        poor |= np.isfinite(band["height"]) & ~(band["confidence"] >= min_confidence)
+        poor |= ~(confidence >= min_confidence)
+    poor &= np.isfinite(height)
     bands[:, poor] = np.nan
     return int(poor.sum())
 

@@ -77,11 +77,11 @@ class PointCloud:
     because their interval is open at an end of the search range.
     """
 
-    def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices | None = None) -> None:
+    def __init__(self, run: Run, projection: Projection, choices: SurfaceChoices) -> None:
         self.run = run
         self._path = run.out / "points.tif"
         self._projection = projection
-        self._choices = choices or SurfaceChoices().for_intervals([run.config.interval])
+        self._choices = choices
         self._extents: list[tuple[Window, Extent]] = []
         self.points = self.outliers = self.open = 0
         for tile in Grid(Window(0, 0, *run.shape), WINDOW):

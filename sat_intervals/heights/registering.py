@@ -4,6 +4,7 @@ import threading
 
 import numpy as np
 
+from sat_intervals.heights.choices import SurfaceChoices
 from sat_intervals.heights.point_cloud import Cells, Extent, PointCloud
 from sat_intervals.heights.points import read_points
 from sat_intervals.kernels.registration import (
@@ -43,7 +44,8 @@ def blocks_of_raster(run: Run, raster: HeightRaster, projection: Projection, pix
 
 def blocks_of_points(run: Run, places: np.ndarray, projection: Projection, pixel: float) -> Blocks | None:
     """Return points, ``(n, 3)`` on the map and above the ellipsoid, on surfaces of a run; None without a point."""
-    cloud, side = PointCloud(run, projection), block_side(*run.shape, _SMALLEST) * pixel
+    cloud = PointCloud(run, projection, SurfaceChoices("envelope").for_intervals([run.config.interval]))
+    side = block_side(*run.shape, _SMALLEST) * pixel
     groups, numbers = np.unique(np.floor(places[:, :2] / side), axis=0, return_inverse=True)
     counts = np.bincount(numbers.ravel(), minlength=len(groups))
     parts = []

@@ -367,7 +367,7 @@ def test_make_surface__refuses_a_radius_of_many_cells(tmp_path):
 
 def test_make_surface__ends_at_once_when_it_is_interrupted(tmp_path, monkeypatch):
     out = write_points(tmp_path / "a", [0.5] * 20, [-0.5] * 20, [10.0] * 20)
-    cloud = PointCloud(open_run(out), Projection("EPSG:32631"))
+    cloud = PointCloud(open_run(out), Projection("EPSG:32631"), SurfaceChoices("envelope", keeps_open=True))
     ended = threading.Event()
     ended.set()
     cells = Cells.over(cloud.extent, 1.0)
