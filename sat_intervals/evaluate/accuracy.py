@@ -18,19 +18,27 @@ LARGEST = 500
 _NORMAL = 1.4826
 
 
-class Errors(NamedTuple):
-    """Errors (height - reference), interval widths, and distances of a missed reference from the interval, in metres.
+class Heights(NamedTuple):
+    """Heights of cells, their bounds, and reference heights: ``(n,)`` metres; NaN bounds without an interval."""
 
-    Widths and distances are NaN without an interval.
-    """
+    height: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    reference: np.ndarray
 
-    error: np.ndarray
-    width: np.ndarray
-    missed: np.ndarray
+    @property
+    def width(self) -> np.ndarray:
+        """Return the widths of the intervals."""
+        return np.asarray(self.upper - self.lower)
 
-    def of(self, chosen: np.ndarray) -> "Errors":
+    @property
+    def outside(self) -> np.ndarray:
+        """Return how far the reference is outside the intervals, negative inside."""
+        return np.asarray(np.maximum(self.lower - self.reference, self.reference - self.upper))
+
+    def of(self, chosen: np.ndarray) -> "Heights":
         """Return a part."""
-        return Errors(*(values[chosen] for values in self))
+        return Heights(*(values[chosen] for values in self))
 
 
 class Accuracy:
@@ -42,14 +50,15 @@ class Accuracy:
         self._sum = self._squares = 0.0
         self._errors, self._intervals = Histogram(-LARGEST, LARGEST, 1000), Intervals(LARGEST, nominal)
 
-    def add(self, errors: Errors) -> None:
+    def add(self, cells: Heights) -> None:
         """Add cells."""
-        self._count += errors.error.size
-        self._sum += float(errors.error.sum())
-        self._squares += float(np.square(errors.error).sum())
-        self._errors.add(errors.error)
-        bounded = np.isfinite(errors.width)
-        self._intervals.add(errors.missed[bounded], errors.width[bounded])
+        error = cells.height - cells.reference
+        self._count += error.size
+        self._sum += float(error.sum())
+        self._squares += float(np.square(error).sum())
+        self._errors.add(error)
+        bounded = cells.of(np.isfinite(cells.width))
+        self._intervals.add(np.maximum(bounded.outside, 0), bounded.width)
 
     def report(self) -> dict[str, Any]:
         """Return all figures, None without cells: metres, and shares of cells with an interval."""

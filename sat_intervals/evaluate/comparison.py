@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import LARGEST
+from sat_intervals.evaluate.accuracy import LARGEST, Heights
 from sat_intervals.kernels.registration import REACH, block_side, put_together, register, spread_blocks, thinned
 from sat_intervals.raster import (
     GROUND,
@@ -113,21 +113,8 @@ def tiles(given: Comparison) -> Iterator[Window]:
     return (tile.core for tile in Grid(Window(0, 0, *given.shape), side))
 
 
-class ComparedCells(NamedTuple):
-    """Heights of a tile that both surface and reference have, ``(n,)`` metres; NaN bounds without an interval.
-
-    A cell counts once for each reference height; ``known`` is the mask of those of the tile.
-    """
-
-    height: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    reference: np.ndarray
-    known: np.ndarray
-
-
-def compared(given: Comparison, window: Window) -> ComparedCells:
-    """Read the cells of a tile and the reference there."""
+def compared(given: Comparison, window: Window) -> tuple[Heights, np.ndarray]:
+    """Read the cells of a tile that both have a height, once for each reference height; and the mask of these."""
     finer = given.finer
     height, lower, upper = (
         np.repeat(np.repeat(band, finer, axis=0), finer, axis=1)
@@ -135,7 +122,7 @@ def compared(given: Comparison, window: Window) -> ComparedCells:
     )
     reference = given.heights(*given.cells(window, finer), needed=np.isfinite(height))
     known = np.isfinite(reference) & np.isfinite(height)
-    return ComparedCells(height[known], lower[known], upper[known], reference[known], known)
+    return Heights(height, lower, upper, reference).of(known), known
 
 
 def registered(given: Comparison) -> tuple[Comparison, list[str]]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.evaluate.accuracy import Accuracy, Errors
+from sat_intervals.evaluate.accuracy import Accuracy, Heights
 from sat_intervals.evaluate.comparison import (
     Comparison,
     check_common,
@@ -37,9 +37,9 @@ class _Ranges:
     def __init__(self, limits: tuple[float, ...], nominal: float | None) -> None:
         self._kinds = {ends: Accuracy(nominal) for ends in pairwise(limits)}
 
-    def add(self, errors: Errors, values: np.ndarray) -> None:
+    def add(self, cells: Heights, values: np.ndarray) -> None:
         for (first, last), kind in self._kinds.items():
-            kind.add(errors.of((first <= values) & (values < last)))
+            kind.add(cells.of((first <= values) & (values < last)))
 
     def report(self) -> list[dict[str, Any]]:
         return [
@@ -72,15 +72,15 @@ def evaluate_surface(
     slopes, widths = _Ranges(SLOPES, nominal), _Ranges(WIDTHS, nominal)
     kinds: dict[int, Accuracy] = {}
     for window in tiles(given):
-        errors, known = _errors(moved, window)
-        whole.add(errors)
-        slopes.add(errors, _slope(moved, window)[known])
-        widths.add(errors, errors.width)
+        cells, known = compared(moved, window)
+        whole.add(cells)
+        slopes.add(cells, _slope(moved, window)[known])
+        widths.add(cells, cells.width)
         if classes is not None:
             for number, chosen in _classes(given, Path(classes), window, known):
-                kinds.setdefault(number, Accuracy(nominal)).add(errors.of(chosen))
+                kinds.setdefault(number, Accuracy(nominal)).add(cells.of(chosen))
         if moved is not given:
-            before.add(_errors(given, window)[0])
+            before.add(compared(given, window)[0])
     report = whole.report()
     in_place = before.report() if moved is not given else report
     check_common(given, in_place["count"], in_place["median"])
@@ -101,13 +101,6 @@ def evaluate_surface(
         "width": widths.report(),
         "classes": [{"class": number, **kinds[number].report()} for number in sorted(kinds)],
     }
-
-
-def _errors(given: Comparison, window: Window) -> tuple[Errors, np.ndarray]:
-    """Return the errors of a tile, and which heights of the tile they are."""
-    height, lower, upper, reference, known = compared(given, window)
-    missed = np.maximum(np.maximum(lower - reference, reference - upper), 0)
-    return Errors(height - reference, upper - lower, missed), known
 
 
 def _slope(given: Comparison, window: Window) -> np.ndarray:
