@@ -15,14 +15,7 @@ from sat_intervals.config import HeightCalibration, WidthClass, surface_key
 from sat_intervals.config.calibration import COVERAGES
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import Heights
-from sat_intervals.evaluate.comparison import (
-    Comparison,
-    check_common,
-    compared,
-    open_comparison,
-    registered,
-    tiles,
-)
+from sat_intervals.evaluate.comparison import Comparison, check_common, compared, open_comparison, registered, tiles
 from sat_intervals.kernels.conformal import least_number, margins, widened
 from sat_intervals.raster import read_tags
 

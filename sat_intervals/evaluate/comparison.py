@@ -9,7 +9,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import LARGEST, Heights
-from sat_intervals.kernels.registration import REACH, block_side, put_together, register, spread_blocks, thinned
+from sat_intervals.kernels.registration import REACH, every_nth, put_together, register, spread_blocks
 from sat_intervals.raster import (
     GROUND,
     Georeferencing,
@@ -127,18 +127,14 @@ def compared(given: Comparison, window: Window) -> tuple[Heights, np.ndarray]:
 
 def registered(given: Comparison) -> tuple[Comparison, list[str]]:
     """Return the comparison with the reference moved to the surface; the same and a warning with too few heights."""
-    covered = covered_window(given.reference, given.place, given.shape)
-    side = block_side(covered.height, covered.width, _SMALLEST)
-    size = side + 2 * (REACH + 1)
     parts = []
-    for core in spread_blocks(covered, side):
+    for core in spread_blocks(covered_window(given.reference, given.place, given.shape), _SMALLEST):
         height = read_layers(given.surface, core)[0].astype(np.float64)
         row, column = np.nonzero(np.isfinite(height))
         if row.size:
-            chosen = thinned(row.size)
+            chosen = every_nth(row.size)
             row, column = row[chosen], column[chosen]
-            around = Window(core.row - REACH - 1, core.column - REACH - 1, size, size)
-            surface = given.heights(*given.cells(around), smooth=True)
+            surface = given.heights(*given.cells(core.grown(REACH + 1, REACH + 1)), smooth=True)
             parts.append((surface, column + REACH + 1.0, row + REACH + 1.0, height[row, column]))
     found = register(put_together(parts, given.cell, moves=1))
     if found is None:

@@ -9,14 +9,7 @@ import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.accuracy import Accuracy, Heights
-from sat_intervals.evaluate.comparison import (
-    Comparison,
-    check_common,
-    compared,
-    open_comparison,
-    registered,
-    tiles,
-)
+from sat_intervals.evaluate.comparison import Comparison, check_common, compared, open_comparison, registered, tiles
 from sat_intervals.raster import read_heights, read_layers, read_place, read_small_layers, read_tags
 from sat_intervals.tiling import Window
 

@@ -117,13 +117,12 @@ class Metrics:
         disparity, lower, upper, confidence, _, truth, _ = bands
         criteria = self._criteria
         lowest, highest, width = lower - criteria.tolerance, upper + criteria.tolerance, upper - lower
-        inside = (lowest <= truth) & (truth <= highest)
-        missed = np.where(inside, 0.0, np.maximum(lowest - truth, truth - highest))
+        missed = np.maximum(np.maximum(lowest - truth, truth - highest), 0)
         for name, chosen in (("all", np.ones_like(low)), ("high", ~low), ("low", low)):
             self._areas[name].add(missed[chosen], width[chosen])
         wide = low & (width > 0)
         self._ratios.add(area_error[wide] / width[wide])
-        self._deciles.add(confidence, inside, width)
+        self._deciles.add(confidence, missed == 0, width)
         error = np.abs(disparity - truth)
         self._wrong["bad1"] += int((error > 1).sum())
         self._wrong["bad3"] += int((error > 3).sum())

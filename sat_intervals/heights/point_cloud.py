@@ -31,12 +31,8 @@ class Extent(NamedTuple):
 
     def intersects(self, other: "Extent") -> bool:
         """Return whether both share a point."""
-        return (
-            self.left <= other.right
-            and other.left <= self.right
-            and self.bottom <= other.top
-            and other.bottom <= self.top
-        )
+        meets = max(self.left, other.left) <= min(self.right, other.right)
+        return meets and max(self.bottom, other.bottom) <= min(self.top, other.top)
 
     def grown(self, margin: float) -> "Extent":
         """Return the rectangle grown by a margin on all sides."""

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,23 +21,15 @@ _STEEPEST = 70.0
 _MARGIN = 3
 
 
-class Shift(NamedTuple):
-    """Metres from the reference to the run: easting, northing, height."""
-
-    east: float = 0.0
-    north: float = 0.0
-    up: float = 0.0
-
-
 class _FarError(Exception):
     """Raised when the lattice must cover more disparities; holds the new minimum and maximum."""
 
 
 class RasterSight:
-    """Disparities of a raster of heights, moved by ``shift`` on the map of a projection, strip by strip.
+    """Disparities of a raster of heights, strip by strip.
 
     ``lattice_of`` returns the `Lattice` of a run over disparities from the first to the second; those of ``search`` are
-    tried first.
+    tried first. ``shift`` moves the raster on the map of ``projection``: easting, northing, height in metres.
     """
 
     def __init__(
@@ -46,7 +37,7 @@ class RasterSight:
         lattice_of: Callable[[int, int], Lattice],
         raster: HeightRaster,
         projection: Projection,
-        shift: Shift,
+        shift: np.ndarray,
         search: tuple[int, int],
     ) -> None:
         self._lattice_of, self._raster, self._projection, self._shift = lattice_of, raster, projection, shift
@@ -86,8 +77,9 @@ class RasterSight:
         nodes, (row, column, disparity) = self._lattice.nodes(window)
         longitude, latitude, height = (nodes[..., index] for index in range(3))
         x, y = self._projection.place(longitude, latitude)
-        longitude, latitude = self._projection.degrees(x - self._shift.east, y - self._shift.north)
-        sights = np.stack(self._raster.positions(longitude, latitude, height - self._shift.up), axis=-1)
+        east, north, up = self._shift
+        longitude, latitude = self._projection.degrees(x - east, y - north)
+        sights = np.stack(self._raster.positions(longitude, latitude, height - up), axis=-1)
         row_step, column_step, step = self._lattice.spacing
         if np.nanmedian(height[:, :, -1] - height[:, :, 0]) > 0:
             sights, disparity, step = sights[:, :, ::-1], disparity + step * (nodes.shape[2] - 1), -step

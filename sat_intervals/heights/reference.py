@@ -17,20 +17,12 @@ from sat_intervals.heights.location import GroundLattice, Location
 from sat_intervals.heights.point_files import PointFile
 from sat_intervals.heights.point_sight import PointSight
 from sat_intervals.heights.points import point_near_the_middle, read_points, triangulated
-from sat_intervals.heights.raster_sight import RasterSight, Shift
+from sat_intervals.heights.raster_sight import RasterSight
 from sat_intervals.heights.registering import blocks_of_points, blocks_of_raster
 from sat_intervals.heights.sensors import Lattice, Sensors
 from sat_intervals.kernels.registration import LEAST, Registration, register
 from sat_intervals.progress import Progress
-from sat_intervals.raster import (
-    HeightRaster,
-    OutputWriter,
-    Projection,
-    Vertical,
-    read_layers,
-    truth_file,
-    utm_of,
-)
+from sat_intervals.raster import HeightRaster, OutputWriter, Projection, Vertical, read_layers, truth_file, utm_of
 from sat_intervals.raster.published import tag_of_left
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
@@ -83,7 +75,7 @@ def make_truth(
         triangulated([run.out])
     work = _Work(run, Sensors.load(*sensor_files, left=run.left_georeferencing), reference)
     found = work.registration(progress) if registers else None
-    shift = Shift() if found is None else Shift(*map(float, found.shift))
+    shift = np.zeros(3) if found is None else found.shift
     tags = {
         "RUN": run.report["finished"],
         "REFERENCE": str(reference.path),
@@ -115,10 +107,8 @@ class _Work:
         search, region = run.config.disparity, run.region
         self._search = search.minimum, search.maximum
         self._location = Location(sensors)
-        rows, columns = (
-            np.linspace(first, first + size - 1, _CHECKED)
-            for first, size in ((region.row, region.height), (region.column, region.width))
-        )
+        rows = np.linspace(region.row, region.row_stop - 1, _CHECKED)
+        columns = np.linspace(region.column, region.column_stop - 1, _CHECKED)
         row, column, disparity = (axis.ravel() for axis in np.meshgrid(rows, columns, self._search, indexing="ij"))
         ground = sensors.triangulate(row, column, disparity)
         seen = self._location.positions(*ground[:, :3].T)
@@ -203,21 +193,20 @@ class _Work:
                 kept, keys = kept[least], keys[least]
         return kept
 
-    def strips(self, shift: Shift, file: BinaryIO, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
+    def strips(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the first row and the true disparities of strips from the top; points are kept in an empty file."""
-        height = self.run.shape[0]
-        right_width = self.run.report["inputs"]["right"]["width"]
         if isinstance(self._heights, HeightRaster):
+            right_width = self.run.report["inputs"]["right"]["width"]
             lattice_of = partial(Lattice, self._sensors, self.run.region, right_width)
             sight = RasterSight(lattice_of, self._heights, self._projection, shift, self._search)
             strips = sight.strips(self._pixel)
         else:
             strips = self._points_seen(shift, file, progress).strips()
         for row, strip in strips:
-            progress("truth", row + len(strip), height)
+            progress("truth", row + len(strip), self.run.region.height)
             yield row, strip
 
-    def _points_seen(self, shift: Shift, file: BinaryIO, progress: Progress) -> PointSight:
+    def _points_seen(self, shift: np.ndarray, file: BinaryIO, progress: Progress) -> PointSight:
         sight = PointSight(file, self.run.region, self._rise)
         lattice = self._lattice(shift, progress)
         if lattice is not None:
@@ -226,12 +215,12 @@ class _Work:
                 sight.add(row, column, right - column)
         return sight
 
-    def _lattice(self, shift: Shift, progress: Progress) -> GroundLattice | None:
+    def _lattice(self, shift: np.ndarray, progress: Progress) -> GroundLattice | None:
         """Return the lattice around all points near the run; None without a point."""
         lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
         for part in self._near(progress):
-            if len(part):
-                lowest, highest = np.minimum(lowest, part.min(axis=0)), np.maximum(highest, part.max(axis=0))
+            lowest = np.minimum(lowest, part.min(axis=0, initial=np.inf))
+            highest = np.maximum(highest, part.max(axis=0, initial=-np.inf))
         if not np.isfinite(lowest).all():
             return None
         return GroundLattice(self._location, self._projection, lowest + shift, highest + shift, self._pixel)

@@ -13,10 +13,10 @@ from sat_intervals.kernels.registration import (
     REACH,
     Blocks,
     block_side,
+    every_nth,
     put_together,
     sampled,
     spread_blocks,
-    thinned,
 )
 from sat_intervals.kernels.splat import mean_heights
 from sat_intervals.raster import HeightRaster, Projection
@@ -31,11 +31,11 @@ def blocks_of_raster(run: Run, raster: HeightRaster, projection: Projection, pix
     """Return points of a run on surfaces of a raster; None if nothing is common. ``pixel`` is metres on the ground."""
     cell = max(pixel, raster.cell)
     parts = []
-    for window in spread_blocks(Window(0, 0, *run.shape), block_side(*run.shape, _SMALLEST)):
+    for window in spread_blocks(Window(0, 0, *run.shape), _SMALLEST):
         bands, known = read_points(run.out / "points.tif", window)
         longitude, latitude, height = (band[known] for band in bands[:3])
         if longitude.size:
-            chosen = thinned(longitude.size)
+            chosen = every_nth(longitude.size)
             x, y = projection.place(longitude[chosen], latitude[chosen])
             cells = _around(x, y, cell)
             parts.append((_on_cells(raster, projection, cells), *_in_cells(cells, x, y), height[chosen]))

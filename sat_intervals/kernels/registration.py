@@ -66,14 +66,14 @@ def block_side(height: int, width: int, smallest: int) -> int:
     return min(_LARGEST, max(smallest, min(height, width) // ACROSS))
 
 
-def spread_blocks(region: Window, side: int) -> list[Window]:
+def spread_blocks(region: Window, smallest: int) -> list[Window]:
     """Return blocks of a region, spread evenly, about `ACROSS` along each side."""
-    grid = Grid(region, side)
+    grid = Grid(region, block_side(region.height, region.width, smallest))
     rows, columns = (range(0, count, max(1, math.ceil(count / ACROSS))) for count in (grid.rows, grid.columns))
     return [grid.tile(row, column).core for row in rows for column in columns]
 
 
-def thinned(count: int) -> slice:
+def every_nth(count: int) -> slice:
     """Return which of the points of a block to take: `POINTS` at most."""
     return slice(None, None, max(1, math.ceil(count / POINTS)))
 

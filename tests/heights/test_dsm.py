@@ -21,12 +21,7 @@ from sat_intervals.config import load_calibration, load_height_calibration
 from sat_intervals.heights.choices import BOUNDS, SurfaceChoices
 from sat_intervals.heights.dsm import make_surface
 from sat_intervals.products import OPEN_ABOVE, POINTS, SURFACE
-from sat_intervals.raster import (
-    POINT_FILES,
-    Projection,
-    north_up,
-    write_layer,
-)
+from sat_intervals.raster import POINT_FILES, Projection, north_up, write_layer
 from sat_intervals.raster.projection import transformed
 
 TO_DEGREES = Transformer.from_crs("EPSG:32631", "EPSG:4326", always_xy=True)
