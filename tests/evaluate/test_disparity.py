@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 import reference_evaluation
+from finished import random_bands, without_intervals, write_run
 from helpers import invoke, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -240,24 +241,15 @@ def test_evaluate_run__of_a_region_takes_its_truth_or_the_whole(pair, tmp_path):
         evaluate_run(tmp_path / "out", tmp_path / "other.tif")
 
 
-def test_evaluate_run__says_what_is_missing(run, pair, tmp_path):
-    with pytest.raises(SatIntervalsError, match=r"run.json: No such file or directory: give the folder of a finished"):
-        evaluate_run(tmp_path)
-    lonely = tmp_path / "lonely"
-    lonely.mkdir()
-    for name in ("left.tif", "right.tif"):
-        shutil.copy(pair / name, lonely)
-    match_pair(lonely / "left.tif", lonely / "right.tif", tmp_path / "out", settings_of(pair))
+def test_evaluate_run__says_what_is_missing(tmp_path):
+    bands, validity, _ = random_bands(20, 30)
+    out = write_run(tmp_path, bands, validity)
     with pytest.raises(SatIntervalsError, match=r"no truth.tif beside its left image .*left.tif: give --truth"):
-        evaluate_run(tmp_path / "out")
-    assert group_beside(lonely / "left.tif") == "all"
-    off = {"interval": None, "regularization": None}
-    match_pair(pair / "left.tif", pair / "right.tif", tmp_path / "off", settings_of(pair, **off))
+        evaluate_run(out)
+    assert group_beside(tmp_path / "left.tif") == "all"
+    (tmp_path / "off").mkdir()
     with pytest.raises(SatIntervalsError, match="has no intervals"):
-        evaluate_run(tmp_path / "off")
-    (tmp_path / "off" / "run.json").write_text("{")
-    with pytest.raises(SatIntervalsError, match=r"run.json is not the report of a run"):
-        evaluate_run(tmp_path / "off")
+        evaluate_run(without_intervals(tmp_path / "off"))
 
 
 def test_evaluate__warns_of_a_truth_of_another_left_image(run, pair, tmp_path):
@@ -440,7 +432,6 @@ def test_command__refuses_a_tolerance_that_is_no_number(run, value):
         (["PAIR", "PAIR"], "2 pairs or runs are called .*/one: give each its own name"),
         (["PAIR", "--config", "OFF"], "off.yaml: interval is null, but evaluate needs intervals: leave it on"),
         (["nothere.csv"], "nothere.csv cannot be read: No such file or directory: give a list of pairs"),
-        (["TMP"], "/run.json: No such file or directory: give the folder of a finished run"),
         (["RUN", "TMP", "--truth", "x.tif"], "--truth is given 1 times for 2 OUT"),
     ],
 )
