@@ -173,7 +173,7 @@ def with_settings(out, **settings):
 
 
 def with_coverage(out, calibration=None):
-    interval = {"alpha": None, "coverage": 0.9, "bounds": "subpixel", "calibration": calibration}
+    interval = {"alpha": None, "coverage": 0.9, "calibration": calibration}
     return with_settings(out, interval=interval)
 
 
