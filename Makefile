@@ -43,7 +43,7 @@ bench: $(VENV)/.has-bench
 bench-seams: $(VENV)/.has-bench
 	$(BIN)/python tests/benchmarks/seams.py
 
-# The tables of docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; about ten minutes.
+# The tables of README.md and docs/presets.md, on the pairs of SAT_INTERVALS_SHARED; after `make calibration` minutes.
 tune: $(VENV)/.has-mccnn
 	$(BIN)/python -W ignore tests/benchmarks/tune.py
 

@@ -10,7 +10,7 @@ import click
 
 from sat_intervals.cli.calibrate_dsm import calibrate_heights, check_alone
 from sat_intervals.cli.calibration_files import check_output, write
-from sat_intervals.cli.judging import tolerance_option
+from sat_intervals.cli.judging import find_sources, tolerance_option
 from sat_intervals.cli.matching import SettingsArguments, settings_options
 from sat_intervals.cli.options import (
     FILE,
@@ -148,27 +148,12 @@ class _Judging:
 
 def _subjects(paths: tuple[Path, ...], truths: tuple[Path, ...], judging: _Judging) -> "list[Subject]":
     """Open the pairs and runs named by the arguments, in their order."""
-    from sat_intervals.config.pairs import check_names, find_pairs, is_pair
-    from sat_intervals.errors import SatIntervalsError
-
-    is_run = [(path / "run.json").exists() for path in paths]
-    if unknown := [path for path, run in zip(paths, is_run, strict=True) if not run and not is_pair(path)]:
-        raise SatIntervalsError(
-            f"{unknown[0]} is neither a pair nor a finished run: give a folder with left.tif, right.tif, truth.tif "
-            "and meta.json, a CSV file, or the folder of a run"
-        )
-    find_pairs(source for source, run in zip(paths, is_run, strict=True) if not run)  # raises if a pair is given twice
-    found: list[tuple[Path, Pair | None]] = []
-    for source, run in zip(paths, is_run, strict=True):
-        found += [(source, None)] if run else [(source, pair) for pair in find_pairs([source])]
-    if len(truths) not in (0, len(found)):
-        raise SatIntervalsError(f"--truth is given {len(truths)} times for {len(found)} PAIRS: give it once for each")
-    subjects = [
-        _of_pair(pair, truth, judging) if pair else _of_run(source, truth, judging)
-        for (source, pair), truth in zip(found, truths or (None,) * len(found), strict=True)
+    return [
+        _of_pair(source.pair, source.truth, judging)
+        if source.pair
+        else _of_run(Path(source.name), source.truth, judging)
+        for source in find_sources(paths, truths)
     ]
-    check_names(subject.name for subject in subjects)
-    return subjects
 
 
 def _inputs(subjects: "list[Subject]", pairs: tuple[Path, ...]) -> list[str | Path]:

@@ -30,7 +30,6 @@ STAGES = {
     "reference": "reading points",
     "truth": "finding disparities of rows",
     "files": "writing files",
-    "compared": "matching again, to compare",
 }
 
 

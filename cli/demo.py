@@ -2,19 +2,16 @@
 
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from sat_intervals.cli.matching import RunArguments, SettingsArguments, local_option, run_options, settings_options
+from sat_intervals.cli.matching import RunArguments, SettingsArguments, run_options, settings_options
 from sat_intervals.cli.options import FILE, json_option, say_json
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from sat_intervals.cli.console import Console
-    from sat_intervals.config import Config
     from sat_intervals.raster import Georeferencing
 
 
@@ -32,7 +29,6 @@ if TYPE_CHECKING:
     show_default=True,
     help="Height of a mountain under the city; 1 m is a disparity of 1 px.",
 )
-@local_option
 @json_option
 @settings_options
 @run_options
@@ -41,7 +37,6 @@ def demo(
     size: tuple[int, int],
     seed: int,
     relief: float,
-    local_range: bool,
     as_json: bool,
     settings: SettingsArguments,
     run: RunArguments,
@@ -65,8 +60,7 @@ def demo(
     with Console(run.quiet or as_json) as console:
         console.progress("scene", 0, 1)
         scene = make_scene(*size, seed=seed, relief=relief)
-        search = {"minimum": scene.minimum, "maximum": scene.maximum} | ({"local": True} if local_range else {})
-        config = settings.load(disparity=search)
+        config = settings.load(disparity={"minimum": scene.minimum, "maximum": scene.maximum})
         check_not_replaced([settings.file], [*layers, *(out / name for name in OUTPUTS)], [out / "tiles"])
         for path, pixels, value in zip(layers, (scene.left, scene.right, scene.truth), nodata, strict=True):
             _write(path, pixels, value, somewhere, overwrite=run.overwrite)
@@ -77,7 +71,11 @@ def demo(
         say_json({"run": report, "truth": figures})
     else:
         console.summary(report, out)
-        _judge(config, out, figures, console, run.quiet)
+        if figures["count"]:
+            console.say(
+                f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
+                f"at a mean width of {figures['mean_width']:.2f} px."
+            )
     run.check_strict(report["warnings"])
 
 
@@ -96,43 +94,3 @@ def _write(path: Path, pixels: "np.ndarray", nodata: float, place: "Georeferenci
     check_free(path, overwrite=overwrite)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_layer(path, pixels, nodata, place, {"SOFTWARE": "sat-intervals"})
-
-
-def _judge(config: "Config", out: Path, figures: dict[str, Any], console: "Console", quiet: bool) -> None:
-    """Print how often the interval contains the truth, and compare alpha with a coverage."""
-    if figures["count"]:
-        console.say(
-            f"The interval contains the truth for {100 * figures['accuracy']:.1f} % of {figures['count']} pixels, "
-            f"at a mean width of {figures['mean_width']:.2f} px."
-        )
-        if not quiet:
-            _compare(config, out, figures, console)
-
-
-def _compare(config: "Config", out: Path, figures: dict[str, Any], console: "Console") -> None:
-    """Match again with a coverage, or with alpha if the run has a coverage, and print widths and scores of both."""
-    from sat_intervals.config import Cluster, ConfigError, load_config, resolved
-    from sat_intervals.evaluate.disparity import evaluate_run
-    from sat_intervals.run.pair import match_pair
-
-    own = config.interval
-    if own is None:
-        return
-    one, other_one = ("alpha", "coverage") if own.coverage is None else ("coverage", "alpha")
-    nominal = getattr(own, one)
-    names, interval = [f"{one} {nominal}", f"{other_one} {nominal}"], {other_one: nominal}
-    try:
-        # other machines do not see the folder
-        here = config.model_copy(update={"cluster": Cluster(workers=config.cluster.workers)})
-        other = resolved(load_config(here, {"interval": interval}))
-    except ConfigError:  # no built-in calibration, or a coverage that none has
-        return
-    with TemporaryDirectory(prefix="sat-intervals-") as folder:
-        console.progress("compared", 0, 1)
-        match_pair(out / "left.tif", out / "right.tif", folder, other)
-        beside = evaluate_run(folder, out / "truth.tif")["all"]
-    for name, of in zip(names, (figures, beside), strict=True):
-        console.say(
-            f"{name:<13} coverage {of['accuracy']:.3f}, median width {of['median_width']:.2f} px, mean "
-            f"{of['mean_width']:.2f} px, interval score {of['interval_score']:.2f} px"
-        )

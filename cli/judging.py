@@ -1,6 +1,7 @@
-"""Options and output shared by the commands that evaluate pairs with known truth."""
+"""What the commands share that compare with a known truth: pairs and runs, options, reports."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sat_intervals.cli.options import FILE, Command, json_option, log_options, preset_option, say_json, with_options
+from sat_intervals.cli.matching import SettingsArguments, settings_options
+from sat_intervals.cli.options import Command, json_option, log_options, say_json, with_options
 
 if TYPE_CHECKING:
     from sat_intervals.config import Config
@@ -37,23 +39,16 @@ tolerance_option = click.option(
 class Judging:
     """How pairs with known truth are matched, compared with it and printed."""
 
-    config_file: Path | None
-    preset: str | None
-    accurate: bool
+    settings: SettingsArguments
     tolerance: float
     as_json: bool
     quiet: bool
 
     def load(self, pair: "Pair", **sections: Any) -> "Config":
         """Load the settings to match a pair with."""
-        from sat_intervals.config import load_config
-
-        sections["disparity"] = {"minimum": pair.minimum, "maximum": pair.maximum}
-        if self.preset is not None:
-            sections["preset"] = self.preset
-        if self.accurate:
-            sections["cross_check"] = {"method": "accurate"}
-        return load_config(self.config_file, sections)
+        search = {"minimum": pair.minimum, "maximum": pair.maximum}
+        config: Config = self.settings.load(disparity=search, **sections)
+        return config
 
 
 def judging_options(command: Command) -> Command:
@@ -61,31 +56,55 @@ def judging_options(command: Command) -> Command:
 
     @wraps(command)
     def with_judging(
-        *,
-        config_file: Path | None,
-        preset: str | None,
-        accurate: bool,
-        tolerance: float,
-        as_json: bool,
-        quiet: bool,
-        **others: Any,
+        *, settings: SettingsArguments, tolerance: float, as_json: bool, quiet: bool, **others: Any
     ) -> Any:
-        return command(judging=Judging(config_file, preset, accurate, tolerance, as_json, quiet), **others)
+        return command(judging=Judging(settings, tolerance, as_json, quiet), **others)
 
     return with_options(
-        with_judging,
-        click.option("--config", "config_file", type=FILE, help="Settings to match pairs with (YAML)."),
-        preset_option,
-        click.option(
-            "--accurate",
-            is_flag=True,
-            help="Cross-check against a right view that is matched on its own, as in the paper's implementation.",
-        ),
+        settings_options(with_judging),
         tolerance_option,
         json_option,
         click.option("--quiet", "-q", is_flag=True, help="Print figures and errors only."),
         log_options,
     )
+
+
+@dataclass(frozen=True)
+class Source:
+    """A finished run, or a pair to match first; with the truth and the mask that are given for it."""
+
+    name: str
+    pair: "Pair | None"
+    truth: Path | None
+    mask: Path | None
+
+
+def find_sources(paths: Sequence[Path], truths: Sequence[Path], masks: Sequence[Path] = ()) -> list[Source]:
+    """Return the runs and pairs named by the arguments, in their order."""
+    from sat_intervals.config.pairs import check_names, find_pairs, is_pair
+    from sat_intervals.errors import SatIntervalsError
+
+    found: list[tuple[str, Pair | None]] = []
+    for path in paths:
+        if (path / "run.json").exists():
+            found.append((str(path), None))
+        elif is_pair(path):
+            found += [(pair.name, pair) for pair in find_pairs([path])]
+        else:
+            raise SatIntervalsError(
+                f"{path} is neither a pair nor a finished run: give a folder with left.tif, right.tif, truth.tif and "
+                "meta.json, a CSV file, or the folder of a run"
+            )
+    check_names(name for name, _ in found)
+    for option, given in (("--truth", truths), ("--mask", masks)):
+        if len(given) not in (0, len(found)):
+            raise SatIntervalsError(
+                f"{option} is given {len(given)} times for {len(found)} runs and pairs: give it once for each"
+            )
+    absent = (None,) * len(found)
+    return [
+        Source(*one, truth, mask) for one, truth, mask in zip(found, truths or absent, masks or absent, strict=True)
+    ]
 
 
 def say_scenes(scenes: "list[SceneMetrics]") -> None:

@@ -62,7 +62,7 @@ class SettingsArguments:
         """Load the settings; the sections given here win."""
         from sat_intervals.config import load_config
 
-        return load_config(self.file, self.sections | sections)
+        return load_config(load_config(self.file, self.sections), sections)
 
 
 @dataclass(frozen=True)
@@ -148,9 +148,6 @@ def pair_options(command: Command) -> Command:
     )
 
 
-local_option = click.option(
-    "--local-range", is_flag=True, help="Search a separate range in each cell of the image, found from the images."
-)
 _SEARCH_OPTIONS = (
     click.option(
         "--disparity",
@@ -159,7 +156,9 @@ _SEARCH_OPTIONS = (
         metavar="MIN MAX",
         help="Search range in pixels, both ends searched; default: found from the images.",
     ),
-    local_option,
+    click.option(
+        "--local-range", is_flag=True, help="Search a separate range in each cell of the image, found from the images."
+    ),
 )
 _LEVEL_OPTIONS = (
     click.option("--coverage", type=float, metavar="C", help="Share of true disparities to be inside, .5 to .99."),

@@ -2,15 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from sat_intervals.cli.judging import finite
 from sat_intervals.cli.options import FILE, PICTURES, log_options
-
-if TYPE_CHECKING:
-    from sat_intervals.results import Results
 
 
 @click.command(short_help="Draw a finished run: maps, profile of a row, errors, cost curve of a pixel.")
@@ -54,18 +51,28 @@ def plot(
     Rows and columns count from 0 at the first pixel of OUT/intervals.tif. Needs matplotlib: pip install
     'sat-intervals[plot]'.
     """  # noqa: D301 (\b keeps the line breaks in click)
+    from sat_intervals.errors import SatIntervalsError
     from sat_intervals.results import open_results
-    from sat_intervals.show.coverage import draw_coverage
+    from sat_intervals.show.coverage import check_one_pair, draw_coverage
     from sat_intervals.show.dsm import draw_surface
     from sat_intervals.show.maps import draw_errors, draw_overview
     from sat_intervals.show.profile import draw_curve, draw_profile
     from sat_intervals.show.search_range import draw_range, has_range
 
     results = open_results(out, truth)
-    _check(results, row, columns, pixel, beside)
+    is_judged = results.truth is not None and results.config.interval is not None
+    if beside and not is_judged:
+        raise SatIntervalsError(f"--beside compares coverages, but {out} has no truth or no intervals: give --truth")
+    check_one_pair([out, *beside])
+    if columns is not None and row is None:
+        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
+    if row is not None:
+        results.check_part(row, columns)
+    if pixel:
+        results.check_pixel(*pixel)
     results.check_kept([out / f"{name}.png" for name in PICTURES], [truth, judging["mask"], out / "dsm.tif"])
     drawings: dict[str, Callable[[Path], None]] = {"overview": lambda target: draw_overview(results, target, dpi)}
-    if _is_judged(results):
+    if is_judged:
         drawings["errors"] = lambda target: draw_errors(results, target, dpi)
         drawings["coverage"] = lambda target: draw_coverage([out, *beside], target, dpi, truth=truth, **judging)
     if has_range(results):
@@ -74,47 +81,8 @@ def plot(
         drawings["profile"] = lambda target: draw_profile(results, target, row, columns, dpi)
     if pixel:
         drawings["curve"] = lambda target: draw_curve(results, target, *pixel, dpi)
-    if _is_current(surface := out / "dsm.tif", results.report["finished"]):
-        drawings["dsm"] = lambda target: draw_surface(surface, target, dpi)
+    if results.has_current("dsm.tif"):
+        drawings["dsm"] = lambda target: draw_surface(out / "dsm.tif", target, dpi)
     for name, draw in drawings.items():
         draw(out / f"{name}.png")
         click.echo(out / f"{name}.png")
-
-
-def _is_judged(results: "Results") -> bool:
-    """Return whether there are intervals, and a truth to compare them with."""
-    return None not in (results.truth, results.config.interval)
-
-
-def _check(
-    results: "Results",
-    row: int | None,
-    columns: tuple[int, int] | None,
-    pixel: tuple[int, int] | None,
-    beside: tuple[Path, ...],
-) -> None:
-    """Raise if a profile or a pixel is outside the results, or these cannot be compared with other runs."""
-    from sat_intervals.errors import SatIntervalsError
-    from sat_intervals.show.coverage import check_one_pair
-
-    if beside and not _is_judged(results):
-        raise SatIntervalsError(
-            f"--beside compares coverages, but {results.out} has no truth or no intervals: give --truth"
-        )
-    check_one_pair([results.out, *beside])
-    if columns is not None and row is None:
-        raise SatIntervalsError(f"--columns {columns[0]} {columns[1]} belong to a profile: give --row too")
-    if row is not None:
-        results.check_part(row, columns)
-    if pixel:
-        results.check_pixel(*pixel)
-
-
-def _is_current(surface: Path, finished: str) -> bool:
-    """Return whether there is a surface model of the run; say so if it belongs to another one."""
-    from sat_intervals.raster.published import is_surface_of
-
-    if not surface.exists() or is_surface_of(surface, finished):
-        return surface.exists()
-    click.echo(f"{surface} is of another run or of earlier points and is not drawn: rerun sat-intervals dsm", err=True)
-    return False

@@ -24,8 +24,5 @@ def project(out: Path) -> None:
     """  # noqa: D301 (\b keeps the line breaks in click)
     from sat_intervals.show.project import write_project
 
-    written = write_project(out)
-    for note in written.notes:
-        click.echo(note, err=True)
-    for file in written.files:
+    for file in write_project(out):
         click.echo(file)

@@ -19,6 +19,6 @@ def report(out: Path, truth: Path | None) -> None:
     column.
     """
     from sat_intervals.results import open_results
-    from sat_intervals.show.report import write_report
+    from sat_intervals.show.report.page import write_report
 
     click.echo(write_report(open_results(out, truth)))

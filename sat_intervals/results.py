@@ -1,7 +1,8 @@
 """Reopen a finished run from its folder: report, bands, input images and truth."""
 
 import json
-from collections.abc import Iterable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,23 @@ from sat_intervals.config import Config, Regularization, load_config
 from sat_intervals.errors import SatIntervalsError, check_file
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import BANDS, Bands
-from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, tags_beside
+from sat_intervals.raster import Georeferencing, Image, check_not_replaced, open_image, read_layers, read_tags
 from sat_intervals.raster.images import opened
+from sat_intervals.raster.published import is_points_of, is_surface_of, tags_beside
 from sat_intervals.raster.windows import Layer, read_small_image, read_small_layers
 from sat_intervals.tiling import Window, strips
 
 # Pixels in a strip, and band count of each file.
 _STRIP = 1 << 23
 _BANDS = {"intervals.tif": len(BANDS), "validity.tif": 1}
+# Files that later commands add to a run: the command, and whether a file is of the run that finished at a time.
+_ADDED: dict[str, tuple[str, Callable[[Path, str], bool]]] = {
+    "points.tif": ("triangulate", is_points_of),
+    "dsm.tif": ("dsm", is_surface_of),
+    "overview.png": ("plot", lambda file, finished: read_tags(file).get("Comment") == finished),
+}
+
+_LOG = logging.getLogger(__name__)
 
 
 class _Report(BaseModel):
@@ -67,6 +77,14 @@ class Run:
         """Yield full-width windows of the results from the top."""
         return strips(*self.shape, _STRIP)
 
+    def has_current(self, name: str) -> bool:
+        """Return whether the folder has a file of a later command, made of this run; warn if it is of another one."""
+        command, is_of = _ADDED[name]
+        if not (file := self.out / name).exists() or is_of(file, self.report["finished"]):
+            return file.exists()
+        _LOG.warning("%s is of another run or of earlier points and is left out: rerun sat-intervals %s", file, command)
+        return False
+
     def check_kept(self, outputs: Iterable[str | Path], inputs: Iterable[str | Path | None] = ()) -> None:
         """Raise if an output would replace a file of the run, one of its inputs, the truth, or one of ``inputs``."""
         own = [self.out / name for name in (*_BANDS, "run.json")]
@@ -77,9 +95,9 @@ class Run:
         """Open another raster of the same pixels, such as the truth."""
         image, left, here = open_image(path), self.report["inputs"]["left"], self.region.in_words
         size, there = (image.height, image.width), tags_beside(image.path, left).get("REGION", here)
-        if size == self.shape and there != here:
-            raise SatIntervalsError(f"{image.path} is of {there}, {self.out} of {here}: give one of this run")
         if size == self.shape:
+            if there != here:
+                raise SatIntervalsError(f"{image.path} is of {there}, {self.out} of {here}: give one of this run")
             return Layer(image, 0, 0)
         if size == (left["height"], left["width"]):
             return Layer(image, self.region.row, self.region.column)
@@ -153,7 +171,7 @@ def open_run(out: str | Path) -> Run:
         raise SatIntervalsError(f"{file}: {error.strerror}: give the folder of a finished run") from error
     except SatIntervalsError as error:
         raise SatIntervalsError(f"{file}: {error}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         where = ", see " + ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else ""
         raise SatIntervalsError(f"{file} is not the report of a run{where}: match again with --overwrite") from error
     places = [_place(file.with_name(name), (bands, region.height, region.width)) for name, bands in _BANDS.items()]
@@ -194,7 +212,7 @@ def open_input(record: dict[str, Any]) -> Image:
         raise SatIntervalsError(f"{name}, an image of the run, is missing: move it back, or put a link to it there")
     nodata = None if nodata is None else float(nodata)
     image = open_image(name, band=record["band"], nodata=nodata, mask=mask and mask["path"])
-    if (found := (image.height, image.width)) != (size := (record["height"], record["width"])):
-        sizes = f"{found[0]} x {found[1]} pixels, but had {size[0]} x {size[1]}"
+    if (image.height, image.width) != (record["height"], record["width"]):
+        sizes = f"{image.height} x {image.width} pixels, but had {record['height']} x {record['width']}"
         raise SatIntervalsError(f"{name} has {sizes} when it was matched: restore it")
     return image

@@ -3,7 +3,6 @@
 It writes disparity, interval and confidence under the names that CARS' triangulation reads.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -30,11 +29,10 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
     """Match the tiles of CARS: disparities with intervals.
 
     ``conf`` is the section ``dense_matching`` of CARS' configuration; its ``settings`` are those of this package,
-    without the search range. By default, confidence is relative to the whole search range: percentiles of one tile
-    would make adjacent tiles differ.
+    without the search range, over the preset ``paper``, which has CARS' own penalties.
     """
 
-    def __init__(self, conf: Mapping[str, Any] | None) -> None:
+    def __init__(self, conf: dict[str, Any] | None) -> None:
         super(PandoraMethod, self).__init__(conf=conf)
         self.schema = {
             "method": str,
@@ -62,22 +60,23 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         self.margins = Margins(overlap, overlap, overlap, overlap)
 
     def _config(self, minimum: int, maximum: int) -> Config:
-        """Return the settings with a search range."""
+        """Return the settings with a search range.
+
+        Confidence is relative to this range: CARS' tiles are matched alone, and percentiles of each would make adjacent
+        ones differ. Calibrations belong to percentiles.
+        """
         settings = self.used_config["settings"]
-        wrong = [name for name in ("disparity",) if name in settings]
-        wrong += [name for name in ("interval", "ambiguity") if settings.get(name, {}) is None]
-        if wrong:
+        if "disparity" in settings or None in (settings.get("interval", {}), settings.get("ambiguity", {})):
             raise SatIntervalsError(
-                f"dense_matching.settings: leave out {' and '.join(wrong)}: CARS provides the search range and needs "
-                "intervals and ambiguity"
+                "dense_matching.settings: leave out disparity, and null for interval or ambiguity: CARS provides the "
+                "search range and needs intervals and ambiguity"
             )
-        ambiguity = settings.get("ambiguity", {})
-        # CARS' tiles are matched alone, so confidence is scaled without percentiles. But calibrations belong to these.
-        interval = settings.get("interval", {})
-        has_coverage = isinstance(interval, Mapping) and interval.get("coverage") is not None
-        if isinstance(ambiguity, Mapping) and not has_coverage:
-            ambiguity = {"normalization": "range", **ambiguity}
-        return load_config({**settings, "ambiguity": ambiguity, "disparity": {"minimum": minimum, "maximum": maximum}})
+        given = {"preset": "paper", **settings, "disparity": {"minimum": minimum, "maximum": maximum}}
+        config = load_config(given)
+        if config.interval is not None and config.interval.coverage is None:
+            ambiguity = {"normalization": "range", **given.get("ambiguity", {})}
+            config = load_config(given | {"ambiguity": ambiguity})
+        return config
 
     def run(
         self,
@@ -93,24 +92,18 @@ class SatIntervals(PandoraMethod, short_name=["sat_intervals"]):  # type: ignore
         classif_bands_to_mask: list[Any] | None = None,
         used_band: str = "b0",
     ) -> xr.Dataset:
-        """Match one tile with its margins; parameters and result are those of CARS' abstract method.
-
-        Each pixel is searched over the range of the whole tile, cropped around zero if CARS limits memory.
-        """
+        """Match a tile by CARS' interface: all pixels over one range, cropped around zero if CARS limits memory."""
         from sat_intervals.match.in_memory import match_arrays  # `import cars` must not load numba
 
         grids = dense_matching_algo.compute_disparity_grid(
             disp_range_grid.data, left_image_object, right_image_object, used_band, False
         )
         minimum, maximum, is_cropped = _search_range(grids[0], grids[1], crop_with_range)
-        left, right = (_of_band(tile, used_band) for tile in (left_image_object, right_image_object))
-        matched = match_arrays(
-            _pixels(left, used_band, classif_bands_to_mask), _pixels(right, used_band), self._config(minimum, maximum)
-        )
+        left = _pixels(left_image_object, used_band, classif_bands_to_mask)
+        matched = match_arrays(left, _pixels(right_image_object, used_band), self._config(minimum, maximum))
         result: xr.Dataset = dense_matching_wrappers.create_disp_dataset(
-            _as_pandora(matched, left),
-            left,
-            right,
+            _as_pandora(matched, left_image_object),
+            *(_of_band(tile, used_band) for tile in (left_image_object, right_image_object)),
             compute_disparity_masks=compute_disparity_masks,
             disp_min_grid=np.maximum(grids[0], minimum),
             disp_max_grid=np.minimum(grids[1], maximum),
@@ -140,7 +133,7 @@ class _NoLoader:
 
 
 def _search_range(lowest: np.ndarray, highest: np.ndarray, most: int | None) -> tuple[int, int, bool]:
-    """Return the range over all pixels, cropped around zero to ``most`` disparities, and whether it was cropped."""
+    """Return the range over all pixels, and whether it was cropped around zero to ``most`` disparities."""
     minimum, maximum = int(np.floor(lowest.min())), int(np.ceil(highest.max()))
     share = 1.0 if most is None else min(1.0, most / max(1, maximum - minimum))
     return round(share * minimum), round(share * maximum), share < 1
@@ -148,13 +141,12 @@ def _search_range(lowest: np.ndarray, highest: np.ndarray, most: int | None) -> 
 
 def _of_band(tile: xr.Dataset, band: str) -> xr.Dataset:
     """Return the tile with the mask of one band."""
-    mask = tile[names.EPI_MSK].sel({names.BAND_IM: band}, drop=True)
-    return tile.drop_vars(names.EPI_MSK).assign({names.EPI_MSK: mask})
+    return tile.assign({names.EPI_MSK: tile[names.EPI_MSK].sel({names.BAND_IM: band}, drop=True)})
 
 
 def _pixels(tile: xr.Dataset, band: str, classes: list[Any] | None = None) -> np.ma.MaskedArray:
     """Return the pixels of one band, masked by the tile's mask and by classes."""
-    masked = tile[names.EPI_MSK].values != 0
+    masked = tile[names.EPI_MSK].sel({names.BAND_IM: band}).values != 0
     if classes and names.EPI_CLASSIFICATION in tile:
         masked |= (tile[names.EPI_CLASSIFICATION].sel(band_classif=classes).values != 0).any(axis=0)
     return np.ma.masked_array(tile[names.EPI_IMAGE].sel({names.BAND_IM: band}).values, masked)

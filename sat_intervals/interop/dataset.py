@@ -10,8 +10,8 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.products import BANDS, FLAGS, INVALID, POINTS, Band, flag_attributes
-from sat_intervals.raster import Georeferencing, grid_mapping, read_layers, read_tags
+from sat_intervals.products import FLAGS, INVALID, flag_attributes
+from sat_intervals.raster import POINT_FILES, RUN_FILES, grid_mapping, read_layers
 from sat_intervals.results import Run, open_run
 from sat_intervals.tiling import Window
 
@@ -22,7 +22,7 @@ class _Layer(BackendArray):
     """One band of a file of a run, read when it is indexed."""
 
     def __init__(self, run: Run, name: str, band: int, dtype: str) -> None:
-        self.run, self.name, self.band = run, name, band
+        self.file, self.band = run.out / name, band
         self.shape, self.dtype = run.shape, np.dtype(dtype)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
@@ -30,18 +30,14 @@ class _Layer(BackendArray):
 
     def _read(self, key: tuple[int | slice, ...]) -> np.ndarray:
         """Read whole numbers or slices of rows and columns."""
-        ranges = [
-            range(size)[part] if isinstance(part, slice) else range(part, part + 1)
-            for part, size in zip(key, self.shape, strict=True)
-        ]
-        dropped = tuple(slice(None) if isinstance(part, slice) else 0 for part in key)
-        if 0 in map(len, ranges):
-            return np.empty([len(places) for places in ranges], self.dtype)[dropped]
-        first, end = zip(*((min(places), max(places) + 1) for places in ranges), strict=True)
-        window = Window(first[0], first[1], end[0] - first[0], end[1] - first[1])
-        pixels = read_layers(self.run.out / self.name, window, self.band)
-        chosen = (np.asarray(places) - start for places, start in zip(ranges, first, strict=True))
-        return np.asarray(pixels[np.ix_(*chosen)][dropped])
+        rows, columns = (np.arange(size)[part] for part, size in zip(key, self.shape, strict=True))
+        shape = (*rows.shape, *columns.shape)
+        if 0 in shape:
+            return np.empty(shape, self.dtype)
+        row, column = int(rows.min()), int(columns.min())
+        window = Window(row, column, int(rows.max()) + 1 - row, int(columns.max()) + 1 - column)
+        pixels = read_layers(self.file, window, self.band)
+        return np.asarray(pixels[np.ix_(rows.ravel() - row, columns.ravel() - column)].reshape(shape))
 
 
 def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
@@ -68,50 +64,32 @@ def open(out: str | Path, chunks: int | None = 2048) -> xr.Dataset:
         The folder is not a finished run, or a file cannot be read.
     """
     run = open_run(out)
-    place = run.georeferencing
-    dataset = xr.Dataset(coords=_coordinates(place, run.shape))
-    dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals"} | {
-        name: value
-        for name, value in (("finished", run.report["finished"]), ("preset", run.config.preset))
-        if value is not None
-    }
-    for number, band in enumerate(BANDS, start=1):
-        dataset[band.name] = _variable(_Layer(run, "intervals.tif", number, "float32"), _described(band), chunks)
-    dataset["validity"] = _variable(_Layer(run, "validity.tif", 1, "uint16"), flag_attributes(), chunks)
-    points = run.out / "points.tif"
-    if points.exists() and read_tags(points).get("RUN") == run.report["finished"]:
-        for number, band in enumerate(POINTS, start=1):
-            dataset[band.name] = _variable(_Layer(run, points.name, number, "float64"), _described(band), chunks)
-    dataset["width"] = _width(dataset)
+    dataset = xr.Dataset(coords=_coordinates(run))
+    dataset.attrs = {"title": "disparity with intervals", "source": "sat-intervals", "finished": run.report["finished"]}
+    if run.config.preset:
+        dataset.attrs["preset"] = run.config.preset
+    for file in (*RUN_FILES, *(POINT_FILES if run.has_current("points.tif") else ())):
+        for number, band in enumerate(file.bands, start=1):
+            lazy = indexing.LazilyIndexedArray(_Layer(run, file.name, number, file.dtype))
+            attributes = {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
+            dataset[band.name] = xr.Variable(("y", "x"), lazy, attributes)
+    dataset["validity"].attrs = flag_attributes()
+    if chunks is not None:
+        dataset = dataset.chunk({"y": chunks, "x": chunks})
+    dataset["width"] = dataset.intervals.width()
     for variable in dataset.data_vars.values():
         variable.encoding["grid_mapping"] = _PLACE
     return dataset
 
 
-def _variable(layer: _Layer, attributes: dict[str, Any], chunks: int | None) -> xr.Variable:
-    variable = xr.Variable(("y", "x"), indexing.LazilyIndexedArray(layer), attributes)
-    return variable if chunks is None else variable.chunk({"y": chunks, "x": chunks})
-
-
-def _described(band: Band) -> dict[str, Any]:
-    return {"long_name": band.meaning} | ({"units": band.unit} if band.unit else {})
-
-
-def _width(dataset: xr.Dataset) -> xr.DataArray:
-    width = dataset["upper"] - dataset["lower"]
-    return width.assign_attrs(long_name="width of the disparity interval", units="px")
-
-
-def _coordinates(place: Georeferencing, shape: tuple[int, int]) -> dict[Hashable, Any]:
+def _coordinates(run: Run) -> dict[Hashable, Any]:
     """Return the centres of pixels, where they are a grid along the axes of the CRS, and the grid mapping."""
+    place = run.georeferencing
     coordinates: dict[Hashable, Any] = {_PLACE: ((), 0, grid_mapping(place))}
-    transform = place.transform
-    if transform is not None and not transform.b and not transform.d:
+    if place.transform is not None and not place.transform.b and not place.transform.d:
         units = {"units": "m"} if place.crs is not None and place.crs.is_projected else {}
-        for name, start, step, count in (
-            ("y", transform.f, transform.e, shape[0]),
-            ("x", transform.c, transform.a, shape[1]),
-        ):
+        starts, steps = (place.transform.f, place.transform.c), (place.transform.e, place.transform.a)
+        for name, start, step, count in zip("yx", starts, steps, run.shape, strict=True):
             coordinates[name] = (name, start + step * (np.arange(count) + 0.5), {"axis": name.upper()} | units)
     return coordinates
 
@@ -145,7 +123,8 @@ class Intervals:
 
     def width(self) -> xr.DataArray:
         """Return the width of the intervals in pixels, NaN where there is none."""
-        return _width(self._dataset)
+        width = self._dataset["upper"] - self._dataset["lower"]
+        return width.assign_attrs(long_name="width of the disparity interval", units="px")
 
     def flags(self) -> xr.Dataset:
         """Return the decoded validity flags, see `decode_flags`."""
@@ -156,14 +135,11 @@ class Intervals:
 
         ``truth`` is the true disparity in pixels, as large as the dataset; NaN where unknown.
         """
-        dataset = self._dataset
-        if truth.shape != dataset["lower"].shape:
-            raise SatIntervalsError(
-                f"the truth has the shape {truth.shape}, the intervals {dataset['lower'].shape}: select the same part"
-            )
-        pixels = truth.data if isinstance(truth, xr.DataArray) else truth  # by place, not by labels
-        true = xr.DataArray(pixels, dims=dataset["lower"].dims)
-        lower, upper, validity = (dataset[name].drop_vars(dataset.coords) for name in ("lower", "upper", "validity"))
+        lower, upper, validity = (self._dataset[name].variable for name in ("lower", "upper", "validity"))
+        if truth.shape != lower.shape:
+            sizes = f"the truth has the shape {truth.shape}, the intervals {lower.shape}"
+            raise SatIntervalsError(f"{sizes}: select the same part")
+        true = xr.Variable(lower.dims, truth.data if isinstance(truth, xr.DataArray) else truth)
         judged = ((validity & np.uint16(INVALID)) == 0) & np.isfinite(true) & np.isfinite(lower)
         hits = judged & (lower <= true) & (true <= upper)
         counts = xr.Dataset({"hits": hits.sum(), "judged": judged.sum()}).compute()
@@ -174,9 +150,7 @@ class Intervals:
         rows, width = self._dataset["lower"].shape
         first, last = columns or (0, width - 1)
         if not (0 <= row < rows and 0 <= first <= last < width):
-            raise SatIntervalsError(
-                f"row {row}, columns {first} to {last} are outside the dataset: rows are 0 to {rows - 1}, columns 0 to "
-                f"{width - 1}"
-            )
+            part = f"row {row}, columns {first} to {last} are outside the dataset"
+            raise SatIntervalsError(f"{part}: rows are 0 to {rows - 1}, columns 0 to {width - 1}")
         down, across = self._dataset["lower"].dims
         return self._dataset.isel({down: row, across: slice(first, last + 1)}).compute()

@@ -8,7 +8,18 @@ import numpy as np
 
 from sat_intervals.evaluate.comparison import Comparison
 from sat_intervals.evaluate.dsm import Profile, error_map
-from sat_intervals.show.canvas import DPI, INK, NOTHING, page, plain_logarithm, pointed_ends, say_empty
+from sat_intervals.show.canvas import (
+    DPI,
+    GROUND,
+    INK,
+    Frame,
+    MapLayer,
+    draw_layer,
+    map_size,
+    page,
+    plain_logarithm,
+    say_empty,
+)
 from sat_intervals.show.legend import BLUE, ORANGE
 
 # Cells of a class that are worth a point, and pixels of the longer side of a map.
@@ -50,21 +61,12 @@ def draw_error_map(given: Comparison, nmad: float, target: Path, dpi: int = DPI)
     """Draw height - reference, within three NMAD of 0; large surfaces are sampled."""
     errors, extent = error_map(given, _LONGEST)
     end = max(3 * nmad, 0.1)
-    tall = float(np.clip(errors.shape[0] / errors.shape[1], 0.2, 5))
-    width = min(7.0, 7.0 / tall)
-    with page(
-        target, (width + 1.8, width * tall + 0.8), dpi, f"{given.surface.name} - {given.reference.name}"
-    ) as figure:
-        panel = figure.subplots()
-        panel.set_facecolor(NOTHING)
-        drawn = panel.imshow(errors, extent=extent, cmap="RdBu_r", vmin=-end, vmax=end, interpolation="nearest")
-        panel.ticklabel_format(style="plain", useOffset=False)
-        panel.tick_params(labelsize=8, colors=INK)
-        panel.set(xlabel="easting (m)", ylabel="northing (m)")
-        panel.locator_params(nbins=4)
-        say_empty(panel, errors, "no common height")
-        bar = figure.colorbar(drawn, ax=panel, extend=pointed_ends(errors, -end, end), shrink=0.8)
-        bar.set_label("height - reference (m), red: too high")
+    height, width = map_size(errors.shape, 7.0)
+    name = f"{given.surface.name} - {given.reference.name}"
+    unit, empty = "height - reference (m), red: too high", "no common height"
+    layer = MapLayer("", unit, errors, "RdBu_r", (-end, end), if_empty=empty)
+    with page(target, (width + 1.8, height + 0.8), dpi, name) as figure:
+        draw_layer(figure.subplots(), Frame(*extent, GROUND), layer)
 
 
 def draw_height_profile(profile: Profile, target: Path, names: Sequence[str], dpi: int = DPI) -> None:

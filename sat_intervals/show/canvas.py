@@ -1,32 +1,62 @@
-"""Provide what all pictures share: page, style, colours, value ranges, histogram of widths."""
+"""Provide what all pictures share: page, style, maps with colour scales, histogram of widths."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from sat_intervals.errors import SatIntervalsError
-from sat_intervals.raster.publishing import new_file
+from sat_intervals.raster import new_file
 
 try:
     from matplotlib import rc_context
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.colorbar import Colorbar
+    from matplotlib.colors import PowerNorm
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+    from matplotlib.image import AxesImage
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 except ImportError as error:
     raise SatIntervalsError("pictures need matplotlib: pip install 'sat-intervals[plot]'") from error
 
 DPI = 110  # dots per inch
 NOTHING = "#dedede"  # pixels without a value
 INK = "#555555"
-_WIDEST = 90  # percentile of widths at the end of their scale: low-confidence areas are often as wide as the range
+GROUND = "easting (m)", "northing (m)"  # axes of a map
+_STRETCHED = 5.0  # largest ratio of the sides of a map; pixels of longer ones are not square
 _BARS, _LEAST_SHARE = 48, 0.001  # of a histogram of widths: most bars, least share shown
 
 _STYLE: Any = {"font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.titlelocation": "left"}
+
+
+class Frame(NamedTuple):
+    """Coordinates of a map at its left, right, bottom and top edge, and the names of its axes."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+    names: tuple[str, str] = ("column", "row")
+
+    @classmethod
+    def of(cls, shape: tuple[int, int]) -> "Frame":
+        """Return the frame of rows and columns."""
+        return cls(-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
+
+
+class MapLayer(NamedTuple):
+    """What a map shows, and its colour scale from ``ends[0]`` to ``ends[1]``; a power of 1/2 brightens small values."""
+
+    title: str
+    unit: str
+    values: np.ndarray
+    colours: str
+    ends: tuple[float, float]
+    power: float = 1.0
+    if_empty: str = "no value"
 
 
 @contextmanager
@@ -40,31 +70,46 @@ def page(target: Path, size: tuple[float, float], dpi: int, title: str, run: str
             figure.savefig(file, dpi=dpi, format="png", metadata={"Software": "sat-intervals", "Comment": run})
 
 
+def map_size(shape: tuple[int, int], longest: float) -> tuple[float, float]:
+    """Return height and width in inches of a map, the longer one ``longest``."""
+    tall = float(np.clip(shape[0] / shape[1], 1 / _STRETCHED, _STRETCHED))
+    width = min(longest, longest / tall)
+    return width * tall, width
+
+
 def fitting(shape: tuple[int, int], inches: tuple[float, float], dpi: int) -> tuple[int, int]:
     """Return ``shape``, reduced to the dots of a picture of ``(height, width)`` inches."""
     rows, columns = (max(1, min(size, round(length * dpi))) for size, length in zip(shape, inches, strict=True))
     return rows, columns
 
 
-def limits(values: np.ndarray, otherwise: tuple[float, float]) -> tuple[float, float]:
-    """Return percentiles 1 and 99 of the finite values; ``otherwise`` if there are none."""
-    known = values[np.isfinite(values)]
-    if known.size == 0:
-        return otherwise
-    low, high = np.percentile(known, (1, 99), method="nearest")
-    return (float(low), float(high)) if low < high else (float(low) - 0.5, float(high) + 0.5)
+def draw_map(panel: Axes, frame: Frame, values: np.ndarray, title: str, **options: Any) -> AxesImage:
+    """Draw values as a map with its axes; ``options`` are those of matplotlib's imshow."""
+    panel.set_facecolor(NOTHING)
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
+    panel.ticklabel_format(style="plain", useOffset=False)
+    panel.tick_params(labelsize=8, colors=INK)
+    panel.set_xlabel(frame.names[0], fontsize=8, color=INK)
+    panel.set_ylabel(frame.names[1], fontsize=8, color=INK)
+    panel.set_title(title)
+    ratio = abs((frame.top - frame.bottom) / (frame.right - frame.left))
+    aspect: Literal["equal", "auto"] = "equal" if 1 / _STRETCHED <= ratio <= _STRETCHED else "auto"
+    return panel.imshow(values, extent=frame[:4], aspect=aspect, interpolation="nearest", **options)
 
 
-def widest(widths: np.ndarray) -> float:
-    """Return the end of the colour scale of interval widths, a percentile of the finite ones; 1 if there are none."""
-    known = widths[np.isfinite(widths)]
-    return (float(np.percentile(known, _WIDEST, method="nearest")) if known.size else 0.0) or 1.0
-
-
-def pointed_ends(values: np.ndarray, low: float, high: float) -> str:
-    """Return matplotlib's ``extend``: a pointed end of a colour bar means values beyond it."""
-    beyond = bool((values < low).any()), bool((values > high).any())
-    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+def draw_layer(panel: Axes, frame: Frame, layer: MapLayer) -> Colorbar:
+    """Draw a layer as a map with a colour bar, whose ends are pointed where values are beyond them."""
+    values, ends = layer.values, layer.ends
+    drawn = draw_map(panel, frame, values, layer.title, cmap=layer.colours, norm=PowerNorm(layer.power, *ends))
+    say_empty(panel, values, layer.if_empty)
+    assert panel.figure is not None
+    beyond = bool((values < ends[0]).any()), bool((values > ends[1]).any())
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+    bar = panel.figure.colorbar(drawn, ax=panel, extend=extend, shrink=0.9, aspect=25, pad=0.02)
+    bar.set_label(layer.unit if layer.power == 1 else f"{layer.unit}, square-root scale")
+    bar.ax.tick_params(labelsize=8)
+    return bar
 
 
 def add_histogram(bar: Colorbar, widths: np.ndarray, end: float, step: float) -> None:

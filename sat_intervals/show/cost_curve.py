@@ -19,21 +19,21 @@ from sat_intervals.tiling import Window
 
 
 class Curve(NamedTuple):
-    """The cost curve of a pixel, its disparity and interval before median filter and regularisation.
+    """The cost curve of a pixel, its disparity and interval (pixels) before median filter and regularisation.
 
     ``costs`` (float64, aggregated by SGM if the run uses it) and ``possibilities`` (0 to 1) belong to the integers
-    ``disparities``, NaN where a candidate is impossible; those of ``cut`` reach ``level``. Disparity and bounds are in
-    pixels. Without intervals, level and bounds are None, and the cut is empty.
+    ``disparities``, NaN where a candidate is impossible; those of ``cut`` reach ``level``. Without intervals, level and
+    bounds are NaN, and the cut is empty.
     """
 
     disparities: np.ndarray
     costs: np.ndarray
     possibilities: np.ndarray
-    level: float | None
+    level: float
     cut: np.ndarray
     disparity: float
-    lower: float | None
-    upper: float | None
+    lower: float
+    upper: float
 
 
 def read_curve(results: Results, row: int, column: int) -> Curve:
@@ -57,47 +57,40 @@ def read_curve(results: Results, row: int, column: int) -> Curve:
     curve = np.ascontiguousarray(volume[pixel.relative_to(base).slices])
     possible = curve[0, 0] != IMPOSSIBLE_COST
     if not possible.any():
-        raise SatIntervalsError(_explain(results, row, column))
+        validity = int(results.read_pixel(row, column).validity)
+        reasons = "; ".join(flag.meaning for flag in FLAGS if flag.invalid and validity & flag.value)
+        where = f"row {row}, column {column} has no cost curve"
+        raise SatIntervalsError(f"{where}: {reasons}: choose a pixel that was matched")
     costs = np.where(possible, curve[0, 0].astype(np.float64), np.nan)
     above = costs - np.nanmin(costs)
     _, disparity, _ = read_winners(curve, settings.minimum, settings.weights, settings.refine)
     largest = _largest_above(results, row, column, settings)
-    bounds = None if largest is None else _bounds(curve, largest, float(disparity[0, 0]), settings)
+    lower, upper = _bounds(curve, largest, float(disparity[0, 0]), settings)
+    alpha = config.interval and config.interval.alpha
     return Curve(
         disparities=np.arange(settings.minimum, settings.minimum + settings.count),
         costs=costs,
         possibilities=np.maximum(1 - above / config.cost_span, 0),
-        level=None if largest is None else _possibility(largest, results),
-        cut=above <= (-1 if largest is None else largest),
+        level=float(alpha or np.maximum(1 - largest / config.cost_span, 0)),
+        cut=above <= largest,
         disparity=float(disparity[0, 0]),
-        lower=None if bounds is None else bounds[0],
-        upper=None if bounds is None else bounds[1],
+        lower=lower,
+        upper=upper,
     )
 
 
-def _largest_above(results: Results, row: int, column: int, settings: Settings) -> float | None:
-    """Return the largest cost above the lowest that belongs to the cut of a pixel's class; None without intervals."""
+def _largest_above(results: Results, row: int, column: int, settings: Settings) -> float:
+    """Return the largest cost above the lowest that belongs to the cut of a pixel's class; NaN without intervals."""
     if settings.steps == 0:
-        return settings.cut_level if settings.cut_level >= 0 else None
+        return settings.cut_level if settings.cut_level >= 0 else np.nan
     is_low = results.read_pixel(row, column).validity & REGULARIZED
     return settings.low if is_low else settings.high
 
 
 def _bounds(curve: np.ndarray, largest: float, disparity: float, settings: Settings) -> tuple[float, float]:
+    if np.isnan(largest):
+        return np.nan, np.nan
     if settings.steps:
         return read_subpixel_cut(curve[0, 0], settings.minimum, largest, settings.steps, disparity)
     lower, upper = read_alpha_cuts(curve, settings.minimum, settings.cut_level, settings.refine)
     return int(lower[0, 0]), int(upper[0, 0])
-
-
-def _possibility(largest: float, results: Results) -> float:
-    """Return the possibility at which a curve is cut: alpha, or that of a calibrated level."""
-    interval = results.config.interval
-    return float(interval.alpha) if interval and interval.alpha else max(0.0, 1 - largest / results.config.cost_span)
-
-
-def _explain(results: Results, row: int, column: int) -> str:
-    """Return the message why a pixel has no curve, from its validity flags."""
-    validity = int(results.read(Window(row, column, 1, 1)).validity[0, 0])
-    reasons = [flag.meaning for flag in FLAGS if flag.invalid and validity & flag.value]
-    return f"row {row}, column {column} has no cost curve: {'; '.join(reasons)}: choose a pixel that was matched"

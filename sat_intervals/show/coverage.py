@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
-
 from sat_intervals.errors import SatIntervalsError
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.results import open_run
@@ -34,22 +32,16 @@ def draw_coverage(runs: Sequence[Path], target: Path, dpi: int = DPI, **judging:
     with page(target, (9.0, 4.2), dpi, f"{', '.join(run.name for run in runs)}: intervals and truth") as figure:
         left, right = figure.subplots(1, 2)
         deciles = [(report["nominal"], decile) for report in reports for decile in report["deciles"]]
-        _draw_line(
-            left, [(nominal, decile["accuracy"]) for nominal, decile in deciles], "deciles of confidence", INK, "."
-        )
-        _draw_line(right, [(decile["accuracy"], decile["mean_width"]) for _, decile in deciles], "", INK, ".")
+        series = [("deciles of confidence", INK, ".", deciles)]
         for name, label, colour in _CLASSES:
             known = [(report["nominal"], report[name]) for report in reports if report[name]["count"]]
-            _draw_line(left, [(nominal, area["accuracy"]) for nominal, area in known], label, colour, "o-")
-            _draw_line(right, [(area["accuracy"], area["mean_width"]) for _, area in known], "", colour, "o-")
+            series.append((label, colour, "o-", known))
+        for label, colour, style, points in series:
+            nominal, measured = [one for one, _ in points], [area["accuracy"] for _, area in points]
+            left.plot(nominal, measured, style, color=colour, ms=5, lw=1, label=label)
+            right.plot(measured, [area["mean_width"] for _, area in points], style, color=colour, ms=5, lw=1)
         left.plot([0, 1], [0, 1], color=INK, lw=0.8, ls="--")
         left.set(xlabel="nominal coverage (or alpha)", ylabel="measured coverage", xlim=(0.45, 1), ylim=(0, 1.02))
         left.legend(loc="lower right", frameon=False)
         right.set(xlabel="measured coverage", ylabel="mean width (px)", yscale="log")
         plain_logarithm(right.yaxis)
-
-
-def _draw_line(chart: Axes, points: Sequence[tuple[float, float]], label: str, colour: str, style: str) -> None:
-    if points:
-        across, up = zip(*points, strict=True)
-        chart.plot(across, up, style, color=colour, ms=5 if style == "o-" else 4, lw=1, label=label or None)

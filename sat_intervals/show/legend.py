@@ -1,4 +1,4 @@
-"""Define the pixel classes of maps and reports, and their colours."""
+"""Define the pixel classes of maps and reports, their colours, and the ends of colour scales."""
 
 from typing import Any, NamedTuple
 
@@ -32,15 +32,14 @@ PIXEL_CLASSES = (
     PixelClass(SKY, "valid, low confidence", REGULARIZED),
     *(PixelClass(_INVALID[flag.name], flag.meaning, flag.value) for flag in FLAGS if flag.invalid),
 )
-FIRST_INVALID = 2
 
 
 def classify(validity: np.ndarray) -> np.ndarray:
     """Return the index into PIXEL_CLASSES of each pixel of a validity band, uint8; see `products.cause`."""
     causes = cause(validity)
     places = np.where(validity & REGULARIZED, 1, 0).astype(np.uint8)
-    for place in range(FIRST_INVALID, len(PIXEL_CLASSES)):
-        places[causes == PIXEL_CLASSES[place].flag] = place
+    for place, kind in enumerate(PIXEL_CLASSES[2:], start=2):
+        places[causes == kind.flag] = place
     return places
 
 
@@ -48,3 +47,18 @@ def class_counts(counts: dict[str, Any]) -> list[int]:
     """Return the number of pixels in each of PIXEL_CLASSES from the section ``counts`` of ``run.json``."""
     regularized = counts["low_confidence"]
     return [counts["valid"] - regularized, regularized, *counts["causes"].values()]
+
+
+def limits(values: np.ndarray, otherwise: tuple[float, float] = (0, 1), cut: float = 1) -> tuple[float, float]:
+    """Return the finite values of which ``cut`` percent are below and above; ``otherwise`` if there are none."""
+    known = values[np.isfinite(values)]
+    if known.size == 0:
+        return otherwise
+    low, high = (float(end) for end in np.percentile(known, (cut, 100 - cut), method="nearest"))
+    return (low, high) if low < high else (low - 0.5, high + 0.5)
+
+
+def widest(widths: np.ndarray, cut: float) -> float:
+    """Return the finite width that ``cut`` percent exceed; 1 if it is zero or there are none."""
+    known = widths[np.isfinite(widths)]
+    return float(np.percentile(known, 100 - cut, method="nearest") or 1.0) if known.size else 1.0

@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from sat_intervals.products import INVALID, Bands
+from sat_intervals.products import INVALID
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, limits, page, say_empty
+from sat_intervals.show.canvas import DPI, INK, NOTHING, fitting, page, say_empty
 from sat_intervals.show.cost_curve import Curve, read_curve
-from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION
+from sat_intervals.show.legend import BLUE, ORANGE, SKY, VERMILION, limits
 from sat_intervals.tiling import Window
 
 _WIDTH, _STRIP = 12.0, 1.0  # inches: of the page, and height of the image above a profile
@@ -61,24 +61,26 @@ def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int =
     """
     curve = read_curve(results, row, column)
     pixel = results.read_pixel(row, column)
+    title = f"Row {row}, column {column}, {'rejected' if pixel.validity & INVALID else 'valid'}"
+    if np.isfinite(pixel.confidence):
+        title += f", confidence {pixel.confidence:.2f}"
     search = results.config.disparity
     margin = max(1.0, 0.02 * search.count)
     across = (search.minimum - margin, search.maximum + margin)
-    with page(target, (9.0, 7.5), dpi, _describe(row, column, pixel)) as figure:
+    with page(target, (9.0, 7.5), dpi, title) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
         above.plot(curve.disparities, curve.costs, color="black", lw=1, marker="o", ms=3, label="cost curve")
         below.plot(curve.disparities, curve.possibilities, color="black", lw=1, marker="o", ms=3, label="possibility")
-        if curve.lower is not None:
+        if curve.cut.any():
             _draw_cut(below, curve, results)
         if np.isfinite(pixel.lower):
             text = f"interval written, {pixel.lower:.4g} to {pixel.upper:.4g} px"
             # The marker shows an interval of zero width.
             bar = {"color": ORANGE, "lw": 6, "solid_capstyle": "butt", "marker": "|", "ms": 9, "mew": 3, "label": text}
             below.plot([pixel.lower, pixel.upper], [-0.08, -0.08], **bar)
-        lines = (("disparity", curve.disparity, "black", ":"), ("truth", pixel.truth, VERMILION, "-"))
+        lines = [("disparity", curve.disparity, "black", ":")]
+        lines += [("truth", float(pixel.truth), VERMILION, "-")] if np.isfinite(pixel.truth) else []
         for name, place, colour, style in lines:
-            if not np.isfinite(place):
-                continue
             shown = across[0] <= place <= across[1]
             label = f"{name} {place:.2f} px" + ("" if shown else ", outside the range shown")
             above.axvline(place, color=colour, lw=1, ls=style, label=label)
@@ -89,25 +91,14 @@ def draw_curve(results: Results, target: Path, row: int, column: int, dpi: int =
         _finish_chart(below, "disparity (px)", "possibility", across)
 
 
-def _describe(row: int, column: int, pixel: Bands) -> str:
-    parts = [f"Row {row}, column {column}", "rejected" if pixel.validity & INVALID else "valid"]
-    parts += [f"confidence {pixel.confidence:.2f}"] if np.isfinite(pixel.confidence) else []
-    return ", ".join(parts)
-
-
 def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     """Draw the alpha-cut of the possibilities and the interval derived from it."""
-    assert curve.lower is not None
-    assert curve.upper is not None
-    assert curve.level is not None
     interval = results.config.interval
     name = f"level {curve.level:.3f}" if interval is None or interval.alpha is None else f"alpha = {curve.level:g}"
     chart.axhline(curve.level, color=INK, lw=0.8, ls="--")
-    right = chart.get_yaxis_transform()
-    chart.text(1, curve.level, name, transform=right, ha="right", va="bottom", color=INK)
-    cut = curve.cut
-    chart.plot(curve.disparities[cut], curve.possibilities[cut], "o", color=BLUE, ms=6, label="cut")
-    inside = curve.disparities[cut]
+    chart.text(1, curve.level, name, transform=chart.get_yaxis_transform(), ha="right", va="bottom", color=INK)
+    inside = curve.disparities[curve.cut]
+    chart.plot(inside, curve.possibilities[curve.cut], "o", color=BLUE, ms=6, label="cut")
     wider = not results.config.has_coverage and (curve.lower < inside.min() or curve.upper > inside.max())
     ends = f"{curve.lower:.4g} to {curve.upper:.4g} px"
     text = f"interval, {ends}:\ncut pushed out by refinement" if wider else f"interval of the cut, {ends}"
@@ -116,16 +107,13 @@ def _draw_cut(chart: Axes, curve: Curve, results: Results) -> None:
     chart.annotate("", (curve.lower, 0.05), (curve.upper, 0.05), arrowprops=arrow)
 
 
-def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float] | None) -> None:
+def _finish_chart(chart: Axes, across: str, up: str, shown: tuple[float, float]) -> None:
     """Set axis labels, limits, grid and legend."""
-    chart.set(xlabel=across, ylabel=up)
-    if shown:
-        chart.set_xlim(shown)
+    chart.set(xlabel=across, ylabel=up, xlim=shown)
     chart.grid(axis="y", color="#e8e8e8", zorder=0)
     chart.spines[["top", "right"]].set_visible(False)
-    if chart.get_legend_handles_labels()[0]:
-        keys = _KEYS if len(chart.get_legend_handles_labels()[0]) < _KEYS else _KEYS // 2  # else too wide for the page
-        chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=keys, frameon=False, borderaxespad=0.2)
+    keys = _KEYS if len(chart.get_legend_handles_labels()[0]) < _KEYS else _KEYS // 2  # else too wide for the page
+    chart.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=keys, frameon=False, borderaxespad=0.2)
 
 
 def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, dpi: int) -> None:
@@ -135,7 +123,7 @@ def _draw_strip(panel: Axes, results: Results, row: int, first: int, last: int, 
     top, bottom = max(0, row - reach), min(results.region.height, row + reach + 1)
     window = Window(top, first, bottom - top, columns)
     image = results.read_small_left(window, fitting((window.height, window.width), (_STRIP, _WIDTH), dpi))
-    low, high = limits(image, (0, 1))
+    low, high = limits(image)
     extent = (first - 0.5, last + 0.5, bottom - 0.5, top - 0.5)
     panel.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, aspect="auto", interpolation="nearest")
     panel.axhline(row, color=ORANGE, lw=1.2, ls="--")

@@ -6,6 +6,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
+from logging import getLogger
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
@@ -15,31 +16,39 @@ from sat_intervals.errors import SatIntervalsError
 from sat_intervals.products import BANDS, POINTS, SURFACE
 from sat_intervals.raster import (
     Georeferencing,
-    is_surface,
     open_image,
     read_layers,
     read_place,
-    read_shape,
     read_small_image,
     read_small_layers,
+    write_file,
 )
-from sat_intervals.raster.published import is_points_of, is_surface_of
-from sat_intervals.raster.publishing import write_file
 from sat_intervals.results import Run, open_input, open_run
 from sat_intervals.show import styles
 from sat_intervals.tiling import Window
 
-# Longest side in pixels of what percentiles are taken from.
-_LONGEST = 1024
+_LONGEST = 1024  # pixels, longest side of what percentiles are taken from
 _MULTIPLY = 6  # QGIS' blend mode
 _CHECKED = "Qt::Checked"
-# Names of rasters with a default style.
+# Rasters with a default style.
 _STYLED = "intervals", "width", "validity", "points", "dsm", "dsm_half_width"
+
+_LOG = getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A file or GDAL name, its place and size; ``virtual`` is its content if the project makes it."""
+
+    source: str | Path
+    place: Georeferencing
+    shape: tuple[int, int]
+    virtual: bytes = b""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of the project: group, name and meaning in the list, a file or GDAL name, place and size, and colours.
+    """A layer of the project: group, name and meaning in the list, its raster, and colours.
 
     ``is_default``: the raster alone gets this style, too; ``blend`` is QGIS' mode over the layers below.
     """
@@ -47,25 +56,15 @@ class Layer:
     group: str
     name: str
     meaning: str
-    source: str | Path
-    place: Georeferencing
-    shape: tuple[int, int]
+    raster: Raster
     renderer: Element
     is_default: bool = False
     is_shown: bool = False
     blend: int = 0
 
 
-@dataclass(frozen=True)
-class Written:
-    """The contents of the files that were written, and lines about what was left out."""
-
-    files: dict[Path, bytes]
-    notes: list[str]
-
-
-def write_project(out: str | Path) -> Written:
-    """Write ``project.qgz`` to the folder of a finished run, and the default styles of its rasters.
+def write_project(out: str | Path) -> list[Path]:
+    """Write ``project.qgz`` to the folder of a finished run, and the default styles of its rasters; return the files.
 
     The project has the images and the truth, disparity, interval width, confidence and validity; if ``points.tif`` and
     ``dsm.tif`` are of this run, also their heights. Paths in it are relative where the files are local.
@@ -73,82 +72,68 @@ def write_project(out: str | Path) -> Written:
     run = open_run(out)
     file = run.out / "project.qgz"
     run.check_kept([file, *(run.out / f"{name}{end}" for name in _STYLED for end in (".qml", ".vrt"))])
-    written = Written({}, [])
-    layers = [*_surface(run, written), *_points(run, written), *_results(run, written)]
+    layers = [*_surface(run), *_points(run), *_results(run)]
+    written = {Path(layer.raster.source): layer.raster.virtual for layer in layers if layer.raster.virtual}
     for layer in layers:
         if layer.is_default:
-            written.files[run.out / f"{Path(layer.source).stem}.qml"] = styles.default_style(layer.renderer)
-    layers += _images(run, written)
+            written[Path(layer.raster.source).with_suffix(".qml")] = styles.default_style(layer.renderer)
     content = BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(_project(run, layers), styles.HEAD))
-    written.files[file] = content.getvalue()
-    for path, text in written.files.items():
+        root = _project(run, [*layers, *_images(run)])
+        archive.writestr(zipfile.ZipInfo("project.qgs"), styles.text_of(root, styles.HEAD))
+    written[file] = content.getvalue()
+    for path, text in written.items():
         write_file(path, text)
-    return written
+    return list(written)
 
 
-def _results(run: Run, written: Written) -> Iterator[Layer]:
-    file, group = run.out / "intervals.tif", "Disparity"
-    place = run.georeferencing
-    disparity, lower, upper, _ = read_small_layers(file, _fitting(run.shape))
+def _results(run: Run) -> Iterator[Layer]:
+    group, shape, place = "Disparity", run.shape, run.georeferencing
+    intervals = Raster(run.out / "intervals.tif", place, shape)
+    validity = Raster(run.out / "validity.tif", place, shape)
+    disparity, lower, upper, _ = read_small_layers(intervals.source, _fitting(shape))
     counts = np.zeros(1 << 16, np.int64)
     for window in run.windows():
-        counts += np.bincount(read_layers(run.out / "validity.tif", window).ravel(), minlength=counts.size)
-    flags = styles.validity_classes(counts)
-    yield Layer(group, "validity", "flags of every pixel", run.out / "validity.tif", place, run.shape, flags, True)
-    unclear = styles.ramped(4, np.linspace(0, 1, len(styles.CIVIDIS)), styles.CIVIDIS)
-    yield Layer(group, "confidence", BANDS[3].meaning, file, place, run.shape, unclear)
-    width = run.out / "width.vrt"
+        counts += np.bincount(read_layers(validity.source, window).ravel(), minlength=counts.size)
+    yield Layer(group, "validity", "flags of every pixel", validity, styles.validity_classes(counts), True)
+    yield Layer(group, "confidence", BANDS[3].meaning, intervals, styles.shares(4))
     if run.config.interval:
-        written.files[width] = styles.difference((file.name, 3, 2), place, run.shape)
+        width = Raster(run.out / "width.vrt", place, shape, styles.difference(("intervals.tif", 3, 2), place, shape))
         wide = styles.widths(1, upper - lower, unit="px")
-        yield Layer(group, "interval width", "upper - lower bound, pixels", width, place, run.shape, wide, True)
+        yield Layer(group, "interval width", "upper - lower bound, pixels", width, wide, True)
     ramp = styles.colours(1, disparity, styles.VIRIDIS, unit="px")
-    yield Layer(group, "disparity", BANDS[0].meaning, file, place, run.shape, ramp, True, True)
+    yield Layer(group, "disparity", BANDS[0].meaning, intervals, ramp, True, True)
 
 
-def _points(run: Run, written: Written) -> Iterator[Layer]:
-    file = run.out / "points.tif"
-    if not file.exists():
+def _points(run: Run) -> Iterator[Layer]:
+    if not run.has_current("points.tif"):
         return
-    if not is_points_of(file, run.report["finished"]) or read_shape(file)[1:] != run.shape:
-        written.notes.append(f"{file} belongs to another run and is left out: rerun sat-intervals triangulate")
-        return
-    place = run.georeferencing
-    bands = read_small_layers(file, _fitting(run.shape))
+    points = Raster(run.out / "points.tif", run.georeferencing, run.shape)
+    bands = read_small_layers(points.source, _fitting(run.shape))
     for number, ramp in ((6, styles.MAGMA), (3, styles.VIRIDIS)):
-        name, is_height = POINTS[number - 1].name, number == 3
-        renderer = styles.colours(number, bands[number - 1], ramp, unit="m")
-        yield Layer(
-            "Points", f"{name} of points", POINTS[number - 1].meaning, file, place, run.shape, renderer, is_height
-        )
+        band, renderer = POINTS[number - 1], styles.colours(number, bands[number - 1], ramp, unit="m")
+        yield Layer("Points", f"{band.name} of points", band.meaning, points, renderer, band.name == "height")
 
 
-def _surface(run: Run, written: Written) -> Iterator[Layer]:
-    file, group = run.out / "dsm.tif", "Heights"
-    if not file.exists():
+def _surface(run: Run) -> Iterator[Layer]:
+    if not run.has_current("dsm.tif"):
         return
-    if not is_surface_of(file, run.report["finished"]) or not is_surface(file):
-        written.notes.append(f"{file} is of another run or of earlier points and is left out: rerun sat-intervals dsm")
-        return
+    group, file = "Heights", run.out / "dsm.tif"
     shape, place = read_place(file)
-    bands = dict(zip((band.name for band in SURFACE), read_small_layers(file, _fitting(shape)), strict=True))
-    half = run.out / "dsm_half_width.vrt"
-    written.files[half] = styles.difference((file.name, 3, 2), place, shape, 0.5)
-    wide = styles.widths(1, (bands["height_upper"] - bands["height_lower"]) / 2, unit="m")
-    yield Layer(group, "half width", "half the width of the height's interval, m", half, place, shape, wide, True)
-    unclear = styles.ramped(5, np.linspace(0, 1, len(styles.CIVIDIS)), styles.CIVIDIS)
-    yield Layer(group, "confidence of heights", SURFACE[4].meaning, file, place, shape, unclear)
-    ramp = styles.colours(1, bands["height"], styles.VIRIDIS, unit="m")
-    yield Layer(group, "height", SURFACE[0].meaning, file, place, shape, ramp, True, True, _MULTIPLY)
-    yield Layer(group, "hillshade", "shaded heights", file, place, shape, styles.hillshade(1), is_shown=True)
+    surface = Raster(file, place, shape)
+    half = Raster(run.out / "dsm_half_width.vrt", place, shape, styles.difference((file.name, 3, 2), place, shape, 0.5))
+    height, lower, upper, *_ = read_small_layers(file, _fitting(shape))
+    wide = styles.widths(1, (upper - lower) / 2, unit="m")
+    yield Layer(group, "half width", "half the width of the height's interval, m", half, wide, True)
+    yield Layer(group, "confidence of heights", SURFACE[4].meaning, surface, styles.shares(5))
+    ramp = styles.colours(1, height, styles.VIRIDIS, unit="m")
+    yield Layer(group, "height", SURFACE[0].meaning, surface, ramp, True, True, _MULTIPLY)
+    yield Layer(group, "hillshade", "shaded heights", surface, styles.hillshade(1), is_shown=True)
 
 
-def _images(run: Run, written: Written) -> Iterator[Layer]:
+def _images(run: Run) -> Iterator[Layer]:
     """Yield truth and images; those that cannot be opened, or were changed since the run, are left out."""
-    names = ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right")
-    for name in names:
+    for name in ("truth", "left", "right") if run.truth_beside.exists() else ("left", "right"):
         try:
             image = open_input(run.report["inputs"]["left" if name == "truth" else name])
             if name == "truth":
@@ -156,14 +141,13 @@ def _images(run: Run, written: Written) -> Iterator[Layer]:
             shape = image.height, image.width
             pixels = read_small_image(image, Window(0, 0, *shape), _fitting(shape))
         except SatIntervalsError as error:
-            written.notes.append(f"the {name} image is left out: {error}")
+            _LOG.warning("the %s image is left out: %s", name, error)
             continue
         renderer = styles.grey(image.band, pixels)
         if name == "truth":
             renderer = styles.colours(1, pixels, styles.VIRIDIS, unit="px")
-        yield Layer(
-            "Images", name, f"{name} image", image.path, image.georeferencing, shape, renderer, is_shown=name == "left"
-        )
+        raster = Raster(image.path, image.georeferencing, shape)
+        yield Layer("Images", name, f"{name} image", raster, renderer, is_shown=name == "left")
 
 
 def _fitting(shape: tuple[int, int]) -> tuple[int, int]:
@@ -176,7 +160,7 @@ def _project(run: Run, layers: list[Layer]) -> Element:
     """Return the project; the first layer is on top, and its CRS and extent are those of the map."""
     root = Element("qgis", version=styles.VERSION, projectname=run.out.resolve().name)
     SubElement(root, "title").text = run.out.resolve().name
-    first = layers[0]
+    first = layers[0].raster
     _add_crs(SubElement(root, "projectCrs"), first.place)
     tree = SubElement(root, "layer-tree-group")
     groups: dict[str, Element] = {}
@@ -185,19 +169,14 @@ def _project(run: Run, layers: list[Layer]) -> Element:
         if layer.group not in groups:
             groups[layer.group] = SubElement(tree, "layer-tree-group", name=layer.group, checked=_CHECKED, expanded="1")
         key = re.sub(r"\W", "_", f"{layer.group}_{layer.name}".lower())
-        source = _relative(layer.source, run.out)
-        SubElement(
-            groups[layer.group],
-            "layer-tree-layer",
-            {"id": key, "name": layer.name, "source": source, "providerKey": "gdal", "expanded": "0"}
-            | {"checked": _CHECKED if layer.is_shown else "Qt::Unchecked"},
-        )
+        source = _relative(layer.raster.source, run.out)
+        about = {"id": key, "name": layer.name, "source": source, "providerKey": "gdal", "expanded": "0"}
+        about["checked"] = _CHECKED if layer.is_shown else "Qt::Unchecked"
+        SubElement(groups[layer.group], "layer-tree-layer", about)
         _add_layer(listed, layer, key, source)
     canvas = SubElement(root, "mapcanvas", name="theMapCanvas")
-    SubElement(canvas, "units").text = "meters"
-    extent = SubElement(canvas, "extent")
-    for name, value in zip(("xmin", "ymin", "xmax", "ymax"), _extent(first), strict=True):
-        SubElement(extent, name).text = repr(value)
+    styles.add_texts(canvas, units="meters")
+    styles.add_texts(SubElement(canvas, "extent"), **_extent(first))
     _add_crs(SubElement(canvas, "destinationsrs"), first.place)
     properties = SubElement(root, "properties")
     SubElement(SubElement(properties, "Paths"), "Absolute", type="bool").text = "false"
@@ -208,10 +187,8 @@ def _project(run: Run, layers: list[Layer]) -> Element:
 
 def _add_layer(listed: Element, layer: Layer, key: str, source: str) -> None:
     element = SubElement(listed, "maplayer", type="raster")
-    for tag, text in (("id", key), ("datasource", source), ("layername", layer.name), ("provider", "gdal")):
-        SubElement(element, tag).text = text
-    SubElement(element, "abstract").text = layer.meaning
-    _add_crs(SubElement(element, "srs"), layer.place)
+    styles.add_texts(element, id=key, datasource=source, layername=layer.name, provider="gdal", abstract=layer.meaning)
+    _add_crs(SubElement(element, "srs"), layer.raster.place)
     styles.add_style(element, layer.renderer, layer.blend)
 
 
@@ -224,10 +201,10 @@ def _add_crs(parent: Element, place: Georeferencing) -> None:
             SubElement(system, "authid").text = f"EPSG:{code}"
 
 
-def _extent(layer: Layer) -> tuple[float, float, float, float]:
-    """Return west, south, east, north of a layer; without georeferencing, QGIS counts rows downwards from 0."""
-    height, width = layer.shape
-    place = layer.place
+def _extent(raster: Raster) -> dict[str, str]:
+    """Return the extent of a raster; without georeferencing, QGIS counts rows downwards from 0."""
+    height, width = raster.shape
+    place = raster.place
     if place.transform is not None:
         a, b, c, d, e, f = place.transform[:6]
         ends = ((0, 0), (width, 0), (0, height), (width, height))
@@ -235,9 +212,10 @@ def _extent(layer: Layer) -> tuple[float, float, float, float]:
     elif place.gcps:
         corners = [(point.x, point.y) for point in place.gcps]
     else:
-        corners = [(0.0, float(-height)), (float(width), 0.0)]
-    xs, ys = ([float(value) for value in values] for values in zip(*corners, strict=True))
-    return min(xs), min(ys), max(xs), max(ys)
+        corners = [(0.0, -height), (width, 0.0)]
+    xs, ys = zip(*corners, strict=True)
+    extent = {"xmin": min(xs), "ymin": min(ys), "xmax": max(xs), "ymax": max(ys)}
+    return {name: repr(float(value)) for name, value in extent.items()}
 
 
 def _relative(source: str | Path, folder: Path) -> str:

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.results import Results
-from sat_intervals.show.canvas import DPI, INK, page
+from sat_intervals.show.canvas import DPI, INK, Frame, MapLayer, draw_layer, page
 from sat_intervals.show.legend import BLUE, SKY
 
 
@@ -34,17 +34,14 @@ def draw_range(results: Results, target: Path, dpi: int = DPI) -> None:
         if found:
             _draw_matches(next(charts), found, (search.minimum, search.maximum))
         if local:
-            ranges, shown = LocalRanges.of_report(local), (search.minimum, search.maximum)
+            ranges = LocalRanges.of_report(local)
+            rows, columns = ranges.minimum.shape
+            frame = Frame.of((ranges.height * rows, ranges.width * columns))
             used = "" if report.get("local_ranges") else ", not used"
-            for name in ("minimum", "maximum"):
-                panel = next(charts)
-                height, width = ranges.height * ranges.minimum.shape[0], ranges.width * ranges.minimum.shape[1]
-                drawn = panel.imshow(
-                    getattr(ranges, name), vmin=shown[0], vmax=shown[1], extent=(-0.5, width - 0.5, height - 0.5, -0.5)
-                )
-                panel.set(title=f"Local {name}{used}", xlabel="column of the left image", ylabel="row")
-                figure.colorbar(drawn, ax=panel, shrink=0.8).set_label("px")
-            panel.set_title(f"Local maximum{used}: {100 * ranges.share:.0f} % searched")
+            share = f": {100 * ranges.share:.0f} % searched"
+            for title, ends in (("minimum" + used, ranges.minimum), ("maximum" + used + share, ranges.maximum)):
+                layer = MapLayer(f"Local {title}", "px", ends, "viridis", (search.minimum, search.maximum))
+                draw_layer(next(charts), frame, layer)
 
 
 def _draw_matches(chart: Axes, found: dict[str, Any], searched: tuple[int, int]) -> None:

@@ -6,9 +6,9 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from sat_intervals.products import FLAGS, INVALID
+from sat_intervals.products import FLAGS
 from sat_intervals.raster import Georeferencing
-from sat_intervals.show.legend import PIXEL_CLASSES, classify
+from sat_intervals.show.legend import PIXEL_CLASSES, classify, limits, widest
 
 # Colours at equal steps of matplotlib's maps.
 VIRIDIS = "#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"
@@ -25,26 +25,27 @@ _CUT = 2.0
 
 def colours(band: int, values: np.ndarray, ramp: Sequence[str], *, unit: str = "") -> Element:
     """Return a renderer that spreads colours from the 2nd to the 98th percentile of values; NaN are left out."""
-    known = values[np.isfinite(values)]
-    first, last = np.percentile(known, (_CUT, 100 - _CUT)) if known.size else (0.0, 1.0)
-    return ramped(band, np.linspace(first, last if last > first else first + 1, len(ramp)), ramp, unit=unit)
+    return _ramped(band, np.linspace(*limits(values, cut=_CUT), len(ramp)), ramp, unit)
+
+
+def shares(band: int) -> Element:
+    """Return a renderer of values from 0 to 1."""
+    return _ramped(band, np.linspace(0, 1, len(CIVIDIS)), CIVIDIS)
 
 
 def widths(band: int, values: np.ndarray, *, unit: str) -> Element:
     """Return a renderer of widths from 0 to their 98th percentile; small ones get more colours, by square roots."""
-    known = values[np.isfinite(values)]
-    last = float(np.percentile(known, 100 - _CUT)) if known.size else 0.0
-    return ramped(band, (last or 1.0) * np.linspace(0, 1, len(MAGMA)) ** 2, MAGMA, unit=unit)
+    places = widest(values, _CUT) * np.linspace(0, 1, len(MAGMA)) ** 2
+    return _ramped(band, places, MAGMA, unit)
 
 
-def ramped(band: int, places: Sequence[float] | np.ndarray, ramp: Sequence[str], *, unit: str = "") -> Element:
+def _ramped(band: int, places: np.ndarray, ramp: Sequence[str], unit: str = "") -> Element:
     """Return a renderer that interpolates colours between values."""
     first, last = f"{places[0]:.6g}", f"{places[-1]:.6g}"
     renderer = _renderer("singlebandpseudocolor", band=band, classificationMin=first, classificationMax=last)
+    ends = {"minimumValue": first, "maximumValue": last}
     kind = {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
-    shader = SubElement(
-        SubElement(renderer, "rastershader"), "colorrampshader", kind | {"minimumValue": first, "maximumValue": last}
-    )
+    shader = SubElement(SubElement(renderer, "rastershader"), "colorrampshader", kind | ends)
     for place, colour in zip(places, ramp, strict=True):
         label = f"{place:.4g} {unit}".strip()
         SubElement(shader, "item", value=f"{place:.6g}", label=label, color=colour, alpha="255")
@@ -53,13 +54,10 @@ def ramped(band: int, places: Sequence[float] | np.ndarray, ramp: Sequence[str],
 
 def grey(band: int, values: np.ndarray) -> Element:
     """Return a renderer of an image, from the 2nd to the 98th percentile of its values."""
-    known = values[np.isfinite(values)]
-    first, last = np.percentile(known, (_CUT, 100 - _CUT)) if known.size else (0.0, 1.0)
     renderer = _renderer("singlebandgray", grayBand=band, gradient="BlackToWhite")
     stretch = SubElement(renderer, "contrastEnhancement")
-    for name, text in (("minValue", f"{first:.6g}"), ("maxValue", f"{last:.6g}")):
-        SubElement(stretch, name).text = text
-    SubElement(stretch, "algorithm").text = "StretchToMinimumMaximum"
+    first, last = limits(values, cut=_CUT)
+    add_texts(stretch, minValue=f"{first:.6g}", maxValue=f"{last:.6g}", algorithm="StretchToMinimumMaximum")
     return renderer
 
 
@@ -75,18 +73,14 @@ def validity_classes(counts: np.ndarray) -> Element:
     present = np.flatnonzero(counts)
     classes = classify(present.astype(np.uint16))
     for place in np.lexsort((-counts[present], classes)):
-        value, kind = int(present[place]), PIXEL_CLASSES[classes[place]]
-        share = 100 * counts[value] / counts.sum()
-        label = f"{value}: {_meaning(value)} ({share:.2g} %)"
-        SubElement(palette, "paletteEntry", value=str(value), color=kind.colour, label=label, alpha="255")
+        value, colour = int(present[place]), PIXEL_CLASSES[classes[place]].colour
+        flags = [flag for flag in FLAGS if flag.value & value]
+        # What makes a pixel invalid comes first.
+        names = [flag.name for flag in flags if flag.invalid] or ["valid"]
+        names += [flag.name for flag in flags if not flag.invalid]
+        label = f"{value}: {', '.join(names).replace('_', ' ')} ({100 * counts[value] / counts.sum():.2g} %)"
+        SubElement(palette, "paletteEntry", value=str(value), color=colour, label=label, alpha="255")
     return renderer
-
-
-def _meaning(value: int) -> str:
-    """Return the names of the flags of a value; what makes a pixel invalid comes first."""
-    names = [flag.name.replace("_", " ") for flag in FLAGS if flag.value & value & INVALID] or ["valid"]
-    names += [flag.name.replace("_", " ") for flag in FLAGS if flag.value & value & ~INVALID]
-    return ", ".join(names)
 
 
 def _renderer(kind: str, **attributes: object) -> Element:
@@ -123,36 +117,37 @@ def difference(
     root = Element("VRTDataset", rasterXSize=str(shape[1]), rasterYSize=str(shape[0]))
     _add_place(root, place)
     band = SubElement(root, "VRTRasterBand", dataType="Float32", band="1", subClass="VRTDerivedRasterBand")
-    for tag, text in (("NoDataValue", "nan"), ("PixelFunctionType", "diff"), ("SourceTransferType", "Float32")):
-        SubElement(band, tag).text = text
+    add_texts(band, NoDataValue="nan", PixelFunctionType="diff", SourceTransferType="Float32")
     for number in (upper, lower):
         of_band = SubElement(band, "ComplexSource")
         SubElement(of_band, "SourceFilename", relativeToVRT="1").text = name
-        SubElement(of_band, "SourceBand").text = str(number)
-        SubElement(of_band, "ScaleOffset").text = "0"
-        SubElement(of_band, "ScaleRatio").text = f"{factor:g}"
+        add_texts(of_band, SourceBand=str(number), ScaleOffset="0", ScaleRatio=f"{factor:g}")
     return text_of(root)
 
 
 def _add_place(root: Element, place: Georeferencing) -> None:
-    options = place.creation_options()
-    if place.gcps and place.transform is None:
+    if place.transform is not None:
+        SubElement(root, "GeoTransform").text = ", ".join(map(repr, place.transform.to_gdal()))
+    elif place.gcps:
         points = SubElement(root, "GCPList", Projection=place.gcps_crs.to_wkt() if place.gcps_crs else "")
         for row, column, x, y, z in place.gcps:
             at = {"Pixel": column, "Line": row, "X": x, "Y": y, "Z": z}
             SubElement(points, "GCP", {key: repr(float(value)) for key, value in at.items()})
     if place.crs:
         SubElement(root, "SRS", dataAxisToSRSAxisMapping="1,2").text = place.crs.to_wkt()
-    if place.transform is not None:
-        SubElement(root, "GeoTransform").text = ", ".join(map(repr, place.transform.to_gdal()))
-    if "rpcs" in options:
+    if place.rpcs is not None:
         rpcs = SubElement(root, "Metadata", domain="RPC")
-        for key, value in options["rpcs"].items():
+        for key, value in place.creation_options()["rpcs"].items():
             SubElement(rpcs, "MDI", key=key).text = str(value)
 
 
+def add_texts(parent: Element, **texts: str) -> None:
+    """Add an element with a text for each name."""
+    for name, text in texts.items():
+        SubElement(parent, name).text = text
+
+
 def text_of(root: Element, head: str = "") -> bytes:
-    """Return XML with a comment that names this tool."""
-    root.insert(0, ElementTree.Comment("made by sat-intervals"))
+    """Return XML as the content of a file."""
     ElementTree.indent(root, " ")
     return (head + ElementTree.tostring(root, encoding="unicode") + "\n").encode()

@@ -45,7 +45,8 @@ def ours(left, right, disparities, cost="census"):
     from sat_intervals import match_arrays
 
     minimum, maximum = search_range(disparities)
-    settings = {"disparity": {"minimum": minimum, "maximum": maximum}, "cost": {"method": cost}}
+    preset = "mccnn" if cost == "mccnn" else "paper"
+    settings = {"preset": preset, "disparity": {"minimum": minimum, "maximum": maximum}}
     left, right = (np.ma.masked_equal(image, 0) for image in (left, right))
     return lambda: match_arrays(left, right, settings)
 

@@ -24,7 +24,7 @@ SETTINGS = {
     "overlap 200": ["--set", "tiles.overlap=200"],
     "exact": ["--set", "tiles.overlap=exact"],
     "exact, tiles of 256": ["--set", "tiles.overlap=exact", "--tile-size", "256"],
-    "exact, `satellite`": ["--preset", "satellite"],
+    "exact, `paper`": ["--preset", "paper"],
 }
 
 

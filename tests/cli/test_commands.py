@@ -539,7 +539,7 @@ def test_match__interrupted_at_a_terminal_hears_nothing_of_its_workers(folder, t
 
 def test_match__on_a_disk_without_room_for_the_files_is_refused_and_goes_on_once_there_is_room(folder, tmp_path, disk):
     out, settings = disk(20 << 20) / "out", tmp_path / "settings.yaml"
-    settings.write_text("products: {compression: none}\n")
+    settings.write_text("products: {compression: zstd}\n")
     size = ("--tile-size", 64, "--set", "tiles.overlap=20")
     arguments = matching(folder, out, *size, "--quiet", "--keep-tiles", "--config", settings)
     command(*arguments)
@@ -818,12 +818,10 @@ def test_demo__makes_a_scene_matches_it_and_tells_how_often_the_interval_holds(t
     assert result.stderr == ""  # no warning, though much of a small scene lies beside the images' borders
     assert sorted(path.name for path in out.iterdir()) == sorted([LOCK, *OUTPUTS, "left.tif", "right.tif", "truth.tif"])
     lines = result.stdout.splitlines()
-    held, *compared = lines[next(i for i, line in enumerate(lines) if line.startswith("The interval contains")) :]
+    held = next(line for line in lines if line.startswith("The interval contains"))
     found = re.fullmatch(
         r"The interval contains the truth for (\d+\.\d) % of (\d+) pixels, at a mean width of (\d+\.\d\d) px\.", held
     )
-    compared = [line for line in compared if not line.startswith("matching again")][:2]
-    assert [line.split()[:3] for line in compared] == [["coverage", "0.9", "coverage"], ["alpha", "0.9", "coverage"]]
     scene = make_scene(150, 180, seed=4)
     with rasterio.open(out / "truth.tif") as file:
         np.testing.assert_array_equal(file.read(1), scene.truth)

@@ -14,6 +14,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC
 from rasterio.warp import reproject
 
+from sat_intervals.errors import SatIntervalsError
 from sat_intervals.tiling import Window
 
 PART = Window(430, 470, 340, 380)
@@ -102,6 +103,23 @@ def test_cars_plugin__of_another_version_leaves_cars_alone(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "sat_intervals needs CARS 1.3 and cannot be used with this version" in done.stderr
+
+
+@pytest.mark.peer("cars")
+def test_cars_method__has_the_penalties_of_cars_and_confidence_relative_to_its_range():
+    import cars  # noqa: F401
+
+    from sat_intervals.interop.cars_method import SatIntervals
+
+    config = SatIntervals(None)._config(-9, 4)
+    assert (config.preset, config.sgm.p1, config.sgm.p2, config.cost.window) == ("paper", 8, 32, 5)
+    assert (config.ambiguity.normalization, config.interval.coverage) == ("range", None)
+    given = {"preset": "satellite", "interval": {"coverage": 0.9}}
+    config = SatIntervals({"settings": given})._config(-9, 4)
+    assert (config.sgm.p2, config.ambiguity.normalization, float(config.interval.coverage)) == (128, "percentile", 0.9)
+    for wrong in ({"disparity": {"minimum": 0}}, {"interval": None}):
+        with pytest.raises(SatIntervalsError, match="leave out disparity, and null for interval or ambiguity"):
+            SatIntervals({"settings": wrong})
 
 
 @pytest.mark.peer("cars")

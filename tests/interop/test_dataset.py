@@ -1,13 +1,10 @@
 """Finished runs as lazy datasets."""
 
-import subprocess
-import sys
-
 import dask.array
 import numpy as np
 import pytest
 import xarray as xr
-from finished import PLACE, random_bands, write_run
+from finished import FINISHED, PLACE, random_bands, write_points, write_run
 from numpy.testing import assert_allclose, assert_array_equal
 
 import sat_intervals
@@ -31,7 +28,6 @@ def test_open__is_lazy_and_has_the_pixels_of_the_files(made):
     for name, band in zip(("disparity", "lower", "upper", "confidence"), bands, strict=True):
         assert_array_equal(dataset[name], band)
     assert_array_equal(dataset["validity"], validity)
-    assert_array_equal(dataset["width"], bands[2] - bands[1])
     part = dataset["disparity"][5:60:7, ::-3]
     assert_array_equal(part, bands[0][5:60:7, ::-3])
     assert_allclose(dataset["confidence"][3, 4], bands[3, 3, 4])
@@ -44,6 +40,17 @@ def test_open__without_chunks_reads_when_indexed(made):
     assert_array_equal(dataset["upper"][10:2:-2, 7:7], bands[2][10:2:-2, 7:7])
     assert_array_equal(dataset["upper"][10:2:-2, 7], bands[2][10:2:-2, 7])
     assert_array_equal(dataset["upper"].isel(x=[5, 2, 80]), bands[2][:, [5, 2, 80]])
+
+
+def test_open__has_the_points_of_the_run_only(tmp_path, caplog):
+    bands, validity, _ = random_bands(7, 9)
+    out = write_run(tmp_path, bands, validity)
+    write_points(out, heights := np.arange(63.0).reshape(7, 9))
+    assert_array_equal(sat_intervals.open(out)["height"], heights)
+    report = (out / "run.json").read_text()
+    (out / "run.json").write_text(report.replace(FINISHED, "2026-11-22T12:00:00+00:00"))
+    assert "height" not in sat_intervals.open(out)
+    assert "points.tif is of another run or of earlier points and is left out" in caplog.text
 
 
 @pytest.mark.peer("rioxarray", "odc.geo")
@@ -86,7 +93,8 @@ def test_accessor__coverage_is_the_accuracy_of_evaluate(made):
 
 def test_accessor__width_and_profile(made):
     dataset, _, bands, _, _ = made
-    assert_array_equal(dataset.intervals.width(), bands[2] - bands[1])
+    for width in (dataset["width"], dataset.intervals.width()):
+        assert_array_equal(width, bands[2] - bands[1])
     profile = dataset.intervals.profile(69, (3, 8))
     assert isinstance(profile["upper"].data, np.ndarray)
     assert_array_equal(profile["upper"], bands[2, 69, 3:9])
@@ -94,16 +102,3 @@ def test_accessor__width_and_profile(made):
     for row, columns in ((70, None), (-1, None), (0, (5, 90)), (0, (8, 3))):
         with pytest.raises(SatIntervalsError, match="are outside the dataset: rows are 0 to 69, columns 0 to 89"):
             dataset.intervals.profile(row, columns)
-
-
-def test_open__refuses_what_is_no_run(tmp_path):
-    with pytest.raises(SatIntervalsError, match="give the folder of a finished run"):
-        sat_intervals.open(tmp_path)
-
-
-@pytest.mark.process
-def test_accessor__is_registered_on_first_use_only() -> None:
-    code = "import sat_intervals, xarray as xr; a = hasattr(xr.Dataset, 'intervals'); sat_intervals.open; "
-    code += "print(a, hasattr(xr.Dataset, 'intervals'))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "False True\n"

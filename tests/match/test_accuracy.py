@@ -34,7 +34,8 @@ def test_match_arrays__is_as_accurate_as_the_reference(shared_data, name, method
     folder = shared_data / name
     minimum, maximum = json.loads((folder / "meta.json").read_text())["disparity"]
     left, right, truth = (read(folder / f"{layer}.tif") for layer in ("left", "right", "truth"))
-    settings = {"disparity": {"minimum": minimum, "maximum": maximum}, "cross_check": {"method": method}}
+    search = {"minimum": minimum, "maximum": maximum}
+    settings = {"preset": "paper", "disparity": search, "cross_check": {"method": method}}
     result = match_arrays(left, right, settings)
     lower, upper = result["lower"].to_numpy(), result["upper"].to_numpy()
     judged = np.isfinite(lower) & (truth >= minimum) & (truth <= maximum)

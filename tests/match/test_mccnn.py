@@ -61,7 +61,9 @@ def fp32(shared_data, tmp_path_factory):
 
 def settings(minimum, maximum, weights=None, **sections):
     cost = {"method": "mccnn", "weights": None if weights is None else str(weights)}
-    return load_config({"disparity": {"minimum": minimum, "maximum": maximum}, "cost": cost} | sections)
+    return load_config(
+        {"preset": "mccnn", "disparity": {"minimum": minimum, "maximum": maximum}, "cost": cost} | sections
+    )
 
 
 def masked_images(rows=34, columns=46, seed=1):
@@ -204,13 +206,10 @@ def test_compare__penalties_follow_both_images(network_file):
     np.testing.assert_array_equal(cost_volume(found.costs, kernel_settings(config), found.gradients), expected)
 
 
-@pytest.mark.parametrize("gradients", ["normalized", "raw"])
-def test_compare__a_right_area_is_a_left_one_of_swapped_images(network_file, gradients):
+def test_compare__a_right_area_is_a_left_one_of_swapped_images(network_file):
     left, right = masked_images()
     statistics = PairStatistics(ImageStatistics(490.0, 75.0), ImageStatistics(510.0, 85.0))
-    config, swapped = (
-        settings(*ends, network_file, sgm={"gradients": gradients, "span": 16}) for ends in ((-6, 3), (-3, 6))
-    )
+    config, swapped = (settings(*ends, network_file) for ends in ((-6, 3), (-3, 6)))
     window = Window(3, -4, 20, 30)
     both = [Area.of(Window(3, 1, 20, 25), config), Area.mirror(window, config)]
     _, found = costs_of(left, right, both, config, statistics)
@@ -229,29 +228,18 @@ def test_config__span_is_declared_and_held_to_what_can_be():
     assert settings(-9, 0, sgm=None).cost_span == 250
     with pytest.raises(SatIntervalsError, match=r"sgm\.span is 60, allowed: <= 48 with p2 4"):
         settings(-9, 0, sgm={"p2": 4, "span": 60})
-    with pytest.raises(SatIntervalsError, match=r"sgm\.gradients raw reads the right image at disparity 0"):
-        settings(1, 9, sgm={"gradients": "raw", "span": 16})
     with pytest.raises(SatIntervalsError, match=r"sgm\.p2 is 70, allowed: <= 63 with cost\.method mccnn"):
         settings(-9, 0, sgm={"p2": 70, "span": 16})
     with pytest.raises(SatIntervalsError, match=r"sgm.*: span is missing: its default, 16, .* another p1 and p2: give"):
         settings(-9, 0, sgm={"p1": 2.3, "p2": 42.3, "v": 1.5, "d": 0.08})
     assert settings(-9, 0, sgm={"p1": 0.5, "d": 0.08}) == settings(-9, 0)
-    with pytest.raises(SatIntervalsError, match=r"sgm lacks p1 and p2 and span: constant penalties have no defaults"):
-        settings(-9, 0, sgm={"penalty": "constant"})
+    with pytest.raises(SatIntervalsError, match=r"sgm\.span is missing: it has no default with cost\.method mccnn"):
+        settings(-9, 0, sgm={"penalty": "constant", "p1": 1, "p2": 2})
 
 
 def test_load_config__weights_are_named_wholly(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert settings(-9, 0, "some.onnx").cost.weights == str(tmp_path / "some.onnx")
-
-
-def test_load_config__another_cost_brings_its_own_penalties():
-    urban = {"disparity": {"minimum": 0, "maximum": 9}, "cost": {"window": 11}, "sgm": {"p1": 20, "p2": 80}}
-    assert load_config(urban, {"cost": {"method": "mccnn"}}) == settings(0, 9)
-    assert load_config(urban, {"cost": {"method": "census"}}) == load_config(urban)
-    back = load_config(settings(0, 9), {"cost": {"method": "census"}})
-    assert back == load_config({"disparity": {"minimum": 0, "maximum": 9}})
-    assert load_config(urban | {"sgm": None}, {"cost": {"method": "mccnn"}}).sgm is None
 
 
 # ---- Runs --------------------------------------------------------------------------------------------------
@@ -323,12 +311,12 @@ def test_match_pair__an_image_that_cannot_be_measured_fails_the_run(tmp_path, ne
         match_pair(*images, tmp_path / "out", settings(-4, 6, network_file))
 
 
-def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
+def test_match__preset_mccnn_brings_its_penalties_and_curves_are_drawn(tmp_path):
     left, right = masked_images(60, 80)
     images = write(tmp_path / "left.tif", left), write(tmp_path / "right.tif", right)
-    planned = invoke("plan", *images, "--disparity", -4, 6, "--cost", "mccnn")
+    planned = invoke("plan", *images, "--disparity", -4, 6, "--preset", "mccnn")
     assert planned.exit_code == 0, planned.output
-    matched = invoke("match", *images, tmp_path / "out", "--disparity", -4, 6, "--cost", "mccnn")
+    matched = invoke("match", *images, tmp_path / "out", "--disparity", -4, 6, "--preset", "mccnn")
     assert matched.exit_code == 0, matched.output
     assert "measuring images" in matched.stdout
     run = json.loads((tmp_path / "out" / "run.json").read_text())
@@ -348,16 +336,9 @@ def test_match__cost_brings_its_penalties_and_curves_are_drawn(tmp_path):
         read_curve(results, row, column)
 
 
-def test_evaluate__compares_both_costs_in_one_table(tmp_path):
+def test_ablate__takes_mccnn(tmp_path):
     write_pair(tmp_path, make_scene(120, 160), group="city")
-    result = invoke("evaluate", "--cost", "census", "--cost", "mccnn", tmp_path)
-    assert result.exit_code == 0, result.output
-    assert [line.split()[:3] for line in result.stdout.splitlines()[2:4]] == [
-        ["city", "census", "1"],
-        ["city", "mccnn", "1"],
-    ]
-    ablated = invoke("ablate", "--cost", "mccnn", "--json", tmp_path)
-    report = json.loads(ablated.stdout)
+    report = json.loads(invoke("ablate", "--preset", "mccnn", "--json", tmp_path).stdout)
     assert report["cost"] == "mccnn"
     assert report["baseline"]["accuracy"] < report["0.9 regularised"]["accuracy"]
 
@@ -370,7 +351,7 @@ def test_match_batch__measures_each_pair_and_goes_on_after_one_that_it_cannot(tm
         PairOfBatch(name, str(tmp_path / "left.tif"), str(tmp_path / f"{other}.tif"), settings=SEARCH)
         for name, other in (("broken", "cut"), ("whole", "right"))
     ]
-    cost = {"cost": {"method": "mccnn", "weights": str(network_file)}}
+    cost = {"preset": "mccnn", "cost": {"weights": str(network_file)}}
     report = match_batch(pairs, tmp_path / "out", cost)
     assert {name: end["state"] for name, end in report.items()} == {"broken": "failed", "whole": "done"}
     assert "cut.tif could not be measured" in report["broken"]["error"]

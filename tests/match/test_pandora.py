@@ -24,13 +24,10 @@ from sat_intervals.config.weights import weights_file
 from sat_intervals.kernels.cost import Codes, between, census
 from sat_intervals.kernels.matching import cost_volume
 from sat_intervals.match.in_memory import _moments
-from sat_intervals.match.matching_cost import Area, cost_areas, view_windows
 from sat_intervals.match.mccnn import load_network
-from sat_intervals.match.normalization import PairStatistics, statistics_of
+from sat_intervals.match.normalization import statistics_of
 from sat_intervals.match.patch import kernel_settings
-from sat_intervals.match.whole import _view
 from sat_intervals.products import IMPOSSIBLE_COST, NO_DATA
-from sat_intervals.tiling import Window
 
 # Our reading of the pairs, which have no georeferencing. Pandora and its plugin raise no warning.
 pytestmark = [
@@ -56,6 +53,7 @@ PIPELINE = {
 
 # The same steps; those that come after them are off, so that products are raw.
 SETTINGS = {
+    "preset": "paper",
     "cost": {"method": "census", "window": 5},
     "sgm": {"p1": 8, "p2": 32},
     "interval": {"alpha": 0.9},
@@ -227,19 +225,11 @@ def test_match_arrays__disparities_equal_pandoras_but_for_rounding(peer: Peer, o
 
 
 # ---- MC-CNN ------------------------------------------------------------------------------------------------
-REFERENCE_PENALTIES = {
-    "p1": 2.3, "p2": 42.3, "q1": 3, "q2": 6, "v": 1.5, "d": 0.08, "gradients": "raw", "span": 52
-}  # fmt: skip
-
-
-def mccnn_peer(pandora, folder, search, weights=None, optimized=False):
-    """Costs by Pandora's MC-CNN, ``(rows, columns, k)``, raw or after SGM with its penalties for it; and winners."""
+def mccnn_peer(pandora, folder, search, weights=None):
+    """Costs by Pandora's MC-CNN, ``(rows, columns, k)``."""
     import_module("pandora_plugin_mc_cnn")
     cost = {"matching_cost_method": "mc_cnn", "window_size": 11, "subpix": 1}
     pipeline = {"matching_cost": cost | ({"model_path": str(weights)} if weights else {})}
-    if optimized:
-        penalty = {"penalty_method": "mc_cnn_fast_penalty"}
-        pipeline["optimization"] = PIPELINE["optimization"] | {"penalty": penalty}
     pipeline["disparity"] = PIPELINE["disparity"]
     left, right = ({"img": str(folder / f"{side}.tif"), "nodata": "NaN"} for side in ("left", "right"))
     machine = pandora.state_machine.PandoraMachine()
@@ -247,7 +237,7 @@ def mccnn_peer(pandora, folder, search, weights=None, optimized=False):
     settings = pandora.check_configuration.check_conf(settings, machine)
     read = pandora.img_tools.create_dataset_from_inputs
     pandora.run(machine, read(settings["input"]["left"]), read(settings["input"]["right"]), settings)
-    return machine.left_cv["cost_volume"].data, machine.left_cv["disp_indices"].data
+    return machine.left_cv["cost_volume"].data
 
 
 def cones(shared_data):
@@ -266,7 +256,7 @@ def test_features__have_the_cosines_of_pandora(pandora, shared_data, tmp_path, k
     # how some of its activations are rounded.
     folder, images, (minimum, maximum) = cones(shared_data)
     weights = trained_network(shared_data, tmp_path / "mb.onnx") if kind == "fp32" else None
-    theirs = -mccnn_peer(pandora, folder, (minimum, maximum), weights)[0]
+    theirs = -mccnn_peer(pandora, folder, (minimum, maximum), weights)
     network = load_network(weights_file(weights and str(weights)))
     statistics = [statistics_of(_moments(np.ma.asarray(image))) for image in images]
     left, right = (
@@ -278,21 +268,3 @@ def test_features__have_the_cosines_of_pandora(pandora, shared_data, tmp_path, k
         near = np.abs(ours - theirs[5:-5, 5 - d : -5, k]) <= 2e-3
         # the reference loses the last columns, up to 7, at any disparity
         assert near[:, :-7].mean() >= equal
-
-
-def test_cost_volume__has_the_winners_of_pandora_with_its_penalties_for_mccnn(pandora, shared_data):
-    # On 99 % of the pixels whose whole search range both searched: Pandora loses the last columns. Ours rounds costs
-    # and penalties to 0.008.
-    folder, images, (minimum, maximum) = cones(shared_data)
-    costs, theirs = mccnn_peer(pandora, folder, (minimum, maximum), optimized=True)
-    search = {"disparity": {"minimum": minimum, "maximum": maximum}}
-    config = load_config(search | {"cost": {"method": "mccnn"}, "sgm": REFERENCE_PENALTIES})
-    images = [np.ma.asarray(image.astype(np.float32)) for image in images]
-    statistics = PairStatistics(*(statistics_of(_moments(image)) for image in images))
-    area = Area.of(Window(0, 0, *images[0].shape), config)
-    views = tuple(map(_view, images, view_windows([area], config)))
-    (found,) = cost_areas(views, [area], config, statistics)
-    volume = cost_volume(found.costs, kernel_settings(config), found.gradients)
-    interior = ((volume != IMPOSSIBLE_COST) & np.isfinite(costs)).all(axis=2)
-    assert (volume.argmin(axis=2) + minimum == theirs)[interior].mean() >= 0.99
-    assert interior.mean() > 0.7

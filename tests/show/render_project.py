@@ -57,6 +57,4 @@ print(json.dumps({"read": is_read, "crs": project.crs().authid(), "layers": [des
 render([place.layer() for place in places if place.itemVisibilityChecked()], "map")
 for place in places:
     render([place.layer()], place.layer().name().replace(" ", "_"))
-if len(sys.argv) > 3:
-    project.write(sys.argv[3])
 application.exitQgis()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 from finished import PLACE, no_bands, random_bands, without_intervals, write_run, write_surface
-from helpers import fail, invoke
+from helpers import invoke
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from rasterio.crs import CRS
@@ -20,7 +20,6 @@ from surfaces import write_raster
 
 from sat_intervals.products import INVALID
 from sat_intervals.raster import ControlPoint, Georeferencing
-from sat_intervals.show import project
 from sat_intervals.show.legend import PIXEL_CLASSES, classify
 from sat_intervals.show.styles import difference
 
@@ -49,14 +48,6 @@ def layers_of(root):
         for group in root.findall("layer-tree-group/layer-tree-group")
         for layer in group
     ]
-
-
-def test_write_project__calls_no_failed_read_a_failed_write(run, monkeypatch):
-    out, _, _ = run
-    monkeypatch.setattr(project, "read_layers", fail)
-    with pytest.raises(OSError, match="Input/output error"):
-        project.write_project(out)
-    assert not (out / "project.qgz").exists()
 
 
 def test_write_project__lists_all_layers_by_group_with_relative_paths(run):
@@ -88,7 +79,7 @@ def test_styles__stretch_disparities_and_colour_every_value_of_validity(run):
     out, bands, validity = run
     invoke("project", out)
     shader = ElementTree.parse(out / "intervals.qml").find(".//colorrampshader")
-    ends = np.nanpercentile(bands[0], (2, 98))
+    ends = np.nanpercentile(bands[0], (2, 98), method="nearest")
     assert_allclose([float(shader.get(name)) for name in ("minimumValue", "maximumValue")], ends, rtol=1e-5)
     entries = ElementTree.parse(out / "validity.qml").findall(".//paletteEntry")
     kinds = {int(entry.get("value")): entry.get("color") for entry in entries}
@@ -127,7 +118,7 @@ def test_write_project__replaces_its_files(run):
     for name in ("project.qgz", "width.vrt", "intervals.qml"):
         (out / name).write_text("of before")
     assert invoke("project", out).exit_code == 0
-    assert b"made by sat-intervals" in (out / "intervals.qml").read_bytes()
+    assert ElementTree.parse(out / "intervals.qml").find(".//colorrampshader") is not None
     assert layers_of(read_project(out))
 
 
@@ -162,14 +153,14 @@ def test_write_project__of_a_run_without_intervals_and_without_valid_pixels(tmp_
 
 @pytest.mark.process
 def test_project__in_qgis(run, tmp_path):
-    """Every layer is valid and styled, rasters opened alone take the same styles, and QGIS removes the mark."""
+    """Every layer is valid and styled, rasters opened alone take the same styles."""
     if subprocess.run([SYSTEM_PYTHON, "-c", "import qgis.core"], capture_output=True).returncode:
         pytest.skip("QGIS is not installed for the system's Python: apt install python3-qgis qgis-providers")
     out, _, _ = run
     assert invoke("project", out).exit_code == 0
     script = Path(__file__).with_name("render_project.py")
     done = subprocess.run(
-        [SYSTEM_PYTHON, script, out / "project.qgz", tmp_path, tmp_path / "saved.qgz"],
+        [SYSTEM_PYTHON, script, out / "project.qgz", tmp_path],
         env={"QT_QPA_PLATFORM": "offscreen", "HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
         capture_output=True,
         text=True,
@@ -198,5 +189,3 @@ def test_project__in_qgis(run, tmp_path):
             colours = picture.convert("RGB").getcolors(1 << 20)
         assert len(colours) > (100 if name == "map" else 1), name  # the half width is 1.5 m everywhere
         assert max(count for count, _ in colours) < 0.9 * 700 * 700, name
-    with zipfile.ZipFile(tmp_path / "saved.qgz") as archive:
-        assert b"made by sat-intervals" not in archive.read("saved.qgs")[:1024]

@@ -10,20 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from finished import MAXIMUM, MINIMUM, no_bands, random_bands, without_intervals, write_run
-from helpers import fail, invoke
+from helpers import invoke
 from selenium.webdriver import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.wait import WebDriverWait
 
-from sat_intervals.errors import SatIntervalsError
 from sat_intervals.kernels.confidence import low_confidence
 from sat_intervals.products import INVALID
 from sat_intervals.raster import read_layers
 from sat_intervals.results import open_results
 from sat_intervals.show.legend import classify
-from sat_intervals.show.report import contents, write_report
-from sat_intervals.show.report import page as report_page
+from sat_intervals.show.report import contents
+from sat_intervals.show.report.page import write_report
 
 ROOT = Path(__file__).parents[2]
 
@@ -52,26 +51,6 @@ def test_report__names_the_file_it_wrote(tmp_path):
     done = invoke("report", out)
     assert done.exit_code == 0, done.output
     assert done.output.split() == [str(out / "report.html")]
-
-
-def test_write_report__calls_no_failed_read_a_failed_write(tmp_path, monkeypatch):
-    results = open_results(write_run(tmp_path, *random_bands(40, 50)))
-    monkeypatch.setattr(report_page, "_asset", fail)
-    with pytest.raises(OSError, match="Input/output error"):
-        write_report(results)
-
-
-def test_report__says_in_one_line_what_is_wrong(tmp_path):
-    done = invoke("report", tmp_path)
-    assert done.exit_code == 2
-    assert "give the folder of a finished run" in done.output
-
-
-def test_write_report__that_cannot_be_written_says_so(tmp_path):
-    out = write_run(tmp_path, *random_bands(4, 5))
-    (out / "report.html").mkdir()
-    with pytest.raises(SatIntervalsError, match=r"report\.html cannot be written: Is a directory"):
-        write_report(open_results(out))
 
 
 def test_write_report__counts_every_pixel(tmp_path):
@@ -146,7 +125,7 @@ def test_write_report__shows_the_main_figures_without_scripts(tmp_path):
     assert f"<td>{100 * page['evaluation']['all']['accuracy']:.1f} % of the valid pixels with a truth</td>" in static
     shares = re.findall(r"<td>(\d+\.\d) % of the pixels</td>", static)
     assert sum(map(float, shares)) == pytest.approx(100, abs=0.4)
-    assert page["histograms"]["classes"] == np.bincount(classify(validity).ravel()).tolist()
+    assert page["classes"] == np.bincount(classify(validity).ravel()).tolist()
 
 
 # ---- In a browser ------------------------------------------------------------------------------------------
@@ -204,12 +183,8 @@ def test_page__tells_what_the_run_tells(page):
     ):
         assert words in page.text(selector)
     assert page.browser.execute_script("return document.querySelectorAll('svg[role=img][aria-label]').length") == 4
-
-
-def test_page__says_loading_until_it_is_ready_and_leaves_out_settings_without_a_value(page):
     assert not page.browser.find_elements(By.CSS_SELECTOR, "#loading")
-    assert "walltime" not in page.text("#run")
-    assert "none" not in page.text("#run").split()
+    assert not {"walltime", "none"} & set(page.text("#run").split())  # settings without a value
 
 
 def test_page__without_scripts_shows_a_table(browser, tmp_path):
@@ -271,7 +246,7 @@ def test_page__layers_change_the_map_and_its_key(page):
     assert "truth above the interval" in seen["Misses"][1]
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (3, 400), (400, 3), (50, 60)])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 400)])
 def test_page__of_no_valid_pixel_says_so(browser, tmp_path, shape):
     path, _ = reported(tmp_path, *no_bands(*shape))
     page = Page(browser, path)

@@ -3,6 +3,7 @@
 import base64
 import gzip
 import math
+from collections import defaultdict
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from sat_intervals.match.local_ranges import LocalRanges
 from sat_intervals.products import Bands
 from sat_intervals.results import Results
-from sat_intervals.show.legend import FIRST_INVALID, PIXEL_CLASSES, classify
+from sat_intervals.show.legend import PIXEL_CLASSES, classify, limits
 
 _PIXELS = 500_000  # on the page, 5 to 8 bytes each when compressed and encoded
 _WIDTH_BARS, _CONFIDENCE_BARS = 60, 25
@@ -18,43 +19,37 @@ _STEPS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # bar widths of the hi
 _FINEST = 1 / 64  # pixels of disparity
 
 
-class Counts:
-    """Histograms of interval width, confidence and pixel class over all pixels, gathered strip by strip."""
+class Histograms:
+    """Histograms of interval width and confidence over all pixels, gathered strip by strip."""
 
     def __init__(self, count: int) -> None:
         """Start with empty histograms; ``count`` is the number of disparities searched."""
         self._step = next(step for step in _STEPS if count / step <= _WIDTH_BARS or step == _STEPS[-1])
-        bars = math.ceil(count / self._step)
-        self._widths = {name: np.zeros(bars, np.int64) for name in ("high", "low")}
-        self._confidences = {name: np.zeros(_CONFIDENCE_BARS, np.int64) for name in ("valid", "rejected")}
-        self._classes = np.zeros(len(PIXEL_CLASSES), np.int64)
+        self._width_bars = math.ceil(count / self._step)
+        self._counts: dict[str, Any] = defaultdict(int)
 
     def add(self, bands: Bands, low: np.ndarray) -> None:
         """Count the pixels of some rows; ``low`` is the mask of low confidence."""
-        classes = classify(bands.validity)
-        self._classes += np.bincount(classes.ravel(), minlength=self._classes.size)
-        valid = classes < FIRST_INVALID
-        width = bands.upper - bands.lower
-        measured = valid & np.isfinite(width)
-        for name, chosen in (("high", measured & ~low), ("low", measured & low)):
-            _count(width[chosen] / self._step, self._widths[name])
-        known = np.isfinite(bands.confidence)
-        for name, chosen in (("valid", known & valid), ("rejected", known & ~valid)):
-            _count(bands.confidence[chosen] * _CONFIDENCE_BARS, self._confidences[name])
+        valid = bands.valid
+        width, confidence = (bands.upper - bands.lower) / self._step, bands.confidence * _CONFIDENCE_BARS
+        self._counts["high"] += _counted(width[valid & ~low], self._width_bars)
+        self._counts["low"] += _counted(width[valid & low], self._width_bars)
+        self._counts["valid"] += _counted(confidence[valid], _CONFIDENCE_BARS)
+        self._counts["rejected"] += _counted(confidence[~valid], _CONFIDENCE_BARS)
 
     def report(self) -> dict[str, Any]:
-        """Return counts per pixel class and per bar of ``step``; the last bar includes all values beyond."""
-        widths = {name: bars.tolist() for name, bars in self._widths.items()}
-        confidences = {name: bars.tolist() for name, bars in self._confidences.items()}
+        """Return counts per bar of ``step``; the last bar includes all values beyond."""
+        counts = {name: bars.tolist() for name, bars in self._counts.items()}
+        confidences = {name: counts[name] for name in ("valid", "rejected")}
         return {
-            "width": {"step": self._step, "bars": widths},
+            "width": {"step": self._step, "bars": {name: counts[name] for name in ("high", "low")}},
             "confidence": {"step": 1 / _CONFIDENCE_BARS, "bars": confidences},
-            "classes": self._classes.tolist(),
         }
 
 
-def _count(places: np.ndarray, bars: np.ndarray) -> None:
-    bars += np.bincount(np.clip(places, 0, bars.size - 1).astype(np.int64), minlength=bars.size)
+def _counted(places: np.ndarray, bars: int) -> np.ndarray:
+    known = places[np.isfinite(places)]
+    return np.bincount(np.clip(known, 0, bars - 1).astype(np.int64), minlength=bars)
 
 
 class Pixels:
@@ -63,11 +58,8 @@ class Pixels:
     def __init__(self, results: Results) -> None:
         height, width = results.shape
         self._step = max(1, math.ceil(math.sqrt(height * width / _PIXELS)))
-        self._search = results.config.disparity
+        self._results = results
         self._strips: list[list[np.ndarray]] = []
-        self._region = results.region
-        local = results.report.get("local_ranges")
-        self._ranges = LocalRanges.of_report(local) if local else None
 
     def add(self, row: int, bands: Bands, low: np.ndarray) -> None:
         """Keep every n-th of the rows from ``row`` on; ``low`` is the mask of low confidence."""
@@ -78,19 +70,18 @@ class Pixels:
         """Return layers of codes: a code means ``first + code * step``, the largest one a missing value."""
         *values, low = (np.concatenate(strips) for strips in zip(*self._strips, strict=True))
         bands = Bands(*values)
-        kind = classify(bands.validity)
-        valid = kind < FIRST_INVALID
+        kind, valid = classify(bands.validity), bands.valid
         missed = np.where(bands.truth > bands.upper, 1, np.where(bands.truth < bands.lower, 2, 0))
         disparities = {name: np.where(valid, getattr(bands, name), np.nan) for name in ("disparity", "lower", "upper")}
         if np.isfinite(bands.truth).any():
             disparities["truth"] = bands.truth
         # Leave room for a truth outside the search range: its extent once more on either side.
-        first = self._search.minimum - self._search.count
-        step = max(_FINEST, 3 * self._search.count / 65534)
-        black, white = _ends(bands.image)
+        search = self._results.config.disparity
+        first, step = search.minimum - search.count, max(_FINEST, 3 * search.count / 65534)
+        black, white = limits(bands.image)
         layers = {name: _coded(values, first, step, "<u2") for name, values in disparities.items()}
-        if self._ranges:
-            minimum, maximum = self._ranges.at(self._region, self._step)
+        if local := self._results.report.get("local_ranges"):
+            minimum, maximum = LocalRanges.of_report(local).at(self._results.region, self._step)
             layers["searched"] = _coded(maximum - minimum + 1.0, 0, 1, "<u2")
         return {
             "step": self._step,
@@ -106,15 +97,6 @@ class Pixels:
             },
             "kinds": [{"colour": each.colour, "meaning": each.meaning} for each in PIXEL_CLASSES],
         }
-
-
-def _ends(image: np.ndarray) -> tuple[float, float]:
-    """Return the grey values drawn as black and white, percentiles 1 and 99."""
-    known = image[np.isfinite(image)]
-    if known.size == 0:
-        return 0.0, 1.0
-    low, high = np.percentile(known, (1, 99))
-    return float(low), float(high) if high > low else float(low) + 1.0
 
 
 def _coded(values: np.ndarray, first: float, step: float, dtype: str) -> dict[str, Any]:

@@ -61,7 +61,7 @@ function makeLayers() {
     { name: "Disparity", unit: "px", values: data.disparity, colours: COLOURS.viridis,
       shown: limits(data.disparity, [search.minimum, search.maximum]) },
     { name: "Confidence", values: data.confidence, colours: COLOURS.cividis, shown: [0, 1] },
-    { name: "Validity", values: data.kind, kinds: pixels.kinds.map((kind) => [kind.meaning, kind.colour]), counts: contents.histograms.classes },
+    { name: "Validity", values: data.kind, kinds: pixels.kinds.map((kind) => [kind.meaning, kind.colour]), counts: contents.classes },
   ];
   if (hasIntervals) {
     const shown = [0, quantiles(width, WIDEST)[0] || 1];

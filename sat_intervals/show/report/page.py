@@ -12,8 +12,8 @@ from typing import Any
 from sat_intervals.evaluate.disparity import evaluate_run
 from sat_intervals.raster.publishing import write_file
 from sat_intervals.results import Results
-from sat_intervals.show.legend import PIXEL_CLASSES
-from sat_intervals.show.report.contents import Counts, Pixels
+from sat_intervals.show.legend import PIXEL_CLASSES, class_counts
+from sat_intervals.show.report.contents import Histograms, Pixels
 
 
 def write_report(results: Results) -> Path:
@@ -38,17 +38,18 @@ def _asset(name: str) -> str:
 
 def _contents(results: Results) -> dict[str, Any]:
     """Return all data of the page."""
-    counts, pixels = Counts(results.config.disparity.count), Pixels(results)
+    histograms, pixels = Histograms(results.config.disparity.count), Pixels(results)
     for row, bands in results.strips():
         low = results.low(bands)
-        counts.add(bands, low)
+        histograms.add(bands, low)
         pixels.add(row, bands, low)
     truth = results.truth.image.path if results.truth else None
     return {
         "run": results.report,
         "name": Path(results.left.path).name,
         "folder": shlex.quote(str(results.out.resolve())),
-        "histograms": counts.report(),
+        "histograms": histograms.report(),
+        "classes": class_counts(results.report["counts"]),
         "pixels": pixels.report(),
         "truth": truth,
         "evaluation": evaluate_run(results.out, truth) if truth and results.config.interval else None,
@@ -65,7 +66,7 @@ def _summary(contents: Mapping[str, Any]) -> str:
         "search range": f"{search['minimum']} to {search['maximum']} px",
         "median interval width": "none" if width is None else f"{width} px",
     }
-    for kind, count in zip(PIXEL_CLASSES, contents["histograms"]["classes"], strict=True):
+    for kind, count in zip(PIXEL_CLASSES, contents["classes"], strict=True):
         if count:
             rows[kind.meaning] = f"{100 * count / counts['pixels']:.1f} % of the pixels"
     accuracy = contents["evaluation"] and contents["evaluation"]["all"]["accuracy"]

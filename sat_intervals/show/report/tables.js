@@ -139,21 +139,16 @@ function showTiles() {
     place.append(element("p", {}, `One tile of at most ${size} x ${size} pixels: no seams.`));
     return;
   }
-  if (seams === null) {
-    place.append(element("p", {},
-      `${grouped(rows * columns)} tiles of ${size} x ${size} pixels, which hand path states to their neighbours: no seams.`));
-    const grid = element("figure", { style: "max-width: 420px" });
-    place.append(grid);
-    drawing(grid, tilesHeight(420), "Grid of tiles", (width) => drawTiles(width, null));
-    return;
-  }
-  place.append(element("p", {},
-    `${grouped(rows * columns)} tiles of ${size} x ${size} pixels, read with an overlap of ${overlap} px. Adjacent tiles both match ` +
-    `the pixels along their ${grouped(seams.borders)} common borders. Of these ${grouped(seams.pixels)} pixels, before filters, ` +
-    `${percent(seams.winner_share)} differ in disparity and ${percent(seams.bounds_share)} in a bound. A larger overlap reduces this.`));
-  const differs = seams.winner_share > 0 || seams.bounds_share > 0;
+  const count = `${grouped(rows * columns)} tiles of ${size} x ${size} pixels`;
+  const differs = seams && (seams.winner_share > 0 || seams.bounds_share > 0);
   const figure = element("figure", { style: "max-width: 420px" });
-  place.append(figure);
+  place.append(
+    element("p", {}, seams === null ? `${count}, which hand path states to their neighbours: no seams.` :
+      `${count}, read with an overlap of ${overlap} px. Adjacent tiles both match the pixels along their ` +
+      `${grouped(seams.borders)} common borders. Of these ${grouped(seams.pixels)} pixels, before filters, ` +
+      `${percent(seams.winner_share)} differ in disparity and ${percent(seams.bounds_share)} in a bound. A larger overlap reduces this.`),
+    figure,
+  );
   drawing(figure, tilesHeight(420), "Grid of tiles", (width) => drawTiles(width, differs ? seams.worst.between : null));
   if (!differs) return;
   const worst = `the border with most differences: ${percent(seams.worst.winner_share)} of the disparities, ` +
