@@ -43,7 +43,7 @@ GALLERY = (
     ("Its heights and half widths", "sat-intervals plot demo --dpi 90", "demo/dsm.png"),
     ("Its errors", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-errors.png"),
     ("A line across it", f"sat-intervals evaluate {COMPARED} --pictures demo --overwrite", "demo/dsm-profile.png"),
-    ("A relief, with local search ranges", "sat-intervals demo relief --size 500 500 --relief 60 --local-range", None),
+    ("A relief, with local search ranges", "sat-intervals demo relief --size 500 500 --relief 60 --set disparity.local=true", None),
     ("Its maps", "sat-intervals plot relief --dpi 90", "relief/overview.png"),
 )  # fmt: skip
 
